@@ -1,0 +1,59 @@
+"""The errors a user can meet, one family.
+
+Each message says what was found, what was expected and what to do next; the command line prints it
+without a traceback and exits with `exit_code`.
+
+    RunnerError
+    ├── ConfigError          a configuration cannot be used (file, line and key stand in the message)
+    ├── EnvironmentNotUsable an environment is unknown, or has no transition table
+    ├── RecordingError       a recording is damaged, foreign, or of an unknown version
+    ├── RunNotFound          no run, or more than one, answers to a name
+    ├── StorageError         the recordings folder cannot be written, or its disk is full
+    └── MissingExtra         a command needs an optional package
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class RunnerError(Exception):
+    """Base of every error that is a user's to mend; `exit_code` is what a command ends with."""
+
+    exit_code = 2
+
+
+class ConfigError(RunnerError):
+    """A configuration cannot be used; the message lists every problem, one a line."""
+
+
+class EnvironmentNotUsable(RunnerError):
+    """An environment is not registered, cannot be made, or offers no transition table."""
+
+
+class RecordingError(RunnerError):
+    """A recording cannot be read: damaged, not one of ours, or of an unknown version."""
+
+
+class RunNotFound(RunnerError):
+    """A name answers to no run, or to several."""
+
+
+class StorageError(RunnerError):
+    """The recordings folder cannot be written, or its disk is full."""
+
+    exit_code = 1
+
+
+class MissingExtra(RunnerError):
+    """A command needs a package that is not installed; the message says which extra brings it."""
+
+    def __init__(self, package: str, extra: str, purpose: str) -> None:
+        super().__init__(f"{purpose} needs {package}, which is not installed: pip install 'dualtaxi[{extra}]'")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return ` Did you mean 'x'?` for the known name nearest to `name`, or an empty string."""
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return f" Did you mean {close[0]!r}?" if close else ""
