@@ -1,0 +1,46 @@
+"""Configuration: a YAML file, or Python values, to one frozen and validated `ExperimentConfig`.
+
+    config = load("configs/quick.yaml", ["episodes=50", "evaluation.trials=10"])
+
+Everything that can be wrong is told in one `ConfigError`, a line for each problem.
+"""
+
+from runner.config.loading import from_mapping, load
+from runner.config.model import (
+    Environment,
+    Evaluation,
+    ExperimentConfig,
+    ExperimentFile,
+    Log,
+    Quirks,
+    RandomTable,
+    Recording,
+    RunTable,
+    Snapshots,
+    UniformRange,
+)
+from runner.config.schedules import Exponential, Linear, Piecewise, Schedule
+from runner.config.schema import json_schema
+from runner.errors import ConfigError
+
+__all__ = [
+    "ConfigError",
+    "Environment",
+    "Evaluation",
+    "ExperimentConfig",
+    "ExperimentFile",
+    "Exponential",
+    "Linear",
+    "Log",
+    "Piecewise",
+    "Quirks",
+    "RandomTable",
+    "Recording",
+    "RunTable",
+    "Schedule",
+    "Snapshots",
+    "UniformRange",
+    "from_mapping",
+    "json_schema",
+    "load",
+]

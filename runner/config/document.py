@@ -1,0 +1,223 @@
+"""YAML text to plain values, and where in the text each of them stands.
+
+The scalars are those of YAML 1.2's core schema, which editors use too: `1e-3` is a number, `no` and
+`2026-11-01` are text. Nothing but null, booleans, numbers, text, lists and mappings comes out.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import yaml
+
+from runner.config.values import MAX_DEPTH, Path
+from runner.errors import ConfigError
+
+MAX_NODES = 100_000
+"""How many values a text may hold, its aliases expanded."""
+
+_TAG = "tag:yaml.org,2002:"
+_INT = re.compile(r"^(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$")
+_SCALARS = (
+    ("null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]),
+    ("bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")),
+    ("int", _INT, list("-+0123456789")),
+    (
+        "float",
+        re.compile(
+            r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+            r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+        ),
+        list("-+.0123456789"),
+    ),
+)
+
+
+class Place(NamedTuple):
+    """Where something was read: a file's line and column (from 1), or an override with neither."""
+
+    source: str
+    line: int = 0
+    column: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.source}:{self.line}:{self.column}" if self.line else self.source
+
+
+class Problem(NamedTuple):
+    """Why the value at `path` cannot be used; `place` where that is not where the value stands."""
+
+    path: Path
+    message: str
+    place: Place | None = None
+
+
+@dataclass
+class Document:
+    """Plain values, the places they were read from, and what was wrong with the text itself."""
+
+    value: Any
+    places: dict[tuple[str, ...], Place] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+
+    def place(self, path: Path) -> Place | None:
+        """Return where the value at `path` was read, or else the nearest value around it."""
+        keys = tuple(map(str, path))
+        around = (self.places.get(keys[:length]) for length in range(len(keys), -1, -1))
+        return next((place for place in around if place), None)
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's parser with the scalars of YAML 1.2, and a bound on what it builds."""
+
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - PyYAML's own way to configure a class
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._depth = self._nodes = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        self._nodes += 1
+        self._depth += 1
+        mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+        if self._depth > MAX_DEPTH:
+            raise yaml.MarkedYAMLError(problem=f"nested deeper than {MAX_DEPTH} levels", problem_mark=mark)
+        if self._nodes > MAX_NODES:
+            raise yaml.MarkedYAMLError(problem=f"more than {MAX_NODES} values", problem_mark=mark)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes whatever YAML 1.1 or 1.2 would not read back as text."""
+
+    def ignore_aliases(self, data: object) -> bool:  # noqa: ARG002 - PyYAML's signature
+        return True
+
+
+for _name, _pattern, _first in _SCALARS:
+    _Loader.add_implicit_resolver(_TAG + _name, _pattern, _first)
+    _Dumper.add_implicit_resolver(_TAG + _name, _pattern, _first)
+
+
+def read_yaml(text: str, source: str, *, lines: bool = True) -> Document:
+    """Return what `text` says; `source` is named in errors, with line and column unless `lines` is false."""
+    try:
+        node = _Loader(text).get_single_node()
+        builder = _Builder(source, lines)
+        value = builder.value(node, ()) if node is not None else None
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = Place(source, mark.line + 1, mark.column + 1) if mark and lines else Place(source)
+        raise ConfigError(f"{place}: cannot be read as YAML: {error.problem or error.context}") from None
+    except yaml.reader.ReaderError as error:
+        before = text[: error.position]
+        line, column = before.count("\n") + 1, error.position - before.rfind("\n")
+        place = Place(source, line, column) if lines else Place(source)
+        raise ConfigError(f"{place}: cannot be read as YAML: the character U+{error.character:04X}") from None
+    return Document(value, builder.places, builder.problems)
+
+
+def write_yaml(value: Mapping[str, Any]) -> str:
+    """Return `value` as YAML that `read_yaml` takes back to an equal one."""
+    text: str = yaml.dump(
+        value, Dumper=_Dumper, sort_keys=False, default_flow_style=False, allow_unicode=True, width=110
+    )
+    return text
+
+
+class _Builder:
+    """Turns nodes into plain values, noting where each stands."""
+
+    def __init__(self, source: str, lines: bool) -> None:
+        self.source = source
+        self.lines = lines
+        self.places: dict[tuple[str, ...], Place] = {}
+        self.problems: list[Problem] = []
+        self.built = 0
+
+    def value(self, node: yaml.Node, path: Path) -> Any:
+        self.built += 1
+        if self.built > MAX_NODES or len(path) > MAX_DEPTH:
+            problem = "aliases make it too large: more than " + (
+                f"{MAX_NODES} values" if self.built > MAX_NODES else f"{MAX_DEPTH} levels"
+            )
+            raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+        self.places.setdefault(tuple(map(str, path)), self._place(node))
+        known = node.tag.removeprefix(_TAG)
+        if isinstance(node, yaml.MappingNode) and known == "map":
+            return self._mapping(node, path)
+        if isinstance(node, yaml.SequenceNode) and known == "seq":
+            return [self.value(item, (*path, position)) for position, item in enumerate(node.value)]
+        if isinstance(node, yaml.ScalarNode) and known in _CONVERT:
+            return self._scalar(node, known, path)
+        tag = "!!" + known if known != node.tag else node.tag
+        self.problems.append(Problem(path, f"found the tag {tag}, expected a plain value without a tag"))
+        return None
+
+    def _mapping(self, node: yaml.MappingNode, path: Path) -> dict[str, Any]:
+        built: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            place = self._place(key_node)
+            key = self._key(key_node, path)
+            if key is None:
+                continue
+            below = (*path, key)
+            if key in built:
+                first = self.places[tuple(map(str, below))]
+                again = f"given twice; first in line {first.line}" if first.line else "given twice"
+                self.problems.append(Problem(below, again, place))
+                continue
+            self.places[tuple(map(str, below))] = place
+            built[key] = self.value(value_node, below)
+        return built
+
+    def _key(self, node: yaml.Node, path: Path) -> str | None:
+        place = self._place(node)
+        if not isinstance(node, yaml.ScalarNode):
+            self.problems.append(Problem(path, "found a list or mapping for a key, expected text", place))
+            return None
+        if node.value == "<<" and node.style is None:
+            self.problems.append(Problem(path, "found the merge key <<, expected the keys themselves", place))
+            return None
+        if node.tag != _TAG + "str":
+            self.problems.append(Problem(path, f"found the key {node.value}, expected text: quote it", place))
+            return None
+        return str(node.value)
+
+    def _scalar(self, node: yaml.ScalarNode, known: str, path: Path) -> Any:
+        try:
+            return _CONVERT[known](node.value)
+        except ValueError:
+            message = f"found {node.value[:40]!r}{'…' * (len(node.value) > 40)}, which is no {_KIND[known]}"
+            self.problems.append(Problem(path, message))
+            return None
+
+    def _place(self, node: yaml.Node) -> Place:
+        if not self.lines:
+            return Place(self.source)
+        return Place(self.source, node.start_mark.line + 1, node.start_mark.column + 1)
+
+
+def _whole_number(text: str) -> int:
+    if not _INT.match(text):
+        raise ValueError(text)
+    return int(text, 0) if text.startswith(("0o", "0x")) else int(text)
+
+
+def _number(text: str) -> float:
+    return float(re.sub(r"^([-+]?)\.(inf|nan)$", r"\1\2", text.lower()))
+
+
+_CONVERT: dict[str, Any] = {
+    "null": lambda _: None,
+    "bool": lambda text: {"true": True, "false": False}.get(text.lower()),
+    "int": _whole_number,
+    "float": _number,
+    "str": str,
+}
+_KIND = {"int": "whole number of a usable size", "float": "number"}

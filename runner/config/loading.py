@@ -1,0 +1,161 @@
+"""From YAML, or from Python values, to an `ExperimentConfig`; whatever is wrong is told at once.
+
+text -> document (plain values and their places) -> overrides -> ExperimentFile -> ExperimentConfig
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path as FilePath
+from typing import Any
+
+from pydantic import ValidationError
+
+from runner.config.document import Document, Problem, read_yaml
+from runner.config.model import (
+    LEARNERS,
+    NAME_EXPECTED,
+    NAME_PATTERN,
+    ExperimentConfig,
+    ExperimentFile,
+    Rewards,
+    SeedRange,
+    Tables,
+)
+from runner.config.overrides import override
+from runner.config.problems import found, problems_in, refuse
+from runner.errors import ConfigError, nearest
+
+MAX_BYTES = 1 << 20
+"""The largest file that is read; a configuration of a thousand lines is a twentieth of it."""
+
+
+def load(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> ExperimentConfig:
+    """Return the experiment that a YAML file describes.
+
+    Args:
+        path: The file; its name without the ending names the experiment, unless it says another.
+        overrides: `KEY=VALUE` each, as given to `--set`: the value is YAML, the key a path such as
+            `evaluation.trials`. Later ones win.
+
+    Raises:
+        ConfigError: The file cannot be read, or does not describe an experiment. The message has a
+            line for each problem, with file, line, column and key.
+    """
+    file = FilePath(path)
+    document = read_yaml(_text(file), str(file))
+    if document.value is None and not document.problems:
+        raise ConfigError(f"{file}:1:1: the file is empty, expected at least `episodes`")
+    return _experiment(document, overrides, file.stem, named_by=f"the file's name, {file.stem!r},")
+
+
+def from_mapping(
+    values: Mapping[str, Any], overrides: Sequence[str] = (), *, name: str = "experiment"
+) -> ExperimentConfig:
+    """Return the experiment that plain Python values describe, under the keys of a YAML file.
+
+    Args:
+        values: What a file would say, or what `ExperimentConfig.to_mapping` returned; not changed.
+        overrides: As for `load`.
+        name: What the experiment is called when `values` has no name.
+
+    Raises:
+        ConfigError: The values do not describe an experiment; a line for each problem.
+    """
+    return _experiment(Document(values), overrides, name, named_by=repr(name))
+
+
+def _text(file: FilePath) -> str:
+    try:
+        with file.open("rb") as stream:
+            content = stream.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise ConfigError(f"{file}: no such file.{_similar(file)}") from None
+    except IsADirectoryError:
+        raise ConfigError(f"{file}: found a directory, expected a YAML file") from None
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{file}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if len(content) > MAX_BYTES:
+        raise ConfigError(f"{file}: larger than 1 MiB, expected a configuration of a few kilobytes")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        byte = content[error.start]
+        raise ConfigError(f"{file}:{line}: found the byte 0x{byte:02x}, expected text in UTF-8") from None
+
+
+def _similar(file: FilePath) -> str:
+    try:
+        return nearest(str(file), map(str, file.parent.glob("*.y*ml")))
+    except OSError:
+        return ""
+
+
+def _experiment(
+    document: Document, overrides: Sequence[str], name: str, *, named_by: str
+) -> ExperimentConfig:
+    if not isinstance(document.value, Mapping):
+        problem = Problem(
+            (), f"found {found(document.value)}, expected keys and values, such as episodes: 1000"
+        )
+        raise refuse([*document.problems, problem], document)
+    override(document, overrides)
+    file, problems = _validated(document.value)
+    problems = [*document.problems, *problems]
+    unusable = {problem.path[0] for problem in problems if problem.path}
+    problems += _contradictions({key: given for key, given in document.value.items() if key not in unusable})
+    if file and file.name is None and not re.fullmatch(NAME_PATTERN, name):
+        problems.append(Problem(("name",), f"missing, and {named_by} cannot be it: expected {NAME_EXPECTED}"))
+    if file is None or problems:
+        raise refuse(problems, document)
+    resolved = _resolved(file, name)
+    try:
+        return ExperimentConfig.model_validate(resolved)
+    except ValidationError as error:
+        raise refuse(problems_in(error, resolved), document) from None
+
+
+def _validated(values: Mapping[str, Any]) -> tuple[ExperimentFile | None, list[Problem]]:
+    try:
+        return ExperimentFile.model_validate(dict(values)), []
+    except ValidationError as error:
+        return None, problems_in(error, values)
+
+
+def _contradictions(given: Mapping[str, Any]) -> list[Problem]:
+    """Return where keys of which each is sound say different things."""
+    problems = []
+    mode = given.get("mode")
+    if mode is not None:
+        tables, rewards = LEARNERS[mode]
+        means = f"mode: {mode} means tables: {tables} and rewards: {rewards}. Remove `mode`, or this key"
+        for key, meant in (("tables", tables), ("rewards", rewards)):
+            if given.get(key) not in (None, meant):
+                problems.append(Problem((key,), f"found {given[key]!r}, but {means}"))
+    if given.get("seed") is not None and given.get("seeds") is not None:
+        problems.append(Problem(("seeds",), "given together with `seed`, expected one of them"))
+    return problems
+
+
+def _resolved(file: ExperimentFile, name: str) -> dict[str, Any]:
+    """Return the values of the resolved experiment, with the shorthands of `file` spelled out."""
+    values = {key: getattr(file, key) for key in ExperimentConfig.model_fields}
+    values["name"] = file.name or name
+    values["tables"], values["rewards"] = _learners(file)
+    if isinstance(file.seeds, SeedRange):
+        values["seeds"] = tuple(range(file.seeds.first, file.seeds.first + file.seeds.count))
+    elif file.seeds is None:
+        values["seeds"] = (file.seed or 0,)
+    return values
+
+
+def _learners(file: ExperimentFile) -> tuple[Tables, Rewards]:
+    if file.mode:
+        return LEARNERS[file.mode]
+    if file.tables and file.rewards:
+        return file.tables, file.rewards
+    given = file.tables or file.rewards or "joint"
+    return next(pair for pair in LEARNERS.values() if given in pair)

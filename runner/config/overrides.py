@@ -1,0 +1,77 @@
+"""Single values put over a configuration, as `--set KEY=VALUE` and sweeps do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from runner.config.document import Document, Place, read_yaml
+from runner.config.model import ExperimentFile
+from runner.config.values import MAX_DEPTH, Path, Section
+from runner.errors import ConfigError
+
+_RIVALS = {"seed": ("seeds",), "seeds": ("seed",), "mode": ("tables", "rewards")}
+"""What a file can say instead of a key: an override of the key takes its place."""
+
+
+def override(document: Document, overrides: Sequence[str]) -> None:
+    """Put every `KEY=VALUE` of `overrides` into `document`, whose value must be a mapping.
+
+    A key on the way to KEY that holds something else than a mapping becomes one. A section that the
+    document does not mention starts from its default, so that only the value named is changed.
+    """
+    assigned: set[str] = set()
+    for text in overrides:
+        path, read = _parse(text)
+        assigned.add(path[0])
+        for rival in _RIVALS.get(path[0], ()) if read.value is not None else ():
+            if rival not in assigned:
+                _assign(document, (rival,), Document(None))
+        if len(path) > 1 and document.value.get(path[0], _ABSENT) is _ABSENT:
+            _assign(document, path[:1], Document(_default(path[0]), {(): read.places[()]}))
+        _assign(document, path, read)
+
+
+_ABSENT = object()
+_LONGEST = 80
+
+
+def _parse(text: str) -> tuple[tuple[str, ...], Document]:
+    shown = text if len(text) <= _LONGEST else text[:_LONGEST] + "…"
+    source = "--set " + (shown if shown.isprintable() else repr(shown))
+    key, separator, value = text.partition("=")
+    path = tuple(key.strip().split("."))
+    if not separator or not all(path):
+        raise ConfigError(f"{source}: expected KEY=VALUE, such as epsilon=0.2 or evaluation.trials=50")
+    if len(path) > MAX_DEPTH:
+        raise ConfigError(f"{source}: expected a key of at most {MAX_DEPTH} parts")
+    read = read_yaml(value, source, lines=False)
+    read.places[()] = Place(source)
+    return path, read
+
+
+def _assign(document: Document, path: tuple[str, ...], read: Document) -> None:
+    for old in [place for place in document.places if place[: len(path)] == path]:
+        del document.places[old]
+    document.value = _with(document.value, path, read.value)
+    document.places.update({(*path, *below): place for below, place in read.places.items()})
+    document.problems = [problem for problem in document.problems if problem.path[: len(path)] != path]
+    document.problems += [problem._replace(path=(*path, *problem.path)) for problem in read.problems]
+
+
+def _with(value: object, path: Path, new: object) -> Any:
+    """Return a copy of `value` with `new` at `path`; only what lies on the path is copied."""
+    if not path:
+        return new
+    key, below = str(path[0]), path[1:]
+    if isinstance(value, list | tuple) and key.isdecimal() and key.isascii() and int(key) < len(value):
+        at = int(key)
+        return [*value[:at], _with(value[at], below, new), *value[at + 1 :]]
+    mapping = dict(value) if isinstance(value, Mapping) else {}
+    return {**mapping, key: _with(mapping.get(key), below, new)}
+
+
+def _default(key: str) -> object:
+    field = ExperimentFile.model_fields.get(key)
+    default = field.default if field else None
+    return default.model_dump(mode="json", exclude_unset=True) if isinstance(default, Section) else None

@@ -1,0 +1,128 @@
+"""What pydantic found wrong, in the words of a configuration: one line for each value."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from runner.config.document import Document, Place, Problem
+from runner.config.schema import choices_of, expected, keys_of, schema_at
+from runner.config.values import REFUSED, Path
+from runner.errors import ConfigError, nearest
+
+_LONGEST = 60
+_UNKNOWN = "extra_forbidden"
+_BRANCHES = frozenset(
+    ("number", "array", "Linear", "Exponential", "Piecewise", "RandomTable", "RunTable", "SeedRange")
+)
+"""The names by which a location tells which branch of a union was taken; none is a key."""
+
+
+def problems_in(error: ValidationError, value: object) -> list[Problem]:
+    """Return what is wrong with `value`, the mapping that was validated, and leave out what only follows."""
+    details = error.errors(include_url=False, include_input=False)
+    paths = [_path(detail) for detail in details]
+    unknown = [path for path, detail in zip(paths, details, strict=True) if detail["type"] == _UNKNOWN]
+    problems = []
+    for path, detail in zip(paths, details, strict=True):
+        if detail["type"] == "missing" and any(_meant(path, other) for other in unknown):
+            continue
+        if detail["type"] == "too_short" and any(other[:-1] == path for other in paths if other):
+            continue
+        problems.append(_problem(path, detail, value))
+    return problems
+
+
+def refuse(problems: Sequence[Problem], document: Document) -> ConfigError:
+    """Return the error that lists `problems`, one a line, in the order of the text."""
+    first: dict[tuple[Path, Place | None], Problem] = {}
+    for problem in problems:
+        first.setdefault((problem.path, problem.place), problem)
+    placed = [(problem.place or document.place(problem.path), problem) for problem in first.values()]
+    placed.sort(key=lambda pair: pair[0][1:] if pair[0] and pair[0].line else (10**9, 0))
+    return ConfigError("\n".join(_line(place, problem) for place, problem in placed))
+
+
+def found(value: object) -> str:  # noqa: PLR0911 - one line a kind
+    """Return `value` as a message names it: short, on one line, in YAML's words."""
+    match value:
+        case None:
+            return "null"
+        case bool():
+            return str(value).lower()
+        case int() if value.bit_length() > 128:
+            return f"a whole number of {value.bit_length()} bits"
+        case float() if value in (float("inf"), float("-inf")) or value != value:  # noqa: PLR0124 - NaN
+            return f"{value}".replace("inf", ".inf").replace("nan", ".nan")
+        case int() | float():
+            return str(value)
+        case str():
+            return repr(value if len(value) <= _LONGEST else value[:_LONGEST] + "…")
+        case Mapping():
+            return (
+                _shortened("a mapping with " + ", ".join(map(_key, value))) if value else "an empty mapping"
+            )
+        case list() | tuple():
+            return "a list" if value else "an empty list"
+        case _:
+            return f"a Python {type(value).__name__}"
+
+
+def _problem(path: Path, detail: ErrorDetails, value: object) -> Problem:
+    if detail["type"] == REFUSED:
+        return Problem(path, detail["msg"])
+    around = schema_at(detail["loc"][:-1])
+    if detail["type"] == _UNKNOWN:
+        known = keys_of(around)
+        return Problem(
+            path, "unknown key." + (nearest(str(path[-1]), known) or f" Known: {', '.join(known)}")
+        )
+    if detail["type"] == "missing" and isinstance(path[-1], int):
+        path, here = path[:-1], around
+    else:
+        here = schema_at(detail["loc"])
+    if detail["type"] == "missing":
+        return Problem(path, f"missing, expected {expected(here)}")
+    value = _at(value, path)
+    hint = nearest(value, choices_of(here)) if isinstance(value, str) else ""
+    return Problem(path, f"found {found(value)}, expected {expected(here)}{'.' if hint else ''}{hint}")
+
+
+def _path(detail: ErrorDetails) -> Path:
+    """Return the keys of an error's location: without union branches, with what a refusal adds."""
+    location = detail["loc"]
+    below: Path = detail["ctx"]["path"] if detail["type"] == REFUSED else ()
+    last = len(location) - 1 if detail["type"] == _UNKNOWN else -1
+    keys = [part for index, part in enumerate(location) if index == last or part not in _BRANCHES]
+    return (*keys, *below)
+
+
+def _at(value: Any, path: Path) -> Any:
+    for part in path:
+        value = value[part]
+    return value
+
+
+def _meant(missing: Path, unknown: Path) -> bool:
+    return missing[:-1] == unknown[:-1] and bool(nearest(str(unknown[-1]), [str(missing[-1])]))
+
+
+def _line(place: Place | None, problem: Problem) -> str:
+    return ": ".join(filter(None, (place and str(place), _dotted(problem.path), problem.message)))
+
+
+def _dotted(path: Path) -> str:
+    parts = [f"[{part}]" if isinstance(part, int) else f".{_key(part)}" for part in path]
+    return "".join(parts).removeprefix(".")
+
+
+def _key(key: object) -> str:
+    plain = isinstance(key, str) and key.isprintable() and not set(key) & set(". :'\"[]")
+    return _shortened(str(key)) if plain and key else _shortened(repr(key))
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST else text[:_LONGEST] + "…"

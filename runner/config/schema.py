@@ -1,0 +1,149 @@
+"""The JSON Schema of a configuration file, and what it says of one value in a few words."""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from runner.config.model import KEYS, ExperimentFile
+
+Schema = Mapping[str, Any]
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of what a YAML file may contain, shorthands included."""
+    return copy.deepcopy(_schema())
+
+
+@functools.cache
+def _schema() -> dict[str, Any]:
+    from pydantic.json_schema import GenerateJsonSchema
+
+    schema = ExperimentFile.model_json_schema()
+    for model in (schema, *schema["$defs"].values()):
+        for value in model["properties"].values():
+            value.pop("title", None)
+            if model is schema and value.get("default", ...) is None:
+                del value["default"]
+    return {
+        "$schema": GenerateJsonSchema.schema_dialect,
+        "title": "Experiment",
+        "description": schema["description"],
+        "type": "object",
+        "additionalProperties": False,
+        "properties": {key: schema["properties"][key] for key in KEYS},
+        "required": schema["required"],
+        "$defs": schema["$defs"],
+    }
+
+
+def schema_at(location: tuple[str | int, ...]) -> Schema:
+    """Return the schema of the value at `location`, or an empty one.
+
+    Besides keys and list positions, a location may name the branch of a union on its way: the model's
+    name for a mapping, the JSON type for anything else.
+    """
+    node: Schema = _schema()
+    for part in location:
+        node = next((found for branch in branches(node) for found in _inside(branch, part)), {})
+    return node
+
+
+def branches(node: Schema) -> Iterator[Schema]:
+    """Yield the alternatives that a schema offers, each with its `$ref` followed and its name as `ref`."""
+    for alternative in node.get("oneOf", node.get("anyOf", ())):
+        yield from branches(alternative)
+    if "$ref" in node:
+        name = node["$ref"].rpartition("/")[2]
+        yield {"ref": name, **_schema()["$defs"][name]}
+    elif "oneOf" not in node and "anyOf" not in node:
+        yield node
+
+
+def _inside(branch: Schema, part: str | int) -> Iterator[Schema]:
+    if isinstance(part, int):
+        positions = branch.get("prefixItems", ())
+        if part < len(positions):
+            yield positions[part]
+        elif "items" in branch:
+            yield branch["items"]
+    elif part in branch.get("properties", ()):
+        yield branch["properties"][part]
+    elif part == branch.get("ref", branch.get("type")):
+        yield branch
+
+
+def keys_of(node: Schema) -> list[str]:
+    """Return the keys that a mapping may have here."""
+    return list(dict.fromkeys(key for branch in branches(node) for key in branch.get("properties", ())))
+
+
+def choices_of(node: Schema) -> list[str]:
+    """Return the words that are accepted here."""
+    return [word for branch in branches(node) for word in _words(branch)]
+
+
+def _words(branch: Schema) -> list[str]:
+    return list(branch.get("enum", [branch["const"]] if "const" in branch else []))
+
+
+def expected(node: Schema) -> str:
+    """Return in a few words what may stand here: `a number from 0 to 1`."""
+    simple, kinds, mappings = [], [], []
+    for branch in branches(node):
+        properties = branch.get("properties", {})
+        if "schedule" in properties:
+            kinds.append(properties["schedule"]["const"])
+        elif properties:
+            mappings.append("a mapping with " + ", ".join(properties))
+        else:
+            simple.append(_simple(branch))
+    schedules = [f"a mapping with schedule: {_either(kinds)}"] if kinds else []
+    simple.sort(key=lambda words: words == "null")
+    return _either([*dict.fromkeys(simple), *schedules, *mappings])
+
+
+def _either(alternatives: list[str]) -> str:
+    *most, last = alternatives or ["something else"]
+    return f"{', '.join(most)} or {last}" if most else last
+
+
+def _simple(branch: Schema) -> str:  # noqa: PLR0911 - one line a kind
+    if words := _words(branch):
+        return _either([repr(word) for word in words])
+    if "prefixItems" in branch:
+        return "[" + ", ".join(map(_simple, branch["prefixItems"])) + "]"
+    match branch.get("type"):
+        case "integer":
+            return "a whole number" + _range(branch)
+        case "number":
+            return "a number" + _range(branch)
+        case "array":
+            return f"a list, each item {expected(branch['items'])}"
+        case "string":
+            return str(
+                branch.get("patternErrorMessage", "text, not empty" if "minLength" in branch else "text")
+            )
+        case kind:
+            return {"boolean": "true or false", "object": "a mapping", "null": "null"}.get(
+                str(kind), "a value"
+            )
+
+
+def _bound(number: float) -> str:
+    if isinstance(number, int) and number >= 10**9:
+        exponent = len(str(number)) - 1
+        return f"10^{exponent}" if number == 10**exponent else f"2^{number.bit_length()} - 1"
+    return f"{number:,}"
+
+
+def _range(branch: Schema) -> str:
+    low, above = branch.get("minimum"), branch.get("exclusiveMinimum")
+    high = branch.get("maximum")
+    if low is not None and high is not None:
+        return f" from {low} to {_bound(high)}"
+    if above is not None and high is not None:
+        return f" above {above} and at most {_bound(high)}"
+    return ""

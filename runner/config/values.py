@@ -1,0 +1,101 @@
+"""What the models of a configuration have in common: sections, located refusals, free values.
+
+A section is one frozen mapping of known keys. A refusal is a validator's own error: it names the key
+it is about, so that the line a user reads points there. Free values are the arguments of an
+environment, which the models know nothing about beyond that JSON and YAML can carry them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
+
+REFUSED = "refused"
+"""The type of the errors that `refusal` makes; their message is shown to users as it stands."""
+
+Path = tuple[str | int, ...]
+"""Where a value stands in a configuration: keys and list positions from the top."""
+
+MAX_DEPTH = 50
+"""How deep values may be nested; also what stops a value that contains itself."""
+
+Count = Annotated[int, Field(ge=1, le=10**12)]
+"""A number of episodes or steps; bounded so that sums and products of them fit 64 bits."""
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class Section(BaseModel):
+    """One frozen mapping of a configuration: unknown keys, wrong types, NaN and infinity are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+def refusal(path: Path, message: str) -> PydanticCustomError:
+    """Return the error a validator raises to refuse the value at `path` below its own."""
+    return PydanticCustomError(REFUSED, "{message}", {"message": message, "path": path})
+
+
+class FrozenMapping(Mapping[str, Any]):
+    """A read-only mapping that can be hashed, pickled and passed on with `**`."""
+
+    __slots__ = ("_items",)
+
+    def __init__(self, items: Mapping[str, Any]) -> None:
+        self._items = dict(items)
+
+    def __getitem__(self, key: str) -> Any:
+        return self._items[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._items)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __hash__(self) -> int:
+        return hash(frozenset(self._items.items()))
+
+    def __repr__(self) -> str:
+        return f"FrozenMapping({self._items!r})"
+
+
+def frozen(value: object, path: Path = ()) -> Any:
+    """Return `value` with its mappings and lists made read-only; refuse what JSON cannot carry."""
+    if len(path) > MAX_DEPTH:
+        raise refusal(path[:1], f"nested deeper than {MAX_DEPTH} levels")
+    if isinstance(value, Mapping):
+        return FrozenMapping({_text(key, path): frozen(item, (*path, key)) for key, item in value.items()})
+    if isinstance(value, list | tuple):
+        return tuple(frozen(item, (*path, position)) for position, item in enumerate(value))
+    if isinstance(value, str):
+        return _text(value, path)
+    if isinstance(value, int) and not -(2**63) <= value < 2**64:
+        raise refusal(path, "found a whole number of more than 64 bits, expected one that fits")
+    if value is None or isinstance(value, int) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    what = "a number that is not finite" if isinstance(value, float) else f"a Python {type(value).__name__}"
+    raise refusal(path, f"found {what}, expected text, a number, true, false, null, a list or a mapping")
+
+
+def plain(value: object) -> Any:
+    """Return `frozen` undone: dictionaries and lists, which the caller may change."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value
+
+
+def _text(value: object, path: Path) -> str:
+    if not isinstance(value, str):
+        raise refusal(path, f"found the key {value!r}, expected text")
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        raise refusal(path, f"found {value!r}, expected text that UTF-8 can carry") from None
+    return value

@@ -1,0 +1,100 @@
+"""A tabular environment as the kernel wants it: small arrays that stay in the processor's caches.
+
+An outcome of a (state, joint action) is two 32-bit integers: the next state and an *outcome class*.
+Outcomes of one class agree in rewards, termination and events, so whatever else a step needs is looked
+up in arrays of a few dozen entries.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.mdp import Mdp
+
+PENALTY_BIT = np.uint32(1 << 31)
+"""Bit of an event class that marks a penalty; events themselves use the bits below it."""
+
+
+class Model(NamedTuple):
+    """The arrays of one environment, for learners that share its joint action.
+
+    S states, J joint actions, K outcomes a pair at most, L learners, C outcome classes, E event classes.
+    """
+
+    outcome: NDArray[np.int32]
+    """[S * J * K, 2]: next state, outcome class."""
+    cumulative: NDArray[np.float64]
+    """[S * J, K]: cumulative probability of the outcomes; the last real one and all after it are 1."""
+    rewards: NDArray[np.float64]
+    """[C, L]: reward of each learner."""
+    terminated: NDArray[np.bool_]
+    """[C]."""
+    event_class: NDArray[np.int32]
+    """[C]."""
+    event_mask: NDArray[np.uint32]
+    """[E]: bit i is event i, bit 31 a penalty."""
+    start_states: NDArray[np.int32]
+    """States an episode can start in."""
+    start_cumulative: NDArray[np.float64]
+    """Their cumulative probability; the last is 1."""
+    own_action: NDArray[np.int32]
+    """[J, L]: each learner's part of a joint action."""
+    stride: NDArray[np.int64]
+    """[L]: a joint action is the sum of own actions times these."""
+    width: NDArray[np.int64]
+    """[L]: number of own actions."""
+    step_limit: int
+    """Steps after which an episode is truncated; 0 for never."""
+
+
+def build_model(mdp: Mdp, tables: str) -> Model:
+    """Return `mdp` prepared for one `joint` table, or for one table `per_agent`."""
+    width = np.array([mdp.joint_actions] if tables == "joint" else mdp.action_counts, dtype=np.int64)
+    stride = np.array([int(np.prod(width[i + 1 :])) for i in range(len(width))], dtype=np.int64)
+    joint = np.arange(mdp.joint_actions, dtype=np.int64)
+    rewards = mdp.rewards_of(len(width))
+    classes, class_of = _outcome_classes(mdp, rewards)
+    masks = classes["mask"]
+    event_mask, event_class = np.unique(masks, return_inverse=True)
+    support = np.flatnonzero(mdp.start > 0)
+    return Model(
+        outcome=np.stack([mdp.next_state.reshape(-1), class_of], axis=1).astype(np.int32),
+        cumulative=_cumulative(mdp.probability.reshape(-1, mdp.probability.shape[-1])),
+        rewards=np.ascontiguousarray(classes["rewards"]),
+        terminated=np.ascontiguousarray(classes["terminated"]),
+        event_class=event_class.astype(np.int32),
+        event_mask=event_mask.astype(np.uint32),
+        start_states=support.astype(np.int32),
+        start_cumulative=_cumulative(mdp.start[support][None])[0],
+        own_action=((joint[:, None] // stride) % width).astype(np.int32),
+        stride=stride,
+        width=width,
+        step_limit=mdp.step_limit,
+    )
+
+
+def _outcome_classes(
+    mdp: Mdp, rewards: NDArray[np.float64]
+) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+    """Return the distinct (rewards, terminated, mask) of all outcomes, and each outcome's class."""
+    learners = rewards.shape[-1]
+    kind = np.dtype([("rewards", "<f8", (learners,)), ("terminated", "?"), ("mask", "<u4")])
+    rows = np.zeros(mdp.next_state.size, dtype=kind)
+    rows["rewards"] = rewards.reshape(-1, learners) + 0.0  # turns -0.0 into 0.0: equal bytes when equal
+    rows["terminated"] = mdp.terminated.reshape(-1)
+    penalty = mdp.summed_rewards.reshape(-1) < mdp.penalty_below
+    rows["mask"] = mdp.events.reshape(-1) | np.where(penalty, PENALTY_BIT, np.uint32(0))
+    raw = rows.view(np.dtype((np.void, kind.itemsize)))
+    _, first, class_of = np.unique(raw, return_index=True, return_inverse=True)
+    return rows[first], class_of
+
+
+def _cumulative(probability: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return cumulative probabilities along the last axis, exactly 1 from the last possible entry on."""
+    total = np.cumsum(probability, axis=-1)
+    left = np.cumsum(probability[:, ::-1], axis=-1)[:, ::-1]  # what is still to come, this one included
+    total[left - probability <= 0] = 1.0
+    return total

@@ -1,0 +1,264 @@
+"""A tabular Gymnasium environment as arrays: all that the runner ever learns of it.
+
+An environment offers its arrays as documented attributes of `env.unwrapped` (`transitions`, `agents`,
+`agent_action_counts`, `event_names`, `success_events`, `penalty_below`, `scene`, `scene_cells`,
+`scene_carriers`), or only Gymnasium's customary `P` and `initial_state_distrib`; what it does not offer
+is left out, not invented. From here on nothing knows which environment it was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import EnvironmentNotUsable, nearest
+
+MAX_EVENTS = 31
+MAX_AGENTS = 31
+
+
+@dataclass(frozen=True, eq=False)
+class Mdp:
+    """A Markov decision process: S states, J joint actions, at most K outcomes a pair, R reward columns."""
+
+    env_id: str
+    kwargs: Mapping[str, Any]
+    next_state: NDArray[np.int32]
+    """[S, J, K]."""
+    probability: NDArray[np.float64]
+    """[S, J, K]; 0 where a pair has fewer outcomes, those come last."""
+    rewards: NDArray[np.float64]
+    """[S, J, K, R]; R is 1 (all agents share it), or the number of agents."""
+    terminated: NDArray[np.bool_]
+    """[S, J, K]."""
+    events: NDArray[np.uint32]
+    """[S, J, K]: bit i is `event_names[i]`."""
+    start: NDArray[np.float64]
+    """[S]: probability that an episode starts there."""
+    step_limit: int
+    """Steps after which an episode is truncated; 0 for never."""
+    agents: tuple[str, ...]
+    action_counts: tuple[int, ...]
+    """Actions of each agent; a joint action counts them up like digits, the first agent's foremost."""
+    event_names: tuple[str, ...] = ()
+    success_events: tuple[str, ...] = ()
+    penalty_below: float = -np.inf
+    """A step whose summed reward is lower counts as a penalty."""
+    scene: Mapping[str, Any] | None = None
+    scene_cells: NDArray[np.int16] | None = None
+    """[S, things]: the cell of each thing, row * columns + column."""
+    scene_carriers: NDArray[np.int8] | None = None
+    """[S, things]: which thing carries it, or -1."""
+
+    @property
+    def states(self) -> int:
+        """Number of states."""
+        return len(self.next_state)
+
+    @property
+    def joint_actions(self) -> int:
+        """Number of joint actions."""
+        return int(self.next_state.shape[1])
+
+    @property
+    def success_mask(self) -> int:
+        """The bits of `events` that mean success; 0 if the environment names none."""
+        return sum(1 << self.event_names.index(name) for name in self.success_events)
+
+    @property
+    def summed_rewards(self) -> NDArray[np.float64]:
+        """[S, J, K]: the reward of all agents together."""
+        return np.asarray(self.rewards.sum(axis=-1))
+
+    def rewards_of(self, learners: int) -> NDArray[np.float64]:
+        """Return rewards as [S, J, K, learners]: their own where there are several, else the shared one."""
+        if self.rewards.shape[-1] in (learners, 1):
+            return np.broadcast_to(self.rewards, (*self.rewards.shape[:-1], learners))
+        raise EnvironmentNotUsable(
+            f"{self.env_id} pays {self.rewards.shape[-1]} agents one by one, but one table for all is to "
+            "learn from the reward: set `rewards: team`, or `tables: per_agent`."
+        )
+
+    def description(self) -> dict[str, Any]:
+        """Return all that is not an array, as JSON can hold it."""
+        return {
+            "env_id": self.env_id,
+            "kwargs": dict(self.kwargs),
+            "step_limit": self.step_limit,
+            "agents": list(self.agents),
+            "action_counts": list(self.action_counts),
+            "event_names": list(self.event_names),
+            "success_events": list(self.success_events),
+            "penalty_below": None if np.isinf(self.penalty_below) else self.penalty_below,
+            "scene": None if self.scene is None else dict(self.scene),
+        }
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays by field name."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
+
+
+def from_parts(description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Mdp:
+    """Return the Mdp that `description()` and `arrays()` came from, checked like a new one."""
+    penalty = description["penalty_below"]
+    mdp = Mdp(
+        env_id=description["env_id"],
+        kwargs=description["kwargs"],
+        step_limit=description["step_limit"],
+        agents=tuple(description["agents"]),
+        action_counts=tuple(description["action_counts"]),
+        event_names=tuple(description["event_names"]),
+        success_events=tuple(description["success_events"]),
+        penalty_below=-np.inf if penalty is None else penalty,
+        scene=description["scene"],
+        **arrays,
+    )
+    _check(mdp)
+    return mdp
+
+
+def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> Mdp:
+    """Make the environment and return its arrays.
+
+    Args:
+        env_id: a Gymnasium id; the part before a colon is a module to import first.
+        kwargs: arguments of the environment.
+        rewards: `team`, or `individual` for a reward an agent (the environment's `competitive=True`).
+
+    Raises:
+        EnvironmentNotUsable: it is unknown, cannot be made, or has no transition table.
+    """
+    env = _make(env_id, dict(kwargs) | ({"competitive": True} if rewards == "individual" else {}))
+    base = env.unwrapped
+    limit = env.spec.max_episode_steps if env.spec is not None else None
+    transitions = _transitions(env_id, base)
+    joint = transitions["next_state"].shape[1]
+    mdp = Mdp(
+        env_id=env_id,
+        kwargs=dict(kwargs),
+        **transitions,
+        start=np.ascontiguousarray(base.initial_state_distrib, dtype=np.float64),
+        step_limit=int(limit or 0),
+        agents=tuple(getattr(base, "agents", ("agent",))),
+        action_counts=tuple(int(n) for n in getattr(base, "agent_action_counts", (joint,))),
+        event_names=tuple(getattr(base, "event_names", ())),
+        success_events=tuple(getattr(base, "success_events", ())),
+        penalty_below=float(getattr(base, "penalty_below", -np.inf)),
+        scene=getattr(base, "scene", None),
+        scene_cells=getattr(base, "scene_cells", None),
+        scene_carriers=getattr(base, "scene_carriers", None),
+    )
+    env.close()
+    _check(mdp)
+    if rewards == "individual" and mdp.rewards.shape[-1] != len(mdp.agents):
+        raise EnvironmentNotUsable(f"{env_id} does not pay its agents one by one: set `rewards: team`.")
+    return mdp
+
+
+def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
+    """Return the environment, without the wrappers that only check or render."""
+    import gymnasium
+
+    module, _, name = env_id.rpartition(":")
+    if module:
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            raise EnvironmentNotUsable(
+                f"environment {env_id!r}: there is no module {error.name!r}; "
+                "install the package that brings it, or mend `env.id`."
+            ) from error
+    if name not in gymnasium.registry:
+        newest = [known for known in gymnasium.registry if known.rpartition("-v")[0] == name.rpartition("-v")[0]]
+        hint = f" Did you mean {newest[-1]!r}?" if newest else nearest(name, gymnasium.registry)
+        raise EnvironmentNotUsable(f"environment {env_id!r}: Gymnasium knows no such id.{hint}")
+    try:
+        return gymnasium.make(name, disable_env_checker=True, **kwargs)
+    except (TypeError, ValueError, KeyError, gymnasium.error.Error, ImportError) as error:
+        given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
+        raise EnvironmentNotUsable(f"environment {env_id!r} cannot be made with {given}: {error}") from error
+
+
+def _transitions(env_id: str, base: Any) -> dict[str, NDArray[Any]]:
+    """Return the transition arrays, from the environment's own or from its `P`."""
+    if hasattr(base, "transitions"):
+        own = base.transitions
+        return {
+            "next_state": np.ascontiguousarray(own.next_state, dtype=np.int32),
+            "probability": np.ascontiguousarray(own.probability, dtype=np.float64),
+            "rewards": np.ascontiguousarray(own.rewards, dtype=np.float64),
+            "terminated": np.ascontiguousarray(own.terminated, dtype=np.bool_),
+            "events": np.ascontiguousarray(own.events, dtype=np.uint32),
+        }
+    if not hasattr(base, "P") or not hasattr(base, "initial_state_distrib"):
+        raise EnvironmentNotUsable(
+            f"environment {env_id!r} offers no transition table (`P` and `initial_state_distrib`), which "
+            "tabular learning here needs. DualTaxi-v1, Taxi-v4, FrozenLake-v1 and CliffWalking-v1 have one."
+        )
+    return _transitions_from_p(base.P)
+
+
+def _transitions_from_p(p: Mapping[int, Mapping[int, list[tuple[float, int, Any, bool]]]]) -> dict[str, NDArray[Any]]:
+    """Return arrays from Gymnasium's `P[state][action] = [(probability, next state, reward, terminated)]`."""
+    states, actions = len(p), len(p[0])
+    most = max(len(outcomes) for row in p.values() for outcomes in row.values())
+    shape = (states, actions, most)
+    next_state, probability = np.zeros(shape, np.int32), np.zeros(shape)
+    rewards, terminated = np.zeros((*shape, 1)), np.zeros(shape, np.bool_)
+    for s, row in p.items():
+        for a, outcomes in row.items():
+            for k, (chance, successor, reward, over) in enumerate(outcomes):
+                next_state[s, a, k], probability[s, a, k] = successor, chance
+                rewards[s, a, k, 0], terminated[s, a, k] = float(np.sum(reward)), over
+    return {
+        "next_state": next_state,
+        "probability": probability,
+        "rewards": rewards,
+        "terminated": terminated,
+        "events": np.zeros(shape, np.uint32),
+    }
+
+
+def _check(mdp: Mdp) -> None:
+    """Refuse arrays that contradict each other: an environment, or a recording, may bring anything."""
+    shape = mdp.next_state.shape
+    problems = [
+        ("next_state must have three axes", mdp.next_state.ndim == 3 and mdp.next_state.size > 0),
+        ("next_state must name states", _within(mdp.next_state, 0, shape[0])),
+        ("shapes must agree", mdp.probability.shape == mdp.terminated.shape == mdp.events.shape == shape),
+        ("rewards must add one axis", mdp.rewards.shape[:-1] == shape),
+        ("rewards must be one, or one an agent", mdp.rewards.shape[-1] in (1, len(mdp.agents))),
+        ("rewards must be finite", bool(np.isfinite(mdp.rewards).all())),
+        ("probabilities of a pair must add up to 1", _sums_to_one(mdp.probability)),
+        ("start must be a distribution over states", mdp.start.shape == shape[:1] and _sums_to_one(mdp.start)),
+        ("the agents' actions must make the joint actions", int(np.prod(mdp.action_counts)) == shape[1]),
+        ("each agent needs a number of actions", len(mdp.agents) == len(mdp.action_counts)),
+        (f"at most {MAX_AGENTS} agents", 1 <= len(mdp.agents) <= MAX_AGENTS),
+        (f"at most {MAX_EVENTS} events", len(mdp.event_names) <= MAX_EVENTS),
+        ("success events must be events", set(mdp.success_events) <= set(mdp.event_names)),
+    ]
+    for expectation, holds in problems:
+        if not holds:
+            raise EnvironmentNotUsable(f"environment {mdp.env_id!r}: {expectation}; found otherwise.")
+
+
+def _within(values: NDArray[Any], low: int, high: int) -> bool:
+    return bool(values.size) and int(values.min()) >= low and int(values.max()) < high
+
+
+def _sums_to_one(probability: NDArray[np.float64]) -> bool:
+    total = probability.sum(axis=-1)
+    return bool((probability >= 0).all() and np.allclose(total, 1.0, atol=1e-9))
+
+
+def description_bytes(mdp: Mdp) -> bytes:
+    """Return `description()` as canonical JSON."""
+    return json.dumps(mdp.description(), sort_keys=True, indent=1, ensure_ascii=False).encode()

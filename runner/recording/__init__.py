@@ -1,0 +1,1 @@
+"""Recordings: the format, the recorder that writes it and the reader that gives it back."""

@@ -1,0 +1,50 @@
+"""The content digest: by it two runs are equal or not.
+
+Per topic, BLAKE3 over its message records in order, each in canonical form: the MCAP message record with
+the topic's own channel id, sequence 0, and publish time equal to log time. Then BLAKE3 over the sorted
+topics that have messages: length of the name (u32), name, hash. It depends neither on where chunks were
+closed, nor on compression, index, provenance or `/log`.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+
+from blake3 import blake3
+
+from runner.recording.schema import TOPICS, Topic
+
+_PREFIX = b"dualtaxi content 0\n"
+
+
+class ContentHash:
+    """The running digest of a recording."""
+
+    def __init__(self) -> None:
+        self._topics = {topic.name: blake3() for topic in TOPICS if topic.digested}
+        self._bytes = dict.fromkeys(self._topics, 0)
+
+    def update(self, topic: Topic, records: bytes | memoryview) -> None:
+        """Take in whole message records of a topic, in canonical form."""
+        if topic.digested:
+            view = memoryview(records).cast("B")
+            self._topics[topic.name].update(view)
+            self._bytes[topic.name] += len(view)
+
+    def topics(self) -> dict[str, str]:
+        """Return the hash of each topic that has messages, in hexadecimal."""
+        return {name: self._topics[name].hexdigest() for name in sorted(self._topics) if self._bytes[name]}
+
+    def content(self) -> str:
+        """Return the content digest, in hexadecimal."""
+        return combine(self.topics())
+
+
+def combine(topics: Mapping[str, str]) -> str:
+    """Return the content digest made of the topics' hashes."""
+    whole = blake3(_PREFIX)
+    for name in sorted(topics):
+        encoded = name.encode()
+        whole.update(struct.pack("<I", len(encoded)) + encoded + bytes.fromhex(topics[name]))
+    return whole.hexdigest()

@@ -1,0 +1,207 @@
+"""The MCAP file being written: records in order, and what the summary will say of them.
+
+The `mcap` library lays out every record but two: chunks and message indexes come ready-made as bytes
+(see `chunks`), since they are what a recording consists of.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+
+from runner import __version__
+from runner.recording.chunks import Chunk
+from runner.recording.schema import PROFILE, TOPICS, Topic, file_descriptor_set
+
+LIBRARY = f"dualtaxi {__version__}"
+
+
+class RecordingFile:
+    """A recording on its way to disk: append, then `finish`. Not thread-safe."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file; one that exists is never overwritten.
+
+        Raises:
+            OSError: it exists, or cannot be created.
+        """
+        self.path = path
+        self._stream: BinaryIO = path.open("xb", buffering=0)
+        self._crc = 0
+        self._offset = 0
+        self._attachments: list[AttachmentIndex] = []
+        self._metadata: list[MetadataIndex] = []
+        self._chunks: list[ChunkIndex] = []
+        self._counts = {topic.channel: 0 for topic in TOPICS}
+        self._start_time: int | None = None
+        self._end_time = 0
+        self._schemas, self._channels = schemas_and_channels()
+        self._append(MCAP0_MAGIC)
+        self._append(_bytes_of(Header(PROFILE, LIBRARY), *self._schemas, *self._channels))
+
+    @property
+    def size(self) -> int:
+        """Bytes written so far."""
+        return self._offset
+
+    def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
+        """Append a metadata record."""
+        data = _bytes_of(Metadata(name=name, metadata=dict(entries)))
+        self._metadata.append(MetadataIndex(offset=self._offset, length=len(data), name=name))
+        self._append(data)
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Append an attachment; its times are 0, as wall clock is provenance."""
+        record = _bytes_of(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
+        self._attachments.append(
+            AttachmentIndex(
+                offset=self._offset,
+                length=len(record),
+                log_time=0,
+                create_time=0,
+                data_size=len(data),
+                name=name,
+                media_type=media_type,
+            )
+        )
+        self._append(record)
+
+    def add_chunk(self, topic: Topic, chunk: Chunk) -> None:
+        """Append a chunk of one topic and its message index."""
+        start = self._offset
+        self._append(chunk.record)
+        index_start = self._offset
+        if chunk.index:
+            self._append(chunk.index)
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=len(chunk.record),
+                chunk_start_offset=start,
+                compression=chunk.compression,
+                compressed_size=chunk.compressed_size,
+                message_end_time=chunk.end_time,
+                message_index_length=len(chunk.index),
+                message_index_offsets={topic.channel: index_start} if chunk.index else {},
+                message_start_time=chunk.start_time,
+                uncompressed_size=chunk.uncompressed_size,
+            )
+        )
+        self._counts[topic.channel] += chunk.messages
+        self._start_time = min(chunk.start_time, self._start_time if self._start_time is not None else 2**63)
+        self._end_time = max(chunk.end_time, self._end_time)
+
+    def sync(self) -> None:
+        """Ask the system to put on disk what was written."""
+        os.fsync(self._stream.fileno())
+
+    def cut_back(self) -> None:
+        """Remove the piece of a record that a failed write may have left at the end."""
+        self._stream.truncate(self._offset)
+        self._stream.seek(self._offset)
+
+    def finish(self) -> None:
+        """Write the end of the data section, the summary and the footer, and put all on disk."""
+        self._append(_bytes_of(DataEnd(self._crc)))
+        summary_start = self._offset
+        summary, offsets = self._summary(summary_start)
+        offsets_start = summary_start + len(summary)
+        body = summary + offsets
+        crc = zlib.crc32(body)
+        crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, offsets_start), crc)
+        footer = Footer(summary_start=summary_start, summary_offset_start=offsets_start, summary_crc=crc)
+        self._append(body + _bytes_of(footer) + MCAP0_MAGIC)
+        self.sync()
+
+    def close(self) -> None:
+        """Close the file as it is."""
+        self._stream.close()
+
+    def _append(self, data: bytes) -> None:
+        view = memoryview(data)
+        while view:
+            view = view[self._stream.write(view) :]
+        self._crc = zlib.crc32(data, self._crc)
+        self._offset += len(data)
+
+    def _summary(self, start: int) -> tuple[bytes, bytes]:
+        """Return the summary section and the summary offset section, to stand at `start`."""
+        groups: list[tuple[Opcode, list[McapRecord]]] = [
+            (Opcode.SCHEMA, list(self._schemas)),
+            (Opcode.CHANNEL, list(self._channels)),
+            (Opcode.STATISTICS, [self._statistics()]),
+            (Opcode.CHUNK_INDEX, list(self._chunks)),
+            (Opcode.ATTACHMENT_INDEX, list(self._attachments)),
+            (Opcode.METADATA_INDEX, list(self._metadata)),
+        ]
+        body, offsets = bytearray(), []
+        for opcode, records in groups:
+            data = _bytes_of(*records)
+            if data:
+                offsets.append(
+                    SummaryOffset(group_opcode=opcode, group_start=start + len(body), group_length=len(data))
+                )
+            body += data
+        return bytes(body), _bytes_of(*offsets)
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts={channel: n for channel, n in self._counts.items() if n},
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            metadata_count=len(self._metadata),
+            message_start_time=self._start_time or 0,
+            message_end_time=self._end_time,
+            schema_count=len(self._schemas),
+        )
+
+
+def schemas_and_channels() -> tuple[list[Schema], list[Channel]]:
+    """Return the schema and channel records that every recording has; a schema's id counts from 1."""
+    messages = list(dict.fromkeys(topic.message for topic in TOPICS))
+    schemas = [
+        Schema(id=number, name=message.full_name, encoding="protobuf", data=file_descriptor_set(message))
+        for number, message in enumerate(messages, start=1)
+    ]
+    channels = [
+        Channel(
+            id=topic.channel,
+            topic=topic.name,
+            message_encoding="protobuf",
+            metadata={},
+            schema_id=1 + messages.index(topic.message),
+        )
+        for topic in TOPICS
+    ]
+    return schemas, channels
+
+
+def _bytes_of(*records: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    return bytes(builder.end())
