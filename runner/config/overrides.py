@@ -24,15 +24,14 @@ def override(document: Document, overrides: Sequence[str]) -> None:
     for text in overrides:
         path, read = _parse(text)
         assigned.add(path[0])
-        for rival in _RIVALS.get(path[0], ()) if read.value is not None else ():
+        for rival in _RIVALS.get(path[0], ()):
             if rival not in assigned:
-                _assign(document, (rival,), Document(None))
-        if len(path) > 1 and document.value.get(path[0], _ABSENT) is _ABSENT:
+                _forget(document, rival)
+        if len(path) > 1 and path[0] not in document.value:
             _assign(document, path[:1], Document(_default(path[0]), {(): read.places[()]}))
         _assign(document, path, read)
 
 
-_ABSENT = object()
 _LONGEST = 80
 
 
@@ -50,11 +49,16 @@ def _parse(text: str) -> tuple[tuple[str, ...], Document]:
     return path, read
 
 
+def _forget(document: Document, key: str) -> None:
+    document.value = {other: value for other, value in document.value.items() if other != key}
+    document.problems = [problem for problem in document.problems if problem.path[:1] != (key,)]
+
+
 def _assign(document: Document, path: tuple[str, ...], read: Document) -> None:
     for old in [place for place in document.places if place[: len(path)] == path]:
         del document.places[old]
     document.value = _with(document.value, path, read.value)
-    document.places.update({(*path, *below): place for below, place in read.places.items()})
+    document.places |= {(*path, *below): place for below, place in read.places.items()}
     document.problems = [problem for problem in document.problems if problem.path[: len(path)] != path]
     document.problems += [problem._replace(path=(*path, *problem.path)) for problem in read.problems]
 

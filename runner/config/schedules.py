@@ -123,9 +123,7 @@ def _names_its_schedule(value: object) -> object:
 
 def _stays_positive(value: float | Schedule) -> float | Schedule:
     if isinstance(value, Section) and value.reaches_zero():
-        raise refusal(
-            (), "the schedule reaches 0, expected values above 0: set `floor`, or change its numbers"
-        )
+        raise refusal((), "found a schedule that reaches 0, expected values above 0: set its floor")
     return value
 
 

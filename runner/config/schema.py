@@ -121,7 +121,7 @@ def _simple(branch: Schema) -> str:  # noqa: PLR0911 - one line a kind
         case "number":
             return "a number" + _range(branch)
         case "array":
-            return f"a list, each item {expected(branch['items'])}"
+            return f"a list [{expected(branch['items'])}, ...]"
         case "string":
             return str(
                 branch.get("patternErrorMessage", "text, not empty" if "minLength" in branch else "text")
