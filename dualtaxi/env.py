@@ -186,8 +186,10 @@ class DualTaxiEnv(gymnasium.Env[Any, Any]):
             raise ValueError(f"render_mode is {render_mode!r}, expected one of {modes}, or None")
         if not is_number(slip) or not 0 <= slip <= 1:
             raise ValueError(f"slip is {slip!r}, expected a probability from 0 to 1")
+        if not isinstance(competitive, bool):
+            raise ValueError(f"competitive is {competitive!r}, expected True or False")
         self.render_mode = render_mode
-        self.competitive = bool(competitive)
+        self.competitive = competitive
         self.rewards = Rewards.of(rewards)
         self.slip = float(slip)
         self.grid = Grid.from_text(DEFAULT_MAP if map is None else map)
@@ -218,6 +220,7 @@ class DualTaxiEnv(gymnasium.Env[Any, Any]):
         if self.s is None:
             raise ResetNeeded("step() before an episode has begun; call reset() first")
         self.last_actions = decode_action(action)
+        action = encode_action(*self.last_actions)
         outcome = self._draw(self.s, action)
         table = self.transitions
         rewards = table.rewards[self.s, action, outcome]

@@ -112,7 +112,11 @@ class Grid:
 
 def _size(text: Sequence[str]) -> tuple[int, int]:
     """Return the rows and columns of a map whose frame is drawn as it should be."""
-    if isinstance(text, str) or not all(isinstance(line, str) for line in text):
+    if (
+        isinstance(text, str)
+        or not isinstance(text, Sequence)
+        or not all(isinstance(line, str) for line in text)
+    ):
         raise ValueError(
             f"map is {text!r}, expected a list of strings, one a line; see dualtaxi.DEFAULT_MAP for the style"
         )

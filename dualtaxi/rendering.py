@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dualtaxi.drawing import Canvas, ink_on, mix, text_width
 from dualtaxi.encoding import State
 from dualtaxi.grid import ACTIONS, Grid
-from dualtaxi.scene import BLACK, ORANGE, PURPLE, SKY_BLUE, YELLOW, landmark_colour
+from dualtaxi.scene import BLACK, ORANGE, PURPLE, SKY_BLUE, YELLOW, landmark_colours
 
 LEGEND = "1 2 taxis, p passenger waiting, P passenger in the taxi, * destination"
 
@@ -149,16 +149,14 @@ class Picture:
         edge = (self._left - _FRAME, self._top - _FRAME)
         canvas.box(edge, (self._left + across + _FRAME, self._bottom + _FRAME), _INK, 14)
         canvas.box((self._left, self._top), (self._left + across, self._top + down), _ROAD, 7)
-        colours = {mark[1:]: landmark_colour(mark) for mark in self._grid.landmarks}
+        marks = list(zip(self._grid.landmarks, landmark_colours(self._grid), strict=True))
+        tints = {mark[1:]: mix(_WHITE, colour, 0.28) for mark, colour in marks}
         for row in range(self._grid.rows):
             for column in range(self._grid.columns):
                 x, y = self._corner((row, column))
-                colour = colours.get((row, column))
-                tint = mix(_WHITE, colour, 0.28) if colour else _WHITE
-                canvas.box((x, y), (x + _CELL, y + _CELL), tint, 6)
-        for mark in self._grid.landmarks:
+                canvas.box((x, y), (x + _CELL, y + _CELL), tints.get((row, column), _WHITE), 6)
+        for mark, colour in marks:
             x, y = self._corner(mark[1:])
-            colour = landmark_colour(mark)
             canvas.box((x + 10, y + 9), (x + 46, y + 45), colour, 7)
             canvas.text((x + 28 - text_width("R", 20) / 2, y + 17), mark.name, 20, ink_on(colour))
         for row, column in self._grid.walls:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dualtaxi.encoding import AGENTS, Encoding
-from dualtaxi.grid import ACTIONS, MOVES, Grid, Landmark
+from dualtaxi.grid import ACTIONS, MOVES, Grid
 
 THINGS = (*AGENTS, "passenger", "destination")
 """What has a place in every state, in the order of `scene_cells` and `scene_carriers`."""
@@ -20,10 +21,12 @@ YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 _NAMED_COLOURS = {"R": VERMILLION, "G": GREEN, "Y": YELLOW, "B": BLUE}
 
 
-def landmark_colour(landmark: Landmark) -> str:
-    """Return the colour of a landmark as "#rrggbb": R, G, Y and B are what they stand for."""
-    colours = tuple(_NAMED_COLOURS.values())
-    return _NAMED_COLOURS.get(landmark.name, colours[ord(landmark.name) % len(colours)])
+def landmark_colours(grid: Grid) -> tuple[str, ...]:
+    """Return the colour of each landmark as "#rrggbb": R, G, Y and B are what they stand for."""
+    names = [mark.name for mark in grid.landmarks]
+    unused = [colour for name, colour in _NAMED_COLOURS.items() if name not in names]
+    others = cycle(unused or _NAMED_COLOURS.values())
+    return tuple(_NAMED_COLOURS.get(name) or next(others) for name in names)
 
 
 def describe_scene(grid: Grid) -> dict[str, Any]:
@@ -46,8 +49,8 @@ def describe_scene(grid: Grid) -> dict[str, Any]:
         "columns": grid.columns,
         "walls": [[[row, column], [row, column + 1]] for row, column in grid.walls],
         "landmarks": [
-            {"name": mark.name, "cell": [mark.row, mark.column], "colour": landmark_colour(mark)}
-            for mark in grid.landmarks
+            {"name": mark.name, "cell": [mark.row, mark.column], "colour": colour}
+            for mark, colour in zip(grid.landmarks, landmark_colours(grid), strict=True)
         ],
         "things": movers + others,
         "actions": [

@@ -32,7 +32,7 @@ _MOVE_1 = np.s_[:, np.newaxis, np.newaxis, np.newaxis, :, np.newaxis]  # [cells,
 _MOVE_2 = np.s_[np.newaxis, :, np.newaxis, np.newaxis, np.newaxis, :]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Transitions:
     """Every outcome of every joint action in every state; read-only arrays.
 
