@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from runner.config.document import Document, Place, read_yaml
+from runner.config.document import Document, Place, Problem, read_yaml
 from runner.config.model import ExperimentFile
 from runner.config.values import MAX_DEPTH, Path, Section
 from runner.errors import ConfigError
@@ -51,7 +51,7 @@ def _parse(text: str) -> tuple[tuple[str, ...], Document]:
 
 def _forget(document: Document, key: str) -> None:
     document.value = {other: value for other, value in document.value.items() if other != key}
-    document.problems = [problem for problem in document.problems if problem.path[:1] != (key,)]
+    document.problems = _without(document.problems, (key,))
 
 
 def _assign(document: Document, path: tuple[str, ...], read: Document) -> None:
@@ -59,8 +59,13 @@ def _assign(document: Document, path: tuple[str, ...], read: Document) -> None:
         del document.places[old]
     document.value = _with(document.value, path, read.value)
     document.places |= {(*path, *below): place for below, place in read.places.items()}
-    document.problems = [problem for problem in document.problems if problem.path[: len(path)] != path]
+    document.problems = _without(document.problems, path)
     document.problems += [problem._replace(path=(*path, *problem.path)) for problem in read.problems]
+
+
+def _without(problems: list[Problem], path: Path) -> list[Problem]:
+    """Return `problems` but those of the value at `path`; one of the text itself, with its own place, stays."""
+    return [problem for problem in problems if problem.place or problem.path[: len(path)] != path]
 
 
 def _with(value: object, path: Path, new: object) -> Any:

@@ -1,0 +1,299 @@
+"""Running a job: the only place where learning meets recording."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from runner import runs
+from runner.config.model import RunTable
+from runner.errors import RunnerError
+from runner.job import Job
+from runner.learning.learner import Learner
+from runner.mdp import Mdp, description_bytes, load_mdp
+from runner.provenance import provenance
+from runner.recording import schema
+from runner.recording.chunks import Packing
+from runner.recording.messages import QTable, encode, encode_log, encode_q_table
+from runner.recording.reader import pack_array
+from runner.recording.recorder import Recorder
+from runner.runs import Run
+
+REPORT_SECONDS: Final = 0.1
+
+
+@dataclass
+class Progress:
+    """How far a run is, as its `report` is told a few times a second."""
+
+    episodes: int
+    """Training episodes to do."""
+    episode: int = 0
+    train_steps: int = 0
+    eval_steps: int = 0
+    bytes_written: int = 0
+    evaluations: list[dict[str, Any]] = field(default_factory=list)
+    """The metrics of every evaluation so far."""
+
+
+Report = Callable[[Progress], None]
+Stop = Callable[[], bool]
+
+
+def run_job(
+    job: Job, run: Run, report: Report = lambda _: None, stop: Stop = lambda: False
+) -> Run:
+    """Train, evaluate and record a job; return its run, finished or interrupted.
+
+    Args:
+        job: what to do.
+        run: the folder made for it by `create_run`.
+        report: called with the progress a few times a second, and after every evaluation.
+        stop: asked every few milliseconds; when it says True the recording is closed properly and the
+            run is marked interrupted.
+
+    Raises:
+        RunnerError: the environment cannot be used, or the disk is full; the run is then marked failed.
+    """
+    started = time.monotonic()
+    try:
+        mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
+        learner = Learner(job.config, mdp, job.seed, _initial_tables(job, run, mdp))
+        recorder = _recorder(job, run, learner)
+    except RunnerError as error:
+        run.update(status="failed", summary={"error": str(error)})
+        raise
+    try:
+        _describe(recorder, job, run, learner)
+        session = _Session(job, learner, recorder, report, stop)
+        status = "finished" if session.run() else "interrupted"
+        topics = recorder.drain()
+        summary = session.summary(topics)
+        recorder.finish("result", {"json": json.dumps({"status": status, **summary}, sort_keys=True)})
+    except BaseException as error:
+        recorder.abandon()
+        status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        run.update(status=status, summary={"error": str(error), "bytes": recorder.bytes_written})
+        raise
+    summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": recorder.bytes_written}
+    return run.update(status=status, summary=summary)
+
+
+class _Session:
+    """One execution: alternates training and evaluation, and hands every block to the recorder."""
+
+    def __init__(self, job: Job, learner: Learner, recorder: Recorder, report: Report, stop: Stop) -> None:
+        self._config = job.config
+        self._learner = learner
+        self._recorder = recorder
+        self._report = report
+        self._stop = stop
+        self._progress = Progress(job.config.episodes)
+        self._evaluated = 0
+        self._last_report = 0.0
+
+    def run(self) -> bool:
+        """Do the whole job; return False if it was stopped before the end."""
+        self._log(f"training {self._config.episodes} episodes with {self._config.algorithm}")
+        for episode in self._boundaries():
+            if not (self._train(episode) and self._evaluate(episode)):
+                self._log("interrupted", "WARNING")
+                return False
+            if self._snapshot_is_due(episode):
+                self._snapshot()
+        self._log("finished")
+        return True
+
+    def summary(self, topics: dict[str, str]) -> dict[str, Any]:
+        """Return what is worth knowing of the run without opening its recording."""
+        from runner.recording.digest import combine
+
+        last = self._progress.evaluations[-1] if self._progress.evaluations else None
+        return {
+            "content_digest": combine(topics),
+            "topic_digests": topics,
+            "episodes": self._learner.episode,
+            "train_steps": self._recorder.steps["train"],
+            "eval_steps": self._recorder.steps["eval"],
+            "messages": {name: count for name, count in self._recorder.counts.items() if count},
+            "last_evaluation": last and evaluation_brief(last),
+        }
+
+    def _boundaries(self) -> Iterator[int]:
+        """Yield the episodes at which training pauses for an evaluation or a snapshot, and the last one."""
+        config = self._config
+        due = {0, config.episodes}
+        for every in (config.evaluation and config.evaluation.every, config.snapshots.every):
+            if every:
+                due.update(range(every, config.episodes, every))
+        yield from sorted(due)
+
+    def _train(self, until_episode: int) -> bool:
+        """Train up to an episode, reporting metrics on the way; return False if stopped."""
+        recorder, learner = self._recorder, self._learner
+        every = self._config.log.every_steps if self._config.log else 2**62
+        while learner.episode < until_episode:
+            if self._stop():
+                return False
+            next_log = (learner.step // every + 1) * every
+            steps, episodes = learner.train(
+                recorder.block(schema.TRAIN_STEP), recorder.block(schema.TRAIN_EPISODE), until_episode, next_log
+            )
+            recorder.commit("train", steps, episodes)
+            if learner.step == next_log:
+                metrics = encode(schema.TRAIN_METRICS, learner.training_side())
+                recorder.message(schema.TRAIN_METRICS_TOPIC, metrics)
+            self._tell()
+        return True
+
+    def _evaluate(self, episode: int) -> bool:
+        """Evaluate if it is due at this episode; return False if stopped."""
+        plan = self._config.evaluation
+        if plan is None or (episode % plan.every and episode != self._config.episodes):
+            return True
+        recorder, learner = self._recorder, self._learner
+        learner.begin_evaluation()
+        first = self._evaluated * plan.trials
+        done, trials = first, []
+        while done < first + plan.trials:
+            if self._stop():
+                return False
+            records = recorder.block(schema.EVAL_EPISODE)
+            steps, ended = learner.evaluate(recorder.block(schema.EVAL_STEP), records, first + plan.trials)
+            trials.append(records[:ended].copy())
+            recorder.commit("eval", steps, ended)
+            done += ended
+            self._tell()
+        metrics = evaluation_metrics(learner, self._evaluated, np.concatenate(trials))
+        recorder.message(schema.EVAL_METRICS_TOPIC, encode(schema.EVAL_METRICS, metrics))
+        self._evaluated += 1
+        self._progress.evaluations.append(metrics)
+        self._log(f"evaluation after {episode} episodes: {metrics['finish_percent']:.1f} % finished")
+        self._tell(now=True)
+        return True
+
+    def _snapshot_is_due(self, episode: int) -> bool:
+        every = self._config.snapshots.every
+        return episode in (0, self._config.episodes) or bool(every and episode % every == 0)
+
+    def _snapshot(self) -> None:
+        for i, agent in enumerate(self._learner.agents):
+            table = QTable(self._learner.step, self._learner.episode, agent, i, self._learner.table(i))
+            self._recorder.message(schema.Q_TABLE_TOPIC, encode_q_table(table))
+
+    def _log(self, text: str, level: str = "INFO") -> None:
+        steps = sum(self._recorder.steps.values())
+        self._recorder.message(schema.LOG_TOPIC, encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level))
+
+    def _tell(self, now: bool = False) -> None:
+        """Report the progress, not more often than is worth it."""
+        moment = time.monotonic()
+        if not now and moment - self._last_report < REPORT_SECONDS:
+            return
+        self._last_report = moment
+        progress = self._progress
+        progress.episode = self._learner.episode
+        progress.train_steps, progress.eval_steps = self._recorder.steps["train"], self._recorder.steps["eval"]
+        progress.bytes_written = self._recorder.bytes_written
+        self._report(progress)
+
+
+def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> dict[str, Any]:
+    """Return the measures of an evaluation from its episode records, and training's at that moment."""
+    known = bool(learner.mdp.success_events)
+    successes = int(trials["success"].sum())
+    return learner.training_side() | {
+        "evaluation": evaluation,
+        "trials": len(trials),
+        "successes": successes if known else -1,
+        "finish_percent": 100.0 * successes / len(trials) if known else float("nan"),
+        "eval_mean_length": float(trials["length"].mean()),
+        "mean_penalties": float(trials["penalties"].mean()),
+        "terminations": int(trials["terminated"].sum()),
+        "mean_returns": trials["returns"].mean(axis=0).tolist(),
+        "events": trials["events"].sum(axis=0, dtype=np.int64).tolist(),
+    }
+
+
+def evaluation_brief(metrics: dict[str, Any]) -> dict[str, Any]:
+    """Return the four figures of an evaluation that people quote; finish percent None if unknown."""
+    finished = metrics["finish_percent"]
+    return {
+        "episode": metrics["episode"],
+        "finish_percent": None if finished != finished else finished,
+        "mean_length": metrics["eval_mean_length"],
+        "mean_penalties": metrics["mean_penalties"],
+    }
+
+
+def _recorder(job: Job, run: Run, learner: Learner) -> Recorder:
+    plan = job.config.recording
+    return Recorder(
+        run.folder / runs.RECORDING_FILE,
+        learners=len(learner.agents),
+        events=len(learner.mdp.event_names),
+        packing=Packing(plan.compression, plan.level or 0, plan.index),
+        chunk_steps=plan.chunk_steps,
+        record_steps=plan.steps == "all",
+        beat=run.beat,
+    )
+
+
+def _describe(recorder: Recorder, job: Job, run: Run, learner: Learner) -> None:
+    """Write what makes the recording self-contained."""
+    mdp = learner.mdp
+    recorder.metadata(
+        "run",
+        {
+            "format_version": str(schema.FORMAT_VERSION),
+            "run_id": run.run_id,
+            "name": run.name,
+            "seed": str(job.seed),
+            "job": job.identity,
+            "created": run.facts["created"],
+            "agents": json.dumps(learner.agents),
+            "learners": str(len(learner.agents)),
+            "events": str(len(mdp.event_names)),
+        },
+    )
+    recorder.metadata("config", {"json": json.dumps(job.config.to_mapping(), sort_keys=True)})
+    recorder.metadata("provenance", provenance())
+    description = json.loads(description_bytes(mdp)) | {"arrays": sorted(mdp.arrays())}
+    recorder.attachment("environment.json", "application/json", json.dumps(description, indent=1).encode())
+    for name, array in sorted(mdp.arrays().items()):
+        recorder.attachment(f"environment/{name}.npy.zst", "application/zstd", pack_array(array))
+
+
+def _initial_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
+    """Return the tables of the run that `initial_q` names, if it names one."""
+    start = job.config.initial_q
+    if not isinstance(start, RunTable):
+        return None
+    return recorded_tables(start, run.folder.parent, mdp, job)
+
+
+def recorded_tables(start: RunTable, recordings: Path, mdp: Mdp, job: Job) -> list[Any]:
+    """Return a recorded run's tables at the last snapshot, or at the step asked for.
+
+    Raises:
+        RunnerError: there is no such run or snapshot, or its tables have another shape.
+    """
+    from runner.recording.reader import open_recording
+
+    source = runs.find_run(start.run, recordings)
+    with open_recording(source.recording) as recording:
+        wanted = [table for table in recording.snapshots() if start.step is None or table.step == start.step]
+    step = wanted[-1].step if wanted else None
+    tables = [table.values for table in wanted if table.step == step]
+    joint = job.config.tables == "joint"
+    shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
+    if [table.shape for table in tables] != shapes:
+        found = [table.shape for table in tables] or "no snapshot"
+        raise RunnerError(f"initial_q: run {source.run_id} has {found} there, expected tables of shape {shapes}.")
+    return tables

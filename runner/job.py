@@ -1,0 +1,40 @@
+"""A job: a configuration with one seed. The same job gives the same content."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from blake3 import blake3
+
+from runner.config import ExperimentConfig
+
+NOT_CONTENT = ("name", "seeds", "recording")
+"""Keys of a configuration that change neither what is learned nor what is recorded of it."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One seed of an experiment."""
+
+    config: ExperimentConfig
+    seed: int
+
+    def content(self) -> dict[str, Any]:
+        """Return what determines the content of the job's recording, by key."""
+        mapping = self.config.to_mapping()
+        return {key: value for key, value in mapping.items() if key not in NOT_CONTENT} | {"seed": self.seed}
+
+    @property
+    def identity(self) -> str:
+        """A hash of `content()`: equal jobs, equal identities, whatever they are called."""
+        text = json.dumps(self.content(), sort_keys=True, separators=(",", ":"))
+        return blake3(text.encode()).hexdigest()[:32]
+
+
+def jobs_of(config: ExperimentConfig) -> Iterator[Job]:
+    """Yield the jobs of an experiment, one a seed."""
+    for seed in config.seeds:
+        yield Job(config, seed)

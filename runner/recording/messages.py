@@ -1,0 +1,96 @@
+"""Messages of variable size, to and from protobuf: metrics, Q-tables, log lines."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.schema import MessageType
+
+
+@dataclass(frozen=True, eq=False)
+class QTable:
+    """A snapshot: the table of one agent after `step` training steps, in which `episode` episodes ended."""
+
+    step: int
+    episode: int
+    agent: str
+    table: int
+    values: NDArray[np.float64]
+    """[states, actions]."""
+
+
+def encode(message: MessageType, values: Mapping[str, Any]) -> bytes:
+    """Return the message with these field values; a field that is missing is protobuf's zero."""
+    return bytes(schema.message_class(message)(**values).SerializeToString(deterministic=True))
+
+
+def decode(message: MessageType, payload: bytes) -> dict[str, Any]:
+    """Return the values of a message's fields; repeated ones as lists.
+
+    Raises:
+        RecordingError: the payload is no such message.
+    """
+    try:
+        parsed = schema.message_class(message).FromString(payload)
+    except DecodeError as error:
+        raise RecordingError(f"found a payload that is no {message.full_name} ({error})") from error
+    return {
+        field.name: list(value) if field.repeated else value
+        for field in message.fields
+        for value in (getattr(parsed, field.name),)
+    }
+
+
+def encode_q_table(table: QTable) -> bytes:
+    """Return a `dualtaxi.QTable`; values as little-endian float64, row-major."""
+    return encode(
+        schema.Q_TABLE,
+        {
+            "step": table.step,
+            "episode": table.episode,
+            "agent": table.agent,
+            "table": table.table,
+            "shape": list(table.values.shape),
+            "dtype": "<f8",
+            "data": np.ascontiguousarray(table.values, dtype="<f8").tobytes(),
+        },
+    )
+
+
+def decode_q_table(payload: bytes) -> QTable:
+    """Return the snapshot in a `dualtaxi.QTable`.
+
+    Raises:
+        RecordingError: shape, dtype and data do not fit together.
+    """
+    fields = decode(schema.Q_TABLE, payload)
+    shape, data = tuple(fields["shape"]), fields["data"]
+    if fields["dtype"] != "<f8" or len(shape) != 2 or shape[0] * shape[1] * 8 != len(data):
+        raise RecordingError(
+            f"found a Q-table of shape {shape}, dtype {fields['dtype']!r} and {len(data)} bytes; "
+            "expected two axes of little-endian float64"
+        )
+    values = np.frombuffer(data, dtype="<f8").reshape(shape)
+    return QTable(fields["step"], fields["episode"], fields["agent"], fields["table"], values)
+
+
+def encode_log(text: str, seconds: float, level: str = "INFO") -> bytes:
+    """Return a `foxglove.Log` at a logical time."""
+    whole = int(seconds)
+    return encode(
+        schema.LOG,
+        {
+            "timestamp": {"seconds": whole, "nanos": round((seconds - whole) * 1e9)},
+            "level": schema.LOG_LEVELS.index(level),
+            "message": text,
+            "name": "dualtaxi",
+        },
+    )
