@@ -13,7 +13,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from runner.config.document import Document, Problem, read_yaml
+from runner.config.document import Document, Place, Problem, read_yaml
 from runner.config.model import (
     LEARNERS,
     NAME_EXPECTED,
@@ -82,9 +82,14 @@ def _text(file: FilePath) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        byte = content[error.start]
-        raise ConfigError(f"{file}:{line}: found the byte 0x{byte:02x}, expected text in UTF-8") from None
+        line, column = (
+            content.count(b"\n", 0, error.start) + 1,
+            error.start - content.rfind(b"\n", 0, error.start),
+        )
+        place = Place(str(file), line, column)
+        raise ConfigError(
+            f"{place}: found the byte 0x{content[error.start]:02x}, expected text in UTF-8"
+        ) from None
 
 
 def _similar(file: FilePath) -> str:

@@ -27,8 +27,10 @@ def override(document: Document, overrides: Sequence[str]) -> None:
         for rival in _RIVALS.get(path[0], ()):
             if rival not in assigned:
                 _forget(document, rival)
-        if len(path) > 1 and path[0] not in document.value:
-            _assign(document, path[:1], Document(_default(path[0]), {(): read.places[()]}))
+        for length in range(1, len(path)):
+            if not isinstance(_at(document.value, path[:length]), Mapping | list | tuple):
+                start = {} if path[0] in document.value else _default(path[0])
+                _assign(document, path[:length], Document(start, {(): read.places[()]}))
         _assign(document, path, read)
 
 
@@ -64,7 +66,7 @@ def _assign(document: Document, path: tuple[str, ...], read: Document) -> None:
 
 
 def _without(problems: list[Problem], path: Path) -> list[Problem]:
-    """Return `problems` but those of the value at `path`; one of the text itself, with its own place, stays."""
+    """Return `problems` but those of the value at `path`; one with its own place is the text's, and stays."""
     return [problem for problem in problems if problem.place or problem.path[: len(path)] != path]
 
 
@@ -72,15 +74,31 @@ def _with(value: object, path: Path, new: object) -> Any:
     """Return a copy of `value` with `new` at `path`; only what lies on the path is copied."""
     if not path:
         return new
-    key, below = str(path[0]), path[1:]
-    if isinstance(value, list | tuple) and key.isdecimal() and key.isascii() and int(key) < len(value):
-        at = int(key)
+    key, below = path[0], path[1:]
+    if isinstance(value, list | tuple) and (at := _position(key, value)) is not None:
         return [*value[:at], _with(value[at], below, new), *value[at + 1 :]]
     mapping = dict(value) if isinstance(value, Mapping) else {}
     return {**mapping, key: _with(mapping.get(key), below, new)}
 
 
-def _default(key: str) -> object:
+def _at(value: Any, path: Path) -> Any:
+    for part in path:
+        if isinstance(value, Mapping):
+            value = value.get(part)
+        elif isinstance(value, list | tuple) and _position(part, value) is not None:
+            value = value[int(part)]
+        else:
+            return None
+    return value
+
+
+def _position(part: str | int, items: Sequence[object]) -> int | None:
+    """Return `part` as a position in `items`, if it is one."""
+    text = str(part)
+    return int(text) if text.isascii() and text.isdecimal() and int(text) < len(items) else None
+
+
+def _default(key: str) -> dict[str, Any]:
     field = ExperimentFile.model_fields.get(key)
     default = field.default if field else None
-    return default.model_dump(mode="json", exclude_unset=True) if isinstance(default, Section) else None
+    return default.model_dump(mode="json", exclude_unset=True) if isinstance(default, Section) else {}

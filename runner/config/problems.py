@@ -14,6 +14,7 @@ from runner.config.values import REFUSED, Path
 from runner.errors import ConfigError, nearest
 
 _LONGEST = 60
+_MOST = 200
 _UNKNOWN = "extra_forbidden"
 _BRANCHES = frozenset(
     ("number", "array", "Linear", "Exponential", "Piecewise", "RandomTable", "RunTable", "SeedRange")
@@ -37,13 +38,16 @@ def problems_in(error: ValidationError, value: object) -> list[Problem]:
 
 
 def refuse(problems: Sequence[Problem], document: Document) -> ConfigError:
-    """Return the error that lists `problems`, one a line, in the order of the text."""
+    """Return the error that lists `problems`, one a line, in the order of the text; past 200, their number."""
     first: dict[tuple[Path, Place | None], Problem] = {}
     for problem in problems:
         first.setdefault((problem.path, problem.place), problem)
     placed = [(problem.place or document.place(problem.path), problem) for problem in first.values()]
     placed.sort(key=lambda pair: pair[0][1:] if pair[0] and pair[0].line else (10**9, 0))
-    return ConfigError("\n".join(_line(place, problem) for place, problem in placed))
+    lines = [_line(place, problem) for place, problem in placed[:_MOST]]
+    if len(placed) > _MOST:
+        lines.append(f"... and {len(placed) - _MOST} more")
+    return ConfigError("\n".join(lines))
 
 
 def found(value: object) -> str:  # noqa: PLR0911 - one line a kind
@@ -66,7 +70,7 @@ def found(value: object) -> str:  # noqa: PLR0911 - one line a kind
                 _shortened("a mapping with " + ", ".join(map(_key, value))) if value else "an empty mapping"
             )
         case list() | tuple():
-            return "a list" if value else "an empty list"
+            return f"a list of {len(value)}" if value else "an empty list"
         case _:
             return f"a Python {type(value).__name__}"
 
@@ -80,12 +84,13 @@ def _problem(path: Path, detail: ErrorDetails, value: object) -> Problem:
         return Problem(
             path, "unknown key." + (nearest(str(path[-1]), known) or f" Known: {', '.join(known)}")
         )
-    if detail["type"] == "missing" and isinstance(path[-1], int):
-        path, here = path[:-1], around
-    else:
-        here = schema_at(detail["loc"])
+    if detail["type"] == "invalid_key":
+        return Problem((*path[:-1], str(path[-1])), "unknown key, which is not even text")
+    here = schema_at(detail["loc"])
     if detail["type"] == "missing":
-        return Problem(path, f"missing, expected {expected(here)}")
+        if not isinstance(path[-1], int):
+            return Problem(path, f"missing, expected {expected(here)}")
+        path, here = path[:-1], around
     value = _at(value, path)
     hint = nearest(value, choices_of(here)) if isinstance(value, str) else ""
     return Problem(path, f"found {found(value)}, expected {expected(here)}{'.' if hint else ''}{hint}")
