@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -72,10 +73,10 @@ class Effects(NamedTuple):
     illegal: NDArray[np.bool_]
 
 
-class Branch(NamedTuple):
-    """One direction that an action may take: as meant, or slipped to one of the two sides."""
+class Way(NamedTuple):
+    """One way in which a taxi's actions may turn out."""
 
-    cell_after: NDArray[np.intp]  # [cells, actions]
+    done: NDArray[np.intp]  # [actions]: the action that is done when each is meant
     probability: NDArray[np.float64]  # [actions]
 
 
@@ -91,16 +92,15 @@ def build_transitions(grid: Grid, encoding: Encoding, rewards: Rewards, slip: fl
     Raises:
         ValueError: The map is too large for its table to be held in memory.
     """
-    ways = branches(grid, slip)
+    ways = _ways(slip)
     count = encoding.states * len(ACTIONS) ** 2 * len(ways) ** 2
     if count > MAX_OUTCOMES:
         raise ValueError(
             f"map and slip make {count:,} outcomes ({encoding.states:,} states), expected at most "
             f"{MAX_OUTCOMES:,}; use a smaller map, fewer landmarks, or no slip"
         )
-    effects = (taxi_effects(0, grid, rewards), taxi_effects(1, grid, rewards))
-    outcomes = [_joint_outcome(encoding, rewards, pair, effects) for pair in itertools.product(ways, ways)]
-    return outcomes[0] if len(outcomes) == 1 else _merge_identical(outcomes)
+    sure = _sure_transitions(grid, encoding, rewards)
+    return sure if len(ways) == 1 else _with_slip(sure, ways)
 
 
 def taxi_effects(taxi: int, grid: Grid, rewards: Rewards) -> Effects:
@@ -135,23 +135,12 @@ def taxi_effects(taxi: int, grid: Grid, rewards: Rewards) -> Effects:
     )
 
 
-def branches(grid: Grid, slip: float) -> list[Branch]:
-    """Return the directions that actions may take, those that no action ever takes left out."""
-    moves = np.arange(len(ACTIONS)) < len(MOVES)
-    ways = [Branch(grid.cell_after, np.where(moves, 1.0 - slip, 1.0))]
-    for side in range(2):
-        turned = [SIDEWAYS[move][side] for move in range(len(MOVES))]
-        ways.append(Branch(grid.cell_after[:, [*turned, PICKUP, DROP_OFF]], np.where(moves, slip / 2, 0.0)))
-    return [way for way in ways if way.probability.any()]
-
-
-def _joint_outcome(
-    encoding: Encoding, rewards: Rewards, ways: tuple[Branch, Branch], effects: tuple[Effects, Effects]
-) -> Transitions:
-    """Return the one outcome (K = 1) in which the two taxis go their given ways."""
+def _sure_transitions(grid: Grid, encoding: Encoding, rewards: Rewards) -> Transitions:
+    """Return the transitions without slip, one outcome each (K = 1)."""
+    taxi_1, taxi_2 = (taxi_effects(taxi, grid, rewards) for taxi in range(len(AGENTS)))
     cell_1, cell_2, passenger, destination = np.ogrid[tuple(slice(n) for n in (*encoding.shape, 1, 1))][:4]
-    after_1, after_2 = ways[0].cell_after[_MOVE_1], ways[1].cell_after[_MOVE_2]
-    passenger_1, passenger_2 = effects[0].passenger[_TAXI_1], effects[1].passenger[_TAXI_2]
+    after_1, after_2 = grid.cell_after[_MOVE_1], grid.cell_after[_MOVE_2]
+    passenger_1, passenger_2 = taxi_1.passenger[_TAXI_1], taxi_2.passenger[_TAXI_2]
     collide = after_1 == after_2
     shared = (cell_1 == cell_2) & ~collide
     undone = collide | shared
@@ -162,16 +151,16 @@ def _joint_outcome(
     moved = _number(encoding, after_1, after_2, passenger_after, destination)
     # The published rules judge a delivery before they look for a collision, so one that a
     # collision undoes still ends the episode.
-    ends = effects[0].delivers[_TAXI_1] | effects[1].delivers[_TAXI_2] | shared
-    happened = np.where(undone, np.uint32(0), effects[0].events[_TAXI_1] | effects[1].events[_TAXI_2])
+    ends = taxi_1.delivers[_TAXI_1] | taxi_2.delivers[_TAXI_2] | shared
+    happened = np.where(undone, np.uint32(0), taxi_1.events[_TAXI_1] | taxi_2.events[_TAXI_2])
     collision = np.where(collide, np.uint32(1 << EVENT_NAMES.index("collision")), np.uint32(0))
     pay = [
         np.where(collide, rewards.collision, np.where(shared, SHARED_CELL_REWARDS[taxi], earned))
-        for taxi, earned in enumerate((effects[0].reward[_TAXI_1], effects[1].reward[_TAXI_2]))
+        for taxi, earned in enumerate((taxi_1.reward[_TAXI_1], taxi_2.reward[_TAXI_2]))
     ]
     return Transitions(
         next_state=_fold(encoding, np.where(collide, state, moved), np.int32),
-        probability=_fold(encoding, np.outer(ways[0].probability, ways[1].probability), np.float64),
+        probability=_fold(encoding, np.ones(1), np.float64),
         rewards=np.stack([_fold(encoding, part, np.float64) for part in pay], axis=-1),
         terminated=_fold(encoding, ends, np.bool_),
         events=_fold(encoding, happened | collision, np.uint32),
@@ -193,38 +182,65 @@ def _fold(encoding: Encoding, values: NDArray[Any], dtype: type[np.generic]) -> 
     return np.array(whole, dtype=dtype, order="C").reshape(encoding.states, count * count, 1)
 
 
-def _merge_identical(outcomes: list[Transitions]) -> Transitions:
-    """Return one set of transitions: outcomes that differ in nothing made one, padding put last."""
-    # Within one state and joint action the reward follows from what happened, so it need not be compared.
-    keys = [
-        o.next_state[..., 0].astype(np.int64) << 32 | o.events[..., 0] << 1 | o.terminated[..., 0]
-        for o in outcomes
+def _ways(slip: float) -> list[Way]:
+    """Return the ways actions may turn out: as meant, and to either side; only those that happen."""
+    moves = np.arange(len(ACTIONS)) < len(MOVES)
+    ways = [Way(np.arange(len(ACTIONS)), np.where(moves, 1.0 - slip, 1.0))]
+    for side in range(2):
+        turned = np.array([*(sides[side] for sides in SIDEWAYS), PICKUP, DROP_OFF])
+        ways.append(Way(turned, np.where(moves, slip / 2, 0.0)))
+    return [way for way in ways if way.probability.any()]
+
+
+def _with_slip(sure: Transitions, ways: list[Way]) -> Transitions:
+    """Return the transitions in which what is done may differ from what was meant.
+
+    Outcomes that differ in nothing are made one; padding comes last.
+    """
+    pairs = list(itertools.product(ways, ways))
+    done = [np.add.outer(first.done * len(ACTIONS), second.done).ravel() for first, second in pairs]
+    chances = [
+        np.tile(np.outer(first.probability, second.probability).ravel(), (len(sure.next_state), 1))
+        for first, second in pairs
     ]
-    chances = [o.probability[..., 0].copy() for o in outcomes]
-    for later in range(1, len(outcomes)):
-        for earlier in range(later):
-            same = (keys[earlier] == keys[later]) & (chances[earlier] > 0)
-            chances[earlier] += np.where(same, chances[later], 0.0)
-            chances[later][same] = 0.0
-    probability = np.stack(chances, axis=-1)
-    real = probability > 0
-    order = np.argsort(~real, axis=-1, kind="stable")[..., : real.sum(axis=-1).max()]
-    real = np.take_along_axis(real, order, axis=-1)
+    _merge_identical(sure, done, chances)
 
-    def ordered(values: NDArray[Any]) -> NDArray[Any]:
-        return np.where(real, np.take_along_axis(values, order, axis=-1), np.zeros((), values.dtype))
+    taken = [np.nonzero(chance) for chance in chances]
+    filled = np.zeros(chances[0].shape, dtype=np.intp)
+    places = []
+    for pair in taken:
+        places.append((*pair, filled[pair]))
+        filled[pair] += 1
 
-    def joined(name: str) -> NDArray[Any]:
-        return np.concatenate([getattr(o, name) for o in outcomes], axis=2)
+    def packed(parts: Iterable[NDArray[Any]], like: NDArray[Any]) -> NDArray[Any]:
+        whole = np.zeros((*filled.shape, filled.max(), *like.shape[3:]), dtype=like.dtype)
+        for part, pair, place in zip(parts, taken, places, strict=True):
+            whole[place] = part[pair]
+        return whole
 
-    pay = joined("rewards")
+    def chosen(values: NDArray[Any]) -> NDArray[Any]:
+        return packed((values[:, action, 0] for action in done), values)
+
     return Transitions(
-        next_state=ordered(joined("next_state")),
-        probability=ordered(probability),
-        rewards=np.stack([ordered(pay[..., taxi]) for taxi in range(len(AGENTS))], axis=-1),
-        terminated=ordered(joined("terminated")),
-        events=ordered(joined("events")),
+        next_state=chosen(sure.next_state),
+        probability=packed(chances, sure.probability),
+        rewards=chosen(sure.rewards),
+        terminated=chosen(sure.terminated),
+        events=chosen(sure.events),
     )
+
+
+def _merge_identical(
+    sure: Transitions, done: list[NDArray[np.intp]], chances: list[NDArray[np.float64]]
+) -> None:
+    """Give the chance of each outcome to the first one that is the same; changes `chances`."""
+    # A slip turns moves into moves: within a pair equal events mean equal rewards, which need no comparing.
+    key = sure.next_state.astype(np.int64) << 32 | sure.events << 1 | sure.terminated
+    keys = [key[:, action, 0] for action in done]
+    for later, earlier in ((i, j) for i in range(len(keys)) for j in range(i)):
+        same = np.nonzero((keys[earlier] == keys[later]) & (chances[earlier] > 0))
+        chances[earlier][same] += chances[later][same]
+        chances[later][same] = 0.0
 
 
 def summed(transitions: Transitions) -> Transitions:
