@@ -7,7 +7,7 @@ The scalars are those of YAML 1.2's core schema, which editors use too: `1e-3` i
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from runner.errors import ConfigError
 MAX_NODES = 100_000
 """How many values a text may hold, its aliases expanded."""
 
+_LONGEST = 60
 _TAG = "tag:yaml.org,2002:"
 _INT = re.compile(r"^(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$")
 _SCALARS = (
@@ -162,7 +163,7 @@ class _Builder:
             return [self.value(item, (*path, position)) for position, item in enumerate(node.value)]
         if isinstance(node, yaml.ScalarNode) and known in _CONVERT:
             return self._scalar(node, known, path)
-        tag = "!!" + known if known != node.tag else node.tag
+        tag = _shown("!!" + known if known != node.tag else node.tag)
         self.problems.append(Problem(path, f"found the tag {tag}, expected a plain value without a tag"))
         return None
 
@@ -192,22 +193,27 @@ class _Builder:
             self.problems.append(Problem(path, "found the merge key <<, expected the keys themselves", place))
             return None
         if node.tag != _TAG + "str":
-            self.problems.append(Problem(path, f"found the key {node.value}, expected text: quote it", place))
+            message = f"found the key {_shown(node.value)}, expected text: quote it"
+            self.problems.append(Problem(path, message, place))
             return None
         return str(node.value)
 
     def _scalar(self, node: yaml.ScalarNode, known: str, path: Path) -> Any:
         try:
             return _CONVERT[known](node.value)
-        except ValueError:
-            message = f"found {node.value[:40]!r}{'…' * (len(node.value) > 40)}, which is no {_KIND[known]}"
-            self.problems.append(Problem(path, message))
+        except (ValueError, KeyError):
+            self.problems.append(Problem(path, f"found {_shown(node.value)}, which is no {_KIND[known]}"))
             return None
 
     def _place(self, node: yaml.Node) -> Place:
         if not self.lines:
             return Place(self.source)
         return Place(self.source, node.start_mark.line + 1, node.start_mark.column + 1)
+
+
+def _shown(text: str) -> str:
+    short = text if len(text) <= _LONGEST else text[:_LONGEST] + "…"
+    return short if short.isprintable() else repr(short)
 
 
 def _whole_number(text: str) -> int:
@@ -220,11 +226,13 @@ def _number(text: str) -> float:
     return float(re.sub(r"^([-+]?)\.(inf|nan)$", r"\1\2", text.lower()))
 
 
-_CONVERT: dict[str, Any] = {
-    "null": lambda _: None,
-    "bool": lambda text: {"true": True, "false": False}.get(text.lower()),
+_NULL = dict.fromkeys(("", "~", "null"))
+_BOOL = {"true": True, "false": False}
+_CONVERT: dict[str, Callable[[str], Any]] = {
+    "null": lambda text: _NULL[text.lower()],
+    "bool": lambda text: _BOOL[text.lower()],
     "int": _whole_number,
     "float": _number,
     "str": str,
 }
-_KIND = {"int": "whole number of a usable size", "float": "number"}
+_KIND = {"null": "null", "bool": "true or false", "int": "whole number of a usable size", "float": "number"}

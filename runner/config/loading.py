@@ -82,19 +82,14 @@ def _text(file: FilePath) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        line, column = (
-            content.count(b"\n", 0, error.start) + 1,
-            error.start - content.rfind(b"\n", 0, error.start),
-        )
-        place = Place(str(file), line, column)
-        raise ConfigError(
-            f"{place}: found the byte 0x{content[error.start]:02x}, expected text in UTF-8"
-        ) from None
+        before, byte = content[: error.start], content[error.start]
+        place = Place(str(file), before.count(b"\n") + 1, error.start - before.rfind(b"\n"))
+        raise ConfigError(f"{place}: found the byte 0x{byte:02x}, expected text in UTF-8") from None
 
 
 def _similar(file: FilePath) -> str:
     try:
-        return nearest(str(file), map(str, file.parent.glob("*.y*ml")))
+        return nearest(file.name, [beside.name for beside in file.parent.glob("*.y*ml")])
     except OSError:
         return ""
 

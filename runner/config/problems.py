@@ -38,7 +38,7 @@ def problems_in(error: ValidationError, value: object) -> list[Problem]:
 
 
 def refuse(problems: Sequence[Problem], document: Document) -> ConfigError:
-    """Return the error that lists `problems`, one a line, in the order of the text; past 200, their number."""
+    """Return the error that lists `problems`, in the order of the text; past 200, how many."""
     first: dict[tuple[Path, Place | None], Problem] = {}
     for problem in problems:
         first.setdefault((problem.path, problem.place), problem)
