@@ -106,6 +106,8 @@ def test_competitive_rewards_are_in_info_and_their_sum_is_the_reward():
     _, reward, terminated, _, info = COMPETITIVE.step(COMPETITIVE.encode_action(5, 2))
     assert info["rewards"].tolist() == [100, -1]
     assert (reward, terminated) == (99, True)
+    info["rewards"][:] = 0  # the user's own
+    assert COMPETITIVE.transitions.rewards.any()
 
 
 def test_cooperative_info_has_no_rewards_of_single_taxis():

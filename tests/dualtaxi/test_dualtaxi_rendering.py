@@ -131,6 +131,28 @@ def test_pictures_differ_by_all_that_a_state_holds(change):
     assert (show(env, env.encode(**state)) != show(env, env.encode(**state | change))).sum() > 500
 
 
+def test_a_passenger_aboard_is_seen_in_the_taxi():
+    env = PICTURES[0]
+
+    def ink_around(passenger: int, place: tuple[int, int]) -> int:
+        picture = show(env, env.encode((1, 1), (2, 2), passenger, 2))
+        quarter = picture.shape[1] // 4
+        row, column = place[0] * quarter, place[1] * quarter
+        return int((picture[row : row + quarter, column : column + quarter] < 60).all(axis=2).sum())
+
+    for passenger, place, other in ((4, (1, 1), (2, 2)), (5, (2, 2), (1, 1))):
+        assert ink_around(passenger, place) > ink_around(0, place) + 100
+        assert ink_around(passenger, other) == ink_around(0, other)
+
+
+def test_a_new_episode_shows_no_actions_of_the_last(in_colour):
+    TEXT.reset(seed=0)
+    TEXT.step(0)
+    assert "taxi 1: south" in TEXT.render()
+    TEXT.reset()
+    assert "taxi 1" not in TEXT.render()
+
+
 def test_pictures_show_the_last_actions():
     env = PICTURES[0]
     assert not np.array_equal(show(env, 1, (SOUTH, SOUTH)), show(env, 1, (SOUTH, DROP_OFF)))
