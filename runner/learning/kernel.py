@@ -27,8 +27,8 @@ class Tables(NamedTuple):
 
     q: NDArray[np.float64]
     """[sum of S * width]: table i starts at offset[i], row-major."""
-    offset: NDArray[np.int64]
-    """[L]."""
+    offset: tuple[int, ...]
+    """[L]; a tuple, as `Model.width`: their length is known when the kernel is compiled."""
     greedy: NDArray[np.int32]
     """[L, S]: the lowest action of the highest value."""
     value: NDArray[np.float64]
@@ -76,7 +76,7 @@ def _start_state(model: Model, bits: np.uint64) -> int:
 
 @numba.njit(inline="always")
 def _outcome(model: Model, pair: int, key: np.uint64, t: int) -> int:
-    """Return the row of `model.outcome` that follows the (state, joint action) `pair` at time t."""
+    """Return the index of the outcome that follows the (state, joint action) `pair` at time t."""
     outcomes = model.cumulative.shape[1]
     if outcomes == 1:
         return pair
@@ -108,11 +108,13 @@ def _update(tables: Tables, i: int, state: int, action: int, width: int, target:
 def _rescan(tables: Tables, i: int, state: int, row: int, width: int) -> None:
     """Find the state's greedy action and value anew."""
     best = 0
+    highest = tables.q[row]
     for action in range(1, width):
-        if tables.q[row + action] > tables.q[row + best]:
+        if tables.q[row + action] > highest:
+            highest = tables.q[row + action]
             best = action
     tables.greedy[i, state] = best
-    tables.value[i, state] = tables.q[row + best]
+    tables.value[i, state] = highest
 
 
 @numba.njit(inline="always")
@@ -173,6 +175,7 @@ def train(
     epsilon = schedule_value(rules.epsilon, episode, step)
     if rules.epsilon_exploits:
         epsilon = 1.0 - epsilon
+    place = step % window
     filled = ended = 0
     while filled < len(steps) and ended < len(episodes) and episode < until_episode and step < until_step:
         if t == 0:
@@ -208,8 +211,8 @@ def train(
 
         # Take it, and observe.
         outcome = _outcome(model, state * joint_actions + action, chance, t)
-        next_state = model.outcome[outcome, 0]
-        kind = model.outcome[outcome, 1]
+        next_state = model.next_state[outcome]
+        kind = model.outcome_class[outcome]
         terminated = model.terminated[kind]
         truncated = t + 1 == model.step_limit
 
@@ -237,7 +240,10 @@ def train(
         record.truncated = truncated
         record.explored = explored
         tally.event_classes[model.event_class[kind]] += 1
-        tally.recent_outcomes[step % window] = kind
+        tally.recent_outcomes[place] = kind
+        place += 1
+        if place == window:
+            place = 0
         filled += 1
         step += 1
         t += 1
@@ -283,8 +289,8 @@ def evaluate(
             explored = every_learner
 
         outcome = _outcome(model, state * joint_actions + action, chance, t)
-        next_state = model.outcome[outcome, 0]
-        kind = model.outcome[outcome, 1]
+        next_state = model.next_state[outcome]
+        kind = model.outcome_class[outcome]
         terminated = model.terminated[kind]
         truncated = t + 1 == model.step_limit
 

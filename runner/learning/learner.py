@@ -85,7 +85,7 @@ class Learner:
         if not self.rules.learns:
             self._policy.fill(-1)
             return
-        self._policy[:] = (self.tables.greedy.T * self.model.stride).sum(axis=1)
+        self._policy[:] = (self.tables.greedy.T * np.array(self.model.stride)).sum(axis=1)
 
     def evaluate(
         self, steps: NDArray[np.void], episodes: NDArray[np.void], until_episode: int
@@ -177,11 +177,11 @@ def rules_of(config: ExperimentConfig) -> Rules:
 
 
 def _tables(model: Model, states: int) -> Tables:
-    sizes = model.width * states
-    learners = len(model.width)
+    sizes = [width * states for width in model.width]
+    learners = len(sizes)
     return Tables(
-        q=np.zeros(int(sizes.sum())),
-        offset=np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64),
+        q=np.zeros(sum(sizes)),
+        offset=tuple(sum(sizes[:i]) for i in range(learners)),
         greedy=np.zeros((learners, states), np.int32),
         value=np.zeros((learners, states)),
     )

@@ -7,6 +7,7 @@ up in arrays of a few dozen entries.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +25,10 @@ class Model(NamedTuple):
     S states, J joint actions, K outcomes a pair at most, L learners, C outcome classes, E event classes.
     """
 
-    outcome: NDArray[np.int32]
-    """[S * J * K, 2]: next state, outcome class."""
+    next_state: NDArray[np.int32]
+    """[S * J * K]."""
+    outcome_class: NDArray[np.int32]
+    """[S * J * K]; an array of its own, so that the one that every step waits for is small."""
     cumulative: NDArray[np.float64]
     """[S * J, K]: cumulative probability of the outcomes; the last real one and all after it are 1."""
     rewards: NDArray[np.float64]
@@ -42,9 +45,9 @@ class Model(NamedTuple):
     """Their cumulative probability; the last is 1."""
     own_action: NDArray[np.int32]
     """[J, L]: each learner's part of a joint action."""
-    stride: NDArray[np.int64]
+    stride: tuple[int, ...]
     """[L]: a joint action is the sum of own actions times these."""
-    width: NDArray[np.int64]
+    width: tuple[int, ...]
     """[L]: number of own actions."""
     step_limit: int
     """Steps after which an episode is truncated; 0 for never."""
@@ -52,8 +55,8 @@ class Model(NamedTuple):
 
 def build_model(mdp: Mdp, tables: str) -> Model:
     """Return `mdp` prepared for one `joint` table, or for one table `per_agent`."""
-    width = np.array([mdp.joint_actions] if tables == "joint" else mdp.action_counts, dtype=np.int64)
-    stride = np.array([int(np.prod(width[i + 1 :])) for i in range(len(width))], dtype=np.int64)
+    width = (mdp.joint_actions,) if tables == "joint" else mdp.action_counts
+    stride = tuple(math.prod(width[i + 1 :]) for i in range(len(width)))
     joint = np.arange(mdp.joint_actions, dtype=np.int64)
     rewards = mdp.rewards_of(len(width))
     classes, class_of = _outcome_classes(mdp, rewards)
@@ -61,7 +64,8 @@ def build_model(mdp: Mdp, tables: str) -> Model:
     event_mask, event_class = np.unique(masks, return_inverse=True)
     support = np.flatnonzero(mdp.start > 0)
     return Model(
-        outcome=np.stack([mdp.next_state.reshape(-1), class_of], axis=1).astype(np.int32),
+        next_state=mdp.next_state.reshape(-1),
+        outcome_class=class_of.astype(np.int32),
         cumulative=_cumulative(mdp.probability.reshape(-1, mdp.probability.shape[-1])),
         rewards=np.ascontiguousarray(classes["rewards"]),
         terminated=np.ascontiguousarray(classes["terminated"]),
@@ -69,7 +73,7 @@ def build_model(mdp: Mdp, tables: str) -> Model:
         event_mask=event_mask.astype(np.uint32),
         start_states=support.astype(np.int32),
         start_cumulative=_cumulative(mdp.start[support][None])[0],
-        own_action=((joint[:, None] // stride) % width).astype(np.int32),
+        own_action=((joint[:, None] // np.array(stride)) % np.array(width)).astype(np.int32),
         stride=stride,
         width=width,
         step_limit=mdp.step_limit,
