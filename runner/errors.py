@@ -50,7 +50,9 @@ class MissingExtra(RunnerError):
     """A command needs a package that is not installed; the message says which extra brings it."""
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
-        super().__init__(f"{purpose} needs {package}, which is not installed: pip install 'dualtaxi[{extra}]'")
+        super().__init__(
+            f"{purpose} needs {package}, which is not installed: pip install 'dualtaxi[{extra}]'"
+        )
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

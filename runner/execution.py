@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -46,9 +47,7 @@ Report = Callable[[Progress], None]
 Stop = Callable[[], bool]
 
 
-def run_job(
-    job: Job, run: Run, report: Report = lambda _: None, stop: Stop = lambda: False
-) -> Run:
+def run_job(job: Job, run: Run, report: Report = lambda _: None, stop: Stop = lambda: False) -> Run:
     """Train, evaluate and record a job; return its run, finished or interrupted.
 
     Args:
@@ -143,7 +142,10 @@ class _Session:
                 return False
             next_log = (learner.step // every + 1) * every
             steps, episodes = learner.train(
-                recorder.block(schema.TRAIN_STEP), recorder.block(schema.TRAIN_EPISODE), until_episode, next_log
+                recorder.block(schema.TRAIN_STEP),
+                recorder.block(schema.TRAIN_EPISODE),
+                until_episode,
+                next_log,
             )
             recorder.commit("train", steps, episodes)
             if learner.step == next_log:
@@ -189,7 +191,9 @@ class _Session:
 
     def _log(self, text: str, level: str = "INFO") -> None:
         steps = sum(self._recorder.steps.values())
-        self._recorder.message(schema.LOG_TOPIC, encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level))
+        self._recorder.message(
+            schema.LOG_TOPIC, encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level)
+        )
 
     def _tell(self, now: bool = False) -> None:
         """Report the progress, not more often than is worth it."""
@@ -199,7 +203,10 @@ class _Session:
         self._last_report = moment
         progress = self._progress
         progress.episode = self._learner.episode
-        progress.train_steps, progress.eval_steps = self._recorder.steps["train"], self._recorder.steps["eval"]
+        progress.train_steps, progress.eval_steps = (
+            self._recorder.steps["train"],
+            self._recorder.steps["eval"],
+        )
         progress.bytes_written = self._recorder.bytes_written
         self._report(progress)
 
@@ -226,7 +233,7 @@ def evaluation_brief(metrics: dict[str, Any]) -> dict[str, Any]:
     finished = metrics["finish_percent"]
     return {
         "episode": metrics["episode"],
-        "finish_percent": None if finished != finished else finished,
+        "finish_percent": None if math.isnan(finished) else finished,
         "mean_length": metrics["eval_mean_length"],
         "mean_penalties": metrics["mean_penalties"],
     }
@@ -295,5 +302,7 @@ def recorded_tables(start: RunTable, recordings: Path, mdp: Mdp, job: Job) -> li
     shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
     if [table.shape for table in tables] != shapes:
         found = [table.shape for table in tables] or "no snapshot"
-        raise RunnerError(f"initial_q: run {source.run_id} has {found} there, expected tables of shape {shapes}.")
+        raise RunnerError(
+            f"initial_q: run {source.run_id} has {found} there, expected tables of shape {shapes}."
+        )
     return tables

@@ -177,7 +177,9 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
                 "install the package that brings it, or mend `env.id`."
             ) from error
     if name not in gymnasium.registry:
-        newest = [known for known in gymnasium.registry if known.rpartition("-v")[0] == name.rpartition("-v")[0]]
+        newest = [
+            known for known in gymnasium.registry if known.rpartition("-v")[0] == name.rpartition("-v")[0]
+        ]
         hint = f" Did you mean {newest[-1]!r}?" if newest else nearest(name, gymnasium.registry)
         raise EnvironmentNotUsable(f"environment {env_id!r}: Gymnasium knows no such id.{hint}")
     try:
@@ -206,7 +208,9 @@ def _transitions(env_id: str, base: Any) -> dict[str, NDArray[Any]]:
     return _transitions_from_p(base.P)
 
 
-def _transitions_from_p(p: Mapping[int, Mapping[int, list[tuple[float, int, Any, bool]]]]) -> dict[str, NDArray[Any]]:
+def _transitions_from_p(
+    p: Mapping[int, Mapping[int, list[tuple[float, int, Any, bool]]]],
+) -> dict[str, NDArray[Any]]:
     """Return arrays from Gymnasium's `P[state][action] = [(probability, next state, reward, terminated)]`."""
     states, actions = len(p), len(p[0])
     most = max(len(outcomes) for row in p.values() for outcomes in row.values())
@@ -238,7 +242,10 @@ def _check(mdp: Mdp) -> None:
         ("rewards must be one, or one an agent", mdp.rewards.shape[-1] in (1, len(mdp.agents))),
         ("rewards must be finite", bool(np.isfinite(mdp.rewards).all())),
         ("probabilities of a pair must add up to 1", _sums_to_one(mdp.probability)),
-        ("start must be a distribution over states", mdp.start.shape == shape[:1] and _sums_to_one(mdp.start)),
+        (
+            "start must be a distribution over states",
+            mdp.start.shape == shape[:1] and _sums_to_one(mdp.start),
+        ),
         ("the agents' actions must make the joint actions", int(np.prod(mdp.action_counts)) == shape[1]),
         ("each agent needs a number of actions", len(mdp.agents) == len(mdp.action_counts)),
         (f"at most {MAX_AGENTS} agents", 1 <= len(mdp.agents) <= MAX_AGENTS),

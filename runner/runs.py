@@ -82,7 +82,7 @@ class Run:
     def _owner_lives(self) -> bool:
         owner = self.facts.get("owner", {})
         if owner.get("host") == socket.gethostname() and owner.get("boot_id") == boot_id():
-            return process_start(owner.get("pid", 0)) == owner.get("process_started")
+            return bool(process_start(owner.get("pid", 0)) == owner.get("process_started"))
         with contextlib.suppress(OSError):
             return time.time() - (self.folder / RUN_FILE).stat().st_mtime < HEARTBEAT_SECONDS
         return False
@@ -170,10 +170,14 @@ def find_run(name: str, recordings: Path) -> Run:
     if len(found) == 1:
         return found[0]
     if found:
-        several = "\n".join(f"  {run.run_id}  {run.name}  seed {run.seed}  {run.created:%Y-%m-%d %H:%M}" for run in found)
+        several = "\n".join(
+            f"  {run.run_id}  {run.name}  seed {run.seed}  {run.created:%Y-%m-%d %H:%M}" for run in found
+        )
         raise RunNotFound(f"{name!r} answers to {len(found)} runs; name one by its id:\n{several}")
     hint = nearest(name, [run.name for run in runs] + [run.run_id for run in runs])
-    raise RunNotFound(f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {len(runs)} there are.")
+    raise RunNotFound(
+        f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {len(runs)} there are."
+    )
 
 
 def _run_at(path: Path) -> Run:
@@ -214,7 +218,12 @@ def _from_recording(path: Path) -> Run:
 def owner() -> dict[str, Any]:
     """Return who this process is: host, boot, process id and its start."""
     pid = os.getpid()
-    return {"host": socket.gethostname(), "boot_id": boot_id(), "pid": pid, "process_started": process_start(pid)}
+    return {
+        "host": socket.gethostname(),
+        "boot_id": boot_id(),
+        "pid": pid,
+        "process_started": process_start(pid),
+    }
 
 
 def boot_id() -> str:
@@ -241,4 +250,4 @@ def _write_whole(path: Path, facts: dict[str, Any]) -> None:
     """Replace a file whole: a reader sees the old one or the new one."""
     fresh = path.with_suffix(f".{secrets.token_hex(4)}.tmp")
     fresh.write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    os.replace(fresh, path)
+    fresh.replace(path)

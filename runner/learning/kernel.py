@@ -64,6 +64,9 @@ class Tally(NamedTuple):
     """Ring over the last episodes: length of episode k at k modulo its length."""
 
 
+Index = np.uint64
+"""What the hot loops index with: numba leaves out the arithmetic for negative indices."""
+
 CURSOR = np.dtype([("step", "<i8"), ("episode", "<i8"), ("t", "<i8"), ("state", "<i8")])
 """Where a phase stands: steps taken, current episode, steps in it, current state (if t > 0)."""
 
@@ -71,7 +74,9 @@ CURSOR = np.dtype([("step", "<i8"), ("episode", "<i8"), ("t", "<i8"), ("state", 
 @numba.njit(inline="always")
 def _start_state(model: Model, bits: np.uint64) -> int:
     """Return the start state that falls to these bits."""
-    return model.start_states[np.searchsorted(model.start_cumulative, draws.uniform(bits), side="right")]
+    return Index(
+        model.start_states[np.searchsorted(model.start_cumulative, draws.uniform(bits), side="right")]
+    )
 
 
 @numba.njit(inline="always")
@@ -81,25 +86,29 @@ def _outcome(model: Model, pair: int, key: np.uint64, t: int) -> int:
     if outcomes == 1:
         return pair
     u = draws.uniform(draws.draw(key, t))
-    k = 0
+    k = Index(0)
     while u >= model.cumulative[pair, k]:
-        k += 1
-    return pair * outcomes + k
+        k += Index(1)
+    return pair * Index(outcomes) + k
 
 
 @numba.njit(inline="always")
-def _update(tables: Tables, i: int, state: int, action: int, width: int, target: float, step_size: float) -> None:
+def _update(
+    tables: Tables, i: int, state: int, action: int, width: int, target: float, step_size: float
+) -> None:
     """Move Q_i(state, action) towards the target; keep the state's greedy action and value true."""
-    row = tables.offset[i] + state * width
+    row = Index(tables.offset[i]) + state * Index(width)
     old = tables.q[row + action]
     new = old + step_size * (target - old)
     tables.q[row + action] = new
-    if action == tables.greedy[i, state]:
+    if action == Index(tables.greedy[i, state]):
         if new >= old:
             tables.value[i, state] = new
         else:
             _rescan(tables, i, state, row, width)
-    elif new > tables.value[i, state] or (new == tables.value[i, state] and action < tables.greedy[i, state]):
+    elif new > tables.value[i, state] or (
+        new == tables.value[i, state] and action < Index(tables.greedy[i, state])
+    ):
         tables.greedy[i, state] = action
         tables.value[i, state] = new
 
@@ -107,9 +116,9 @@ def _update(tables: Tables, i: int, state: int, action: int, width: int, target:
 @numba.njit(inline="always")
 def _rescan(tables: Tables, i: int, state: int, row: int, width: int) -> None:
     """Find the state's greedy action and value anew."""
-    best = 0
+    best = Index(0)
     highest = tables.q[row]
-    for action in range(1, width):
+    for action in range(Index(1), Index(width)):
         if tables.q[row + action] > highest:
             highest = tables.q[row + action]
             best = action
@@ -163,7 +172,7 @@ def train(
     they have is left alone. Everything that a later call needs is in the cursor, tables and tally.
     """
     at = cursor[0]
-    step, episode, t, state = at.step, at.episode, at.t, at.state
+    step, episode, t, state = at.step, at.episode, at.t, Index(at.state)
     learners = len(model.width)
     joint_actions = len(model.own_action)
     every_learner = (1 << learners) - 1
@@ -210,9 +219,9 @@ def train(
                     action += tables.greedy[i, state] * model.stride[i]
 
         # Take it, and observe.
-        outcome = _outcome(model, state * joint_actions + action, chance, t)
-        next_state = model.next_state[outcome]
-        kind = model.outcome_class[outcome]
+        outcome = _outcome(model, state * Index(joint_actions) + Index(action), chance, t)
+        next_state = Index(model.next_state[outcome])
+        kind = Index(model.outcome_class[outcome])
         terminated = model.terminated[kind]
         truncated = t + 1 == model.step_limit
 
@@ -222,11 +231,11 @@ def train(
                 target = model.rewards[kind, i]
                 if not terminated or rules.bootstrap_after_termination:
                     target += discount * tables.value[i, next_state]
-                own = model.own_action[action, 0 if rules.first_action_for_all else i]
+                own = Index(model.own_action[action, 0 if rules.first_action_for_all else i])
                 _update(tables, i, state, own, model.width[i], target, step_size)
 
         # Record it.
-        record = steps[filled]
+        record = steps[Index(filled)]
         record.step = step
         record.episode = episode
         record.t = t
@@ -239,8 +248,8 @@ def train(
         record.terminated = terminated
         record.truncated = truncated
         record.explored = explored
-        tally.event_classes[model.event_class[kind]] += 1
-        tally.recent_outcomes[place] = kind
+        tally.event_classes[Index(model.event_class[kind])] += 1
+        tally.recent_outcomes[Index(place)] = kind
         place += 1
         if place == window:
             place = 0
@@ -271,7 +280,7 @@ def evaluate(
 ) -> tuple[int, int]:
     """Play `policy` (the joint action of each state; -1 for a random one) as `train` trains."""
     at = cursor[0]
-    step, episode, t, state = at.step, at.episode, at.t, at.state
+    step, episode, t, state = at.step, at.episode, at.t, Index(at.state)
     learners = len(model.width)
     joint_actions = len(model.own_action)
     every_learner = (1 << learners) - 1
@@ -288,13 +297,13 @@ def evaluate(
             action = draws.below(bits, joint_actions)
             explored = every_learner
 
-        outcome = _outcome(model, state * joint_actions + action, chance, t)
-        next_state = model.next_state[outcome]
-        kind = model.outcome_class[outcome]
+        outcome = _outcome(model, state * Index(joint_actions) + Index(action), chance, t)
+        next_state = Index(model.next_state[outcome])
+        kind = Index(model.outcome_class[outcome])
         terminated = model.terminated[kind]
         truncated = t + 1 == model.step_limit
 
-        record = steps[filled]
+        record = steps[Index(filled)]
         record.step = step
         record.episode = episode
         record.t = t
@@ -307,7 +316,7 @@ def evaluate(
         record.terminated = terminated
         record.truncated = truncated
         record.explored = explored
-        tally.event_classes[model.event_class[kind]] += 1
+        tally.event_classes[Index(model.event_class[kind])] += 1
         filled += 1
         step += 1
         t += 1
@@ -342,5 +351,13 @@ def replay(
             target = record.rewards[i]
             if not record.terminated or rules.bootstrap_after_termination:
                 target += discount * tables.value[i, record.next_state]
-            own = model.own_action[record.action, 0 if rules.first_action_for_all else i]
-            _update(tables, i, record.state, own, model.width[i], target, step_size)
+            own = Index(model.own_action[record.action, 0 if rules.first_action_for_all else i])
+            _update(tables, i, Index(record.state), own, model.width[i], target, step_size)
+
+
+@numba.njit(cache=True)
+def fill_random(q: NDArray[np.float64], seed: np.uint64, low: float, high: float) -> None:
+    """Fill the tables with draws, uniform in [low, high)."""
+    state = draws.key(seed, draws.INITIAL_Q, 0)
+    for cell in range(len(q)):
+        q[cell] = low + (high - low) * draws.uniform(draws.draw(state, cell))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig
 from runner.config.model import RandomTable
-from runner.learning import draws, kernel
+from runner.learning import kernel
 from runner.learning.kernel import Rules, Tables, Tally
 from runner.learning.model import Model, build_model
 from runner.learning.schedules import compile_schedule, schedule_value
@@ -108,8 +107,8 @@ class Learner:
         """Return the measures of training at this moment, named as in the recording's metrics."""
         rewards, counts = self._reward_distribution()
         lengths = self._tally.recent_lengths[: min(self.episode, len(self._tally.recent_lengths))]
-        zero_cells = [int(self.table(i).size - np.count_nonzero(self.table(i))) for i in range(len(self.agents))]
-        sizes = [self.table(i).size for i in range(len(self.agents))]
+        tables = [self.table(i) for i in range(len(self.agents))]
+        zero_cells = [int(table.size - np.count_nonzero(table)) for table in tables]
         epsilon = float(schedule_value(self.rules.epsilon, self.episode, self.step))
         return {
             "step": self.step,
@@ -119,7 +118,8 @@ class Learner:
             "reward_counts": counts,
             "zero_cells": zero_cells,
             "percent_filled": [
-                100.0 * (size - zero) / size for size, zero in zip(sizes, zero_cells, strict=True)
+                100.0 * (table.size - zero) / table.size
+                for table, zero in zip(tables, zero_cells, strict=True)
             ],
             "epsilon": 1.0 - epsilon if self.rules.epsilon_exploits else epsilon,
             "step_size": float(schedule_value(self.rules.step_size, self.episode, self.step)),
@@ -150,7 +150,7 @@ class Learner:
         if initial is not None:
             self.tables.q[:] = np.concatenate([table.reshape(-1) for table in initial])
         elif isinstance(start, RandomTable):
-            _fill_random(self.tables.q, self.seed, start.random.low, start.random.high)
+            kernel.fill_random(self.tables.q, self.seed, start.random.low, start.random.high)
         elif isinstance(start, int | float):
             self.tables.q[:] = start
         for i in range(len(self.model.width)):
@@ -161,13 +161,13 @@ class Learner:
 def rules_of(config: ExperimentConfig) -> Rules:
     """Return the kernel's switches and schedules of an experiment."""
     learns = config.algorithm != "random"
-    schedules = [
-        compile_schedule(value)
-        for value in (config.step_size, config.discount, config.epsilon if learns else 1.0)
-    ]
+    step_size, discount = compile_schedule(config.step_size), compile_schedule(config.discount)
+    epsilon = compile_schedule(config.epsilon if learns else 1.0)
     return Rules(
-        *schedules,
-        by_step=any(bool(schedule[1]) for schedule in schedules),
+        step_size=step_size,
+        discount=discount,
+        epsilon=epsilon,
+        by_step=any(bool(schedule[1]) for schedule in (step_size, discount, epsilon)),
         learns=learns,
         independent=config.exploration == "independent",
         epsilon_exploits=config.quirks.epsilon_exploits and learns,
@@ -194,11 +194,3 @@ def _tally(model: Model, window: int, episodes: int) -> Tally:
         recent_outcomes=np.zeros(window, np.int32),
         recent_lengths=np.zeros(episodes, np.int64),
     )
-
-
-@numba.njit(cache=True)
-def _fill_random(q: NDArray[np.float64], seed: np.uint64, low: float, high: float) -> None:
-    """Fill the tables with draws, uniform in [low, high)."""
-    state = draws.key(seed, draws.INITIAL_Q, 0)
-    for cell in range(len(q)):
-        q[cell] = low + (high - low) * draws.uniform(draws.draw(state, cell))

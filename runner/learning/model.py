@@ -80,9 +80,7 @@ def build_model(mdp: Mdp, tables: str) -> Model:
     )
 
 
-def _outcome_classes(
-    mdp: Mdp, rewards: NDArray[np.float64]
-) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+def _outcome_classes(mdp: Mdp, rewards: NDArray[np.float64]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
     """Return the distinct (rewards, terminated, mask) of all outcomes, and each outcome's class."""
     learners = rewards.shape[-1]
     kind = np.dtype([("rewards", "<f8", (learners,)), ("terminated", "?"), ("mask", "<u4")])

@@ -45,7 +45,11 @@ class Chunk:
 
 
 def encode_chunk(
-    topic: Topic, records: bytes | memoryview, log_times: NDArray[np.uint64], offsets: NDArray[np.uint64], packing: Packing
+    topic: Topic,
+    records: bytes | memoryview,
+    log_times: NDArray[np.uint64],
+    offsets: NDArray[np.uint64],
+    packing: Packing,
 ) -> Chunk:
     """Return the chunk that holds these whole message records of one topic.
 
@@ -80,7 +84,10 @@ def message_index(channel: int, log_times: NDArray[np.uint64], offsets: NDArray[
     entries = np.empty((len(log_times), 2), dtype="<u8")
     entries[:, 0] = log_times
     entries[:, 1] = offsets
-    return struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel, entries.nbytes) + entries.tobytes()
+    return (
+        struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel, entries.nbytes)
+        + entries.tobytes()
+    )
 
 
 def _compress(records: bytes | memoryview, packing: Packing) -> bytes:
@@ -127,4 +134,3 @@ def decompress(data: bytes | memoryview, compression: str, size: int, where: str
     if len(records) != size or more:
         raise RecordingError(f"{where}: found a chunk of another size than the {size} bytes it declares")
     return records
-

@@ -97,7 +97,8 @@ def _check_beginning(stream: BinaryIO, path: str) -> None:
     header = _parse(Header, stream.read(min(length, 4096)), path, len(MCAP0_MAGIC))
     if opcode != Opcode.HEADER or header.profile != PROFILE:
         raise RecordingError(
-            f"{path}: found an MCAP file of profile {header.profile!r}, expected {PROFILE!r}: not a dualtaxi recording."
+            f"{path}: found an MCAP file of profile {header.profile!r}, expected {PROFILE!r}: "
+            "not a dualtaxi recording."
         )
 
 
@@ -116,7 +117,9 @@ def _from_summary(stream: BinaryIO, path: str, footer: Footer, size: int) -> Ind
     """Return the index in the summary section, after comparing its checksum."""
     start, end = footer.summary_start, size - _TAIL_BYTES
     if not len(MCAP0_MAGIC) < start <= footer.summary_offset_start <= end:
-        raise RecordingError(f"{path}: the footer points to a summary at {start}, outside the file; try `repair`.")
+        raise RecordingError(
+            f"{path}: the footer points to a summary at {start}, outside the file; try `repair`."
+        )
     stream.seek(start)
     summary = stream.read(end - start)
     fields = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, footer.summary_offset_start)
@@ -173,13 +176,20 @@ def _from_records(stream: BinaryIO, path: str, size: int) -> Index:
 def _note(index: Index, stream: BinaryIO, path: str, opcode: int, offset: int, length: int) -> None:
     """Take one record of the data section into the index; the stream stands behind its head."""
     if opcode == Opcode.CHUNK:
-        start, end, uncompressed, _, _ = _CHUNK_HEAD.unpack(stream.read(_CHUNK_HEAD.size).ljust(_CHUNK_HEAD.size, b"\0"))
+        start, end, uncompressed, _, _ = _CHUNK_HEAD.unpack(
+            stream.read(_CHUNK_HEAD.size).ljust(_CHUNK_HEAD.size, b"\0")
+        )
         index.chunks.append(ChunkEntry(offset, 9 + length, start, end, uncompressed, ()))
     elif opcode == Opcode.MESSAGE_INDEX and index.chunks:
         (channel,) = struct.unpack("<H", stream.read(2).ljust(2, b"\0"))
         last = index.chunks[-1]
         index.chunks[-1] = ChunkEntry(
-            last.offset, last.length, last.start_time, last.end_time, last.uncompressed_size, (*last.channels, channel)
+            last.offset,
+            last.length,
+            last.start_time,
+            last.end_time,
+            last.uncompressed_size,
+            (*last.channels, channel),
         )
     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT):
         body = stream.read(min(length, MAX_RECORD_BYTES))
@@ -200,7 +210,9 @@ def _records(view: memoryview, base: int, path: str) -> Iterator[tuple[int, int,
     at = 0
     while at < len(view):
         if at + 9 > len(view):
-            raise RecordingError(f"{path}: found {len(view) - at} stray bytes at {base + at}, expected a record.")
+            raise RecordingError(
+                f"{path}: found {len(view) - at} stray bytes at {base + at}, expected a record."
+            )
         opcode, length = _HEAD.unpack(view[at : at + 9])
         if length > len(view) - at - 9:
             raise RecordingError(
@@ -229,4 +241,6 @@ def _name(body: bytes, at: int, path: str, offset: int) -> str:
 
 def _within(path: str, what: str, offset: int, length: int, end: int) -> None:
     if offset < len(MCAP0_MAGIC) or length < 9 or offset + length > end:
-        raise RecordingError(f"{path}: the index points to {what} of {length} bytes at {offset}, outside the data.")
+        raise RecordingError(
+            f"{path}: the index points to {what} of {length} bytes at {offset}, outside the data."
+        )

@@ -141,7 +141,7 @@ class Recording:
             record = Metadata.read(ReadDataStream(BytesIO(self._read(offset, length)[9:])))
         except (McapError, struct.error, UnicodeDecodeError) as error:
             raise RecordingError(f"{self.path}: the metadata {name!r} at {offset} cannot be read.") from error
-        return record.metadata
+        return dict(record.metadata)
 
     def attachment(self, name: str) -> bytes:
         """Return an attachment's data, after comparing its checksum.
@@ -163,7 +163,9 @@ class Recording:
             raise RecordingError(f"{self.path}: the attachment at {offset} cannot be read.") from error
         data = body[at + 8 : -4]
         if len(data) != size or zlib.crc32(body[:-4]) != crc:
-            raise RecordingError(f"{self.path}: the attachment {name!r} at {offset} does not match its checksum.")
+            raise RecordingError(
+                f"{self.path}: the attachment {name!r} at {offset} does not match its checksum."
+            )
         return bytes(data)
 
     @cached_property
@@ -225,7 +227,7 @@ class Recording:
 
     def episodes(self, phase: str, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
         """Return the episode records of a phase (`train` or `eval`) as one array."""
-        topic = schema.TRAIN_EPISODE if phase == "train" else schema.EVAL_EPISODE
+        topic = schema.PHASES[phase][1]
         blocks = list(self.blocks(topic, start, stop))
         return np.concatenate(blocks) if blocks else np.empty(0, self.dtypes[topic])
 
@@ -236,7 +238,10 @@ class Recording:
             RecordingError: the recording has no such episode, or no steps.
         """
         topic = schema.TRAIN_STEP if phase == "train" else schema.EVAL_STEP
-        total, ended = self.count(topic), self.count(schema.TRAIN_EPISODE if phase == "train" else schema.EVAL_EPISODE)
+        total, ended = (
+            self.count(topic),
+            self.count(schema.TRAIN_EPISODE if phase == "train" else schema.EVAL_EPISODE),
+        )
         if not total:
             raise RecordingError(f"{self.path}: has no {phase} steps.")
         if 0 <= episode < ended:
@@ -293,7 +298,9 @@ class Recording:
     def _ends(self, topic: Topic) -> NDArray[np.int64]:
         """Return, for each chunk of a fixed-width topic, how many messages there are up to its end."""
         size = self.dtypes[topic].itemsize
-        return np.cumsum([entry.uncompressed_size // size for entry in self._chunks_of[topic.channel]], dtype=np.int64)
+        return np.cumsum(
+            [entry.uncompressed_size // size for entry in self._chunks_of[topic.channel]], dtype=np.int64
+        )
 
     def _block(self, topic: Topic, entry: ChunkEntry) -> NDArray[np.void]:
         """Return a chunk of a fixed-width topic as an array, after looking at its constant bytes."""
@@ -302,7 +309,9 @@ class Recording:
         if len(data) % dtype.itemsize:
             raise self._damaged(entry, f"{len(data)} bytes, not a multiple of {dtype.itemsize}")
         block = np.frombuffer(data, dtype=dtype)
-        if (block["channel_id"] != topic.channel).any() or (block["record_length"] != dtype.itemsize - 9).any():
+        if (block["channel_id"] != topic.channel).any() or (
+            block["record_length"] != dtype.itemsize - 9
+        ).any():
             raise self._damaged(entry, f"other messages than of {topic.name}")
         return block
 
@@ -332,7 +341,9 @@ class Recording:
 
     def _read(self, offset: int, length: int) -> bytes:
         if length > MAX_CHUNK_BYTES:
-            raise RecordingError(f"{self.path}: the record at {offset} declares {length:,} bytes; too large to be ours.")
+            raise RecordingError(
+                f"{self.path}: the record at {offset} declares {length:,} bytes; too large to be ours."
+            )
         self._stream.seek(offset)
         data = self._stream.read(length)
         if len(data) != length:
@@ -362,6 +373,8 @@ def _array(data: bytes, where: str) -> NDArray[Any]:
     try:
         with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as stream:
             unpacked = stream.read(MAX_ARRAY_BYTES)
-        return np.asarray(np.lib.format.read_array(BytesIO(unpacked), allow_pickle=False, max_header_size=4096))
+        return np.asarray(
+            np.lib.format.read_array(BytesIO(unpacked), allow_pickle=False, max_header_size=4096)
+        )
     except (zstandard.ZstdError, ValueError, EOFError) as error:
         raise RecordingError(f"{where}: holds no array ({error}).") from error

@@ -112,7 +112,9 @@ class Recorder:
         try:
             self._file = RecordingFile(path)
         except OSError as error:
-            raise StorageError(f"{path}: cannot be created ({error.strerror}); choose another --recordings.") from error
+            raise StorageError(
+                f"{path}: cannot be created ({error.strerror}); choose another --recordings."
+            ) from error
         self._encoders = ThreadPoolExecutor(ENCODERS, thread_name_prefix="encoder")
         self._work: queue.Queue[_Work | None] = queue.Queue(maxsize=4 * BLOCKS_UNDER_WAY)
         self._writer = threading.Thread(target=self._write_all, name="recording-writer", daemon=True)
@@ -134,7 +136,7 @@ class Recorder:
             StorageError: the disk is full or failing; everything before is kept.
         """
         self._raise_failure()
-        step_topic, episode_topic = _PHASES[phase]
+        step_topic, episode_topic = schema.PHASES[phase]
         other = self.steps["eval" if phase == "train" else "train"]
         step_block, episode_block = self._lanes[step_topic].open, self._lanes[episode_topic].open
         if steps and step_block is not None:
@@ -163,7 +165,9 @@ class Recorder:
         header["log_time"] = header["publish_time"] = log_time
         records = memoryview(header.tobytes() + payload)
         times = np.array([log_time], dtype=np.uint64)
-        chunk = self._encoders.submit(encode_chunk, topic, records, times, np.zeros(1, np.uint64), self._packing)
+        chunk = self._encoders.submit(
+            encode_chunk, topic, records, times, np.zeros(1, np.uint64), self._packing
+        )
         self.counts[topic.name] += 1
         self._put(_Work(topic, records, chunk))
 
@@ -243,11 +247,13 @@ class Recorder:
         if block is None:
             return
         filled = block.records[: block.filled]
-        view = memoryview(filled.view(np.uint8)).cast("B")
+        view = filled.view(np.uint8).data.cast("B")
         chunk = None
         if self._record_steps or topic.message is not schema.STEP:
             offsets = np.arange(block.filled, dtype=np.uint64) * np.uint64(filled.itemsize)
-            chunk = self._encoders.submit(encode_chunk, topic, view, filled["log_time"], offsets, self._packing)
+            chunk = self._encoders.submit(
+                encode_chunk, topic, view, filled["log_time"], offsets, self._packing
+            )
         self._put(_Work(topic, view, chunk, block))
 
     def _put(self, work: _Work | None) -> None:
@@ -267,7 +273,7 @@ class Recorder:
             try:
                 if self._failure is None:
                     self._write(work)
-            except BaseException as error:  # noqa: BLE001  (handed to the learner's thread)
+            except BaseException as error:  # handed to the learner's thread
                 self._failure = error
             if work.block is not None:
                 self._lanes[work.topic].free.put(work.block)
@@ -301,12 +307,6 @@ class Recorder:
             f"{self._file.size:,} bytes. What was written is kept and can be read; free some disk, or choose "
             "another --recordings."
         )
-
-
-_PHASES: Final[dict[str, tuple[Topic, Topic]]] = {
-    "train": (schema.TRAIN_STEP, schema.TRAIN_EPISODE),
-    "eval": (schema.EVAL_STEP, schema.EVAL_EPISODE),
-}
 
 
 def _stamp(block: _Block, positions: NDArray[np.uint64]) -> None:

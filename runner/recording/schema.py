@@ -171,6 +171,9 @@ TOPICS: Final = (
 BLOCK_TOPICS: Final = (TRAIN_STEP, EVAL_STEP, TRAIN_EPISODE, EVAL_EPISODE)
 """Topics whose messages have one size: read and written as blocks."""
 
+PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_EPISODE)}
+"""The step and the episode topic of each phase."""
+
 _WIDTH: dict[int, str] = {_DOUBLE: "<f8", _FIXED32: "<u4", _SFIXED64: "<i8", _BOOL: "?"}
 _WIRE: dict[int, int] = {_DOUBLE: 1, _SFIXED64: 1, _FIXED32: 5, _BOOL: 0, _STRING: 2, _BYTES: 2}
 
@@ -260,7 +263,7 @@ def _files(message: MessageType) -> list[descriptor_pb2.FileDescriptorProto]:
         added = described.field.add(
             name=field.name,
             number=field.number,
-            type=field.kind,  # type: ignore[arg-type]
+            type=field.kind,
             label=Pb.LABEL_REPEATED if field.repeated else Pb.LABEL_OPTIONAL,
         )
         if field.kind == Pb.TYPE_MESSAGE:
