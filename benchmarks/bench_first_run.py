@@ -1,0 +1,25 @@
+"""The first run on a fresh machine: a short experiment, compiling included."""
+
+from __future__ import annotations
+
+import tempfile
+
+from benchmarks.figures import Figure, figure
+from benchmarks.processes import run_config
+
+
+def measure(quick: bool) -> list[Figure]:
+    """Return seconds of the quick configuration with no compiled kernels kept, and with them."""
+    repetitions = 1 if quick else 3
+    fresh = []
+    for _ in range(repetitions):
+        with tempfile.TemporaryDirectory() as kernels:
+            fresh.append(run_config("quick", environment={"NUMBA_CACHE_DIR": kernels}).process.seconds)
+    run_config("quick")
+    again = [run_config("quick").process.seconds for _ in range(repetitions)]
+    return [
+        figure(
+            "first run, compiling", fresh, "s", (15, 6), higher_is_better=False, detail="configs/quick.yaml"
+        ),
+        figure("  the same again, compiled", again, "s", higher_is_better=False),
+    ]

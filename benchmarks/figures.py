@@ -1,0 +1,87 @@
+"""A measured figure beside its targets, and the table of them."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One measured figure, the target it must reach (`at_least`) and the one it should (`aim`)."""
+
+    what: str
+    value: float
+    unit: str
+    at_least: float | None = None
+    aim: float | None = None
+    higher_is_better: bool = True
+    spread: tuple[float, float] | None = None
+    """Lowest and highest value seen."""
+    detail: str = ""
+    """How it was measured, and the absolute figures behind a ratio."""
+
+    @property
+    def standing(self) -> str:
+        """Where the figure stands: `aim`, `at least` or `short`; empty without targets."""
+        for name, target in (("aim", self.aim), ("at least", self.at_least)):
+            if target is not None and (self.value >= target) == self.higher_is_better:
+                return name
+        return "short" if self.at_least is not None else ""
+
+
+def figure(
+    what: str,
+    values: Sequence[float],
+    unit: str,
+    targets: tuple[float, float] | None = None,
+    *,
+    higher_is_better: bool = True,
+    detail: str = "",
+) -> Figure:
+    """Return the median of repeated measurements as a figure; `targets` are (at least, aim)."""
+    at_least, aim = targets or (None, None)
+    spread = (min(values), max(values)) if len(values) > 1 else None
+    return Figure(what, statistics.median(values), unit, at_least, aim, higher_is_better, spread, detail)
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Return how long the work takes."""
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
+
+
+_WIDTHS = (44, 16, 21, 10, 8)
+
+
+def heading() -> str:
+    """Return the first lines of the table."""
+    return (
+        _row("median of repetitions", "measured", "lowest to highest", "at least", "aim") + "\n" + "-" * 112
+    )
+
+
+def row(figure: Figure) -> str:
+    """Return a figure's lines of the table."""
+    sign = "≥ " if figure.higher_is_better else "≤ "
+    spread = " to ".join(_number(value) for value in figure.spread) if figure.spread else ""
+    targets = ("" if target is None else sign + _number(target) for target in (figure.at_least, figure.aim))
+    reached = {"aim": "reached", "at least": "below the aim", "short": "SHORT"}.get(figure.standing, "")
+    line = _row(figure.what, f"{_number(figure.value)} {figure.unit}", spread, *targets) + "  " + reached
+    return "\n".join([line.rstrip(), *(f"    {text}" for text in figure.detail.splitlines())])
+
+
+def _row(what: str, *cells: str) -> str:
+    return what.ljust(_WIDTHS[0]) + "".join(
+        cell.rjust(width) for cell, width in zip(cells, _WIDTHS[1:], strict=True)
+    )
+
+
+def _number(value: float) -> str:
+    """Return a number with three digits that count."""
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.1f}" if abs(value) >= 10 else f"{value:.3g}"

@@ -1,0 +1,44 @@
+"""The tutorial's cooperative learner and the blocks it fills, for the benchmarks of the kernels."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.processes import ROOT
+from runner.config import load
+from runner.learning.learner import Learner
+from runner.mdp import load_mdp
+from runner.recording import schema
+
+BLOCK_STEPS = 16_384
+"""As in a run: `recording.chunk_steps` unless given."""
+BLOCK_EPISODES = 2_048
+NO_LIMIT = 2**62
+
+
+def tutorial_learner() -> Learner:
+    """Return an untrained learner of the cooperative tutorial: one joint table, epsilon 0.8."""
+    config = load(ROOT / "configs" / "tutorial_cooperative.yaml")
+    return Learner(config, load_mdp(config.env.id, config.env.kwargs, config.rewards), seed=0)
+
+
+def blocks(learner: Learner, phase: str, steps: int = BLOCK_STEPS) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return an empty block of step records and one of episode records, as the recorder hands them out."""
+    topics = [topic for topic in schema.BLOCK_TOPICS if topic.phase == phase]
+    learners, events = len(learner.agents), len(learner.mdp.event_names)
+    step_block, episode_block = (
+        schema.blank_records(topic, schema.block_counts(topic, learners, events), n).view(np.recarray)
+        for topic, n in zip(topics, (steps, BLOCK_EPISODES), strict=True)
+    )
+    return step_block, episode_block
+
+
+def train(learner: Learner, until_episode: int) -> int:
+    """Train up to an episode, filling one block of records over and over; return the steps taken."""
+    steps, episodes = blocks(learner, "train")
+    while learner.episode < until_episode:
+        learner.train(steps, episodes, until_episode, NO_LIMIT)
+    return learner.step

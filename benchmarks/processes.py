@@ -1,0 +1,92 @@
+"""Commands run and measured as processes of their own.
+
+A small launcher stands between: on Linux a process inherits the peak memory of the one that starts it, so
+that one must be smaller than what is measured. The clock runs in the launcher, around the command alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+ROOT: Final = Path(__file__).resolve().parent.parent
+
+_LAUNCHER: Final = """
+import json, os, sys, time
+begin = time.perf_counter()
+child = os.posix_spawnp(sys.argv[1], sys.argv[1:], os.environ)
+_, status, usage = os.wait4(child, 0)
+elapsed = time.perf_counter() - begin
+unit = 1 if sys.platform == "darwin" else 1024
+print(json.dumps([elapsed, usage.ru_utime + usage.ru_stime, usage.ru_maxrss * unit]))
+sys.exit(os.waitstatus_to_exitcode(status) and 1)
+"""
+
+
+@dataclass(frozen=True)
+class Process:
+    """What a finished process took."""
+
+    seconds: float
+    """From its start to its end."""
+    cpu_seconds: float
+    """Of all its threads, and the system for it."""
+    peak_megabytes: float
+    """The most memory that was resident at once, in units of 10**6 bytes."""
+
+
+@dataclass(frozen=True)
+class JobRun:
+    """A job run by the command line, and what it left behind."""
+
+    process: Process
+    steps: int
+    """Training and evaluation steps, all of them recorded."""
+    file_bytes: int
+    """Size of the recording."""
+
+
+def run(command: Sequence[str], environment: Mapping[str, str] | None = None) -> Process:
+    """Run a command to its end and return what it took.
+
+    Raises:
+        RuntimeError: it failed; its output is told.
+    """
+    inherited = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", _LAUNCHER, *command],
+        cwd=ROOT,
+        env=inherited | dict(environment or {}),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)} failed:\n{done.stdout}{done.stderr}")
+    elapsed, cpu, peak = json.loads(done.stdout.splitlines()[-1])
+    return Process(elapsed, cpu, peak / 1e6)
+
+
+def run_config(config: str, *overrides: str, environment: Mapping[str, str] | None = None) -> JobRun:
+    """Run a shipped configuration as a user would, into a folder that is removed, and return what it took."""
+    with tempfile.TemporaryDirectory() as recordings:
+        process = run(run_command(config, recordings, *overrides), environment)
+        (facts_file,) = Path(recordings).glob("*/run.json")
+        facts: dict[str, Any] = json.loads(facts_file.read_bytes())
+        summary = facts["summary"]
+        size = (facts_file.parent / "recording.mcap").stat().st_size
+        return JobRun(process, summary["train_steps"] + summary["eval_steps"], size)
+
+
+def run_command(config: str, recordings: str, *overrides: str) -> list[str]:
+    """Return the command that runs a shipped configuration."""
+    sets = [part for override in overrides for part in ("--set", override)]
+    begin = [sys.executable, "-m", "benchmarks.run_job"]
+    return [*begin, f"configs/{config}.yaml", "--recordings", recordings, *sets]
