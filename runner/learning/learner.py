@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig
 from runner.config.model import RandomTable
+from runner.errors import EnvironmentNotUsable
 from runner.learning import kernel
 from runner.learning.kernel import Rules, Tables, Tally
 from runner.learning.model import Model, build_model
@@ -35,6 +36,7 @@ class Learner:
         self.model: Model = build_model(mdp, config.tables)
         self.agents = ("agency",) if config.tables == "joint" and len(mdp.agents) > 1 else mdp.agents
         self.rules = rules_of(config)
+        _check_first_action(self.rules, self.model)
         self.tables = _tables(self.model, mdp.states)
         self._fill_tables(initial)
         log = config.log
@@ -174,6 +176,15 @@ def rules_of(config: ExperimentConfig) -> Rules:
         first_action_for_all=config.quirks.second_table_uses_first_action,
         bootstrap_after_termination=config.quirks.bootstrap_after_termination,
     )
+
+
+def _check_first_action(rules: Rules, model: Model) -> None:
+    """Refuse to update a table at an action it may not have: the kernel would write outside its row."""
+    if rules.first_action_for_all and len(set(model.width)) > 1:
+        raise EnvironmentNotUsable(
+            "quirks.second_table_uses_first_action needs agents with equally many actions, found "
+            f"{' and '.join(map(str, model.width))}: leave the quirk out."
+        )
 
 
 def _tables(model: Model, states: int) -> Tables:
