@@ -1,5 +1,64 @@
-"""Train tabular agents from a YAML file and record every step; replay, compare and archive the runs."""
+"""Train tabular agents from a YAML file and record every step; replay, compare and archive the runs.
+
+    import runner
+
+    run = runner.run("configs/quick.yaml")                 # learns, and records every step
+    print(runner.frames.evaluations(run))                  # its measures, as a pandas frame
+    for run in runner.run_all("configs/quick.yaml", overrides=["seeds=[1, 2, 3]"]):
+        print(run.run_id, run.summary["content_digest"])
+
+The names below are imported when they are first used, so that `import runner` is quick.
+"""
 
 from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from runner import frames
+    from runner.api import run, run_all
+    from runner.config import ExperimentConfig
+    from runner.errors import RunnerError
+    from runner.recording.reader import Recording, open_recording
+    from runner.runs import Run, find_run, list_runs
+
 __version__ = "0.1.0"
+
+__all__ = [
+    "ExperimentConfig",
+    "Recording",
+    "Run",
+    "RunnerError",
+    "find_run",
+    "frames",
+    "list_runs",
+    "open_recording",
+    "run",
+    "run_all",
+]
+
+_HOME = {
+    "ExperimentConfig": "runner.config",
+    "Recording": "runner.recording.reader",
+    "Run": "runner.runs",
+    "RunnerError": "runner.errors",
+    "find_run": "runner.runs",
+    "list_runs": "runner.runs",
+    "open_recording": "runner.recording.reader",
+    "run": "runner.api",
+    "run_all": "runner.api",
+}
+"""The module of each public name that is not a module itself."""
+
+
+def __getattr__(name: str) -> Any:
+    if name == "frames":
+        return importlib.import_module("runner.frames")
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -19,10 +19,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from runner.config import ExperimentConfig
 from runner.errors import RecordingError, RunNotFound, StorageError, nearest
+
+if TYPE_CHECKING:  # listing runs is to be quick
+    from runner.config import ExperimentConfig
 
 RUN_FILE: Final = "run.json"
 RECORDING_FILE: Final = "recording.mcap"
@@ -65,8 +67,8 @@ class Run:
 
     @property
     def created(self) -> datetime:
-        """When it began."""
-        return datetime.fromisoformat(self.facts["created"])
+        """When it began, in UTC."""
+        return datetime.fromisoformat(self.facts["created"]).astimezone(UTC)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -99,8 +101,14 @@ class Run:
         return changed
 
 
-def create_run(recordings: Path, config: ExperimentConfig, seed: int) -> Run:
+def create_run(recordings: Path, config: ExperimentConfig, seed: int, name: str | None = None) -> Run:
     """Make a folder for a new run and write what it is; an id is never used twice.
+
+    Args:
+        recordings: the folder to make it in; made if it is missing.
+        config: what is run.
+        seed: the one seed that is run.
+        name: what the run is called; the configuration's name unless given.
 
     Raises:
         StorageError: the recordings folder cannot be written.
@@ -119,7 +127,7 @@ def create_run(recordings: Path, config: ExperimentConfig, seed: int) -> Run:
             folder,
             {
                 "run_id": run_id,
-                "name": config.name,
+                "name": name or config.name,
                 "seed": seed,
                 "status": "running",
                 "created": datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -142,10 +150,18 @@ def recordings_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
 
 
 def list_runs(recordings: Path) -> list[Run]:
-    """Return the runs of a folder, the newest first; what is no run is left alone."""
-    if not recordings.is_dir():
+    """Return the runs of a folder, the newest first; what is no run is left alone.
+
+    Raises:
+        StorageError: the folder is there and cannot be read.
+    """
+    try:
+        folders = [Path(entry.path) for entry in os.scandir(recordings) if entry.is_dir()]
+    except FileNotFoundError:
         return []
-    runs = [run for entry in os.scandir(recordings) if entry.is_dir() for run in _runs_in(Path(entry.path))]
+    except OSError as error:
+        raise StorageError(f"{recordings}: cannot be read as a folder of runs ({error.strerror}).") from error
+    runs = [run for folder in folders for run in _runs_in(folder)]
     return sorted(runs, key=lambda run: (run.facts["created"], run.run_id), reverse=True)
 
 
@@ -162,9 +178,9 @@ def find_run(name: str, recordings: Path) -> Run:
     runs = list_runs(recordings)
     if name.endswith(_LATEST):
         stem = name.removesuffix(_LATEST)
-        runs = [run for run in runs if stem in ("", run.name)]
-        if runs:
-            return runs[0]
+        newest = next((run for run in runs if stem in ("", run.name)), None)
+        if newest is not None:
+            return newest
     exact = [run for run in runs if run.run_id == name]
     found = exact or [run for run in runs if run.name == name or run.run_id.startswith(name)]
     if len(found) == 1:
@@ -197,7 +213,7 @@ def _runs_in(folder: Path) -> Iterator[Run]:
     """Yield the run in a folder, if there is one; from its recording when `run.json` is gone."""
     try:
         facts = json.loads((folder / RUN_FILE).read_bytes())
-        if isinstance(facts, dict) and {"run_id", "name", "seed", "status", "created"} <= facts.keys():
+        if _is_run(facts):
             yield Run(folder, facts)
             return
     except (OSError, ValueError):
@@ -205,6 +221,16 @@ def _runs_in(folder: Path) -> Iterator[Run]:
     if (folder / RECORDING_FILE).is_file():
         with contextlib.suppress(RecordingError):
             yield _from_recording(folder / RECORDING_FILE)
+
+
+def _is_run(facts: Any) -> bool:
+    """Return whether these are the facts of a run: a file may hold anything."""
+    if not isinstance(facts, dict):
+        return False
+    kinds = {"run_id": str, "name": str, "seed": int, "status": str, "created": str}
+    sound = all(isinstance(facts.get(key), kind) for key, kind in kinds.items())
+    parts = all(isinstance(facts.get(key, {}), dict) for key in ("owner", "config", "summary"))
+    return sound and parts and bool(datetime.fromisoformat(facts["created"]))
 
 
 def _from_recording(path: Path) -> Run:

@@ -1,0 +1,190 @@
+"""Running experiments from Python: `runner.run` and `runner.run_all`, and what the command line shares.
+
+import runner
+
+run = runner.run("configs/quick.yaml", seed=3)
+print(run.run_id, run.summary["last_evaluation"])
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from runner.config import ConfigError, ExperimentConfig, from_mapping, load
+from runner.job import Job, jobs_of
+from runner.runs import Run, create_run, recordings_folder
+
+if TYPE_CHECKING:  # both are imported late: a run is to stand on disk before NumPy and Numba are loaded
+    from runner.execution import Progress
+
+Config = str | os.PathLike[str] | Mapping[str, Any] | ExperimentConfig
+Handler = Callable[[int, Any], Any] | int | signal.Handlers | None
+
+_SIGNALS: Final = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGBREAK") if hasattr(signal, name)
+)
+
+
+def run(
+    config: Config,
+    *,
+    seed: int | None = None,
+    overrides: Sequence[str] = (),
+    name: str | None = None,
+    recordings: str | os.PathLike[str] | None = None,
+    report: Callable[[Progress], None] = lambda _: None,
+) -> Run:
+    """Train, evaluate and record one run, and return it when it is finished.
+
+    On the main thread SIGINT (Ctrl-C) and SIGTERM close the recording properly before they raise.
+
+    Args:
+        config: the path of a YAML file, the same as a mapping, or an `ExperimentConfig`.
+        seed: the seed, instead of the configuration's; needed where that has several.
+        overrides: `KEY=VALUE` each, as `--set` takes them.
+        name: what the run is called; the configuration's name unless given.
+        recordings: the folder for it: $DUALTAXI_RECORDINGS, or ./recordings, unless given.
+        report: called with the progress a few times a second.
+
+    Raises:
+        ConfigError: the configuration cannot be used, or has several seeds and none was chosen.
+        EnvironmentNotUsable: the environment is unknown, or has no transition table.
+        StorageError: the recordings folder cannot be written, or its disk is full.
+        KeyboardInterrupt: it was interrupted; what was recorded is kept.
+    """
+    experiment = experiment_of(config, overrides, seed)
+    if len(experiment.seeds) > 1:
+        raise ConfigError(
+            f"found {len(experiment.seeds)} seeds, and run() does one: choose it by seed=, or call run_all()."
+        )
+    return next(_run_jobs(experiment, name, recordings, report))
+
+
+def run_all(
+    config: Config,
+    *,
+    overrides: Sequence[str] = (),
+    name: str | None = None,
+    recordings: str | os.PathLike[str] | None = None,
+    report: Callable[[Progress], None] = lambda _: None,
+) -> Iterator[Run]:
+    """Yield the runs of an experiment as they finish, one a seed; arguments and errors as for `run`."""
+    return _run_jobs(experiment_of(config, overrides), name, recordings, report)
+
+
+def experiment_of(config: Config, overrides: Sequence[str] = (), seed: int | None = None) -> ExperimentConfig:
+    """Return the experiment that a path, a mapping or an experiment means, with overrides and seed put in.
+
+    Raises:
+        ConfigError: it does not describe an experiment.
+    """
+    changes = [*overrides, *([] if seed is None else [f"seed={seed}"])]
+    if isinstance(config, ExperimentConfig):
+        return from_mapping(config.to_mapping(), changes) if changes else config
+    if isinstance(config, Mapping):
+        return from_mapping(config, changes)
+    return load(config, changes)
+
+
+def checked_name(name: str | None) -> str | None:
+    """Return the name of a run if it can be one.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    import re
+
+    from runner.config.model import NAME_EXPECTED, NAME_PATTERN
+
+    if name is not None and not re.fullmatch(NAME_PATTERN, name):
+        raise ConfigError(f"name: found {name!r}, expected {NAME_EXPECTED}")
+    return name
+
+
+class Interrupt:
+    """Whether the process was told to stop."""
+
+    def __init__(self) -> None:
+        self.came = False
+
+    def __call__(self) -> bool:
+        """Return whether it was, as `run_job` asks."""
+        return self.came
+
+
+@contextlib.contextmanager
+def interruptible(second: Handler = None) -> Iterator[Interrupt]:
+    """Catch the first SIGINT or SIGTERM, so that a run can end properly; the caller looks whether it came.
+
+    Args:
+        second: the handler of a second signal: the one from before, unless given.
+
+    Handlers belong to the main thread; on another one nothing is caught.
+    """
+    interrupt = Interrupt()
+    if threading.current_thread() is not threading.main_thread():
+        yield interrupt
+        return
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+
+    def first(_number: int, _frame: Any) -> None:
+        interrupt.came = True
+        for number, handler in before.items():
+            _handle(number, handler if second is None else second)
+
+    try:
+        for number in _SIGNALS:
+            signal.signal(number, first)
+        yield interrupt
+    finally:
+        for number, handler in before.items():
+            _handle(number, handler)
+
+
+def _handle(number: int, handler: Handler) -> None:
+    """Set a signal's handler; one that was not set from Python (None) cannot be set again."""
+    if handler is not None:
+        signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def unless_empty(run: Run) -> Iterator[None]:
+    """Remove the run's folder if what is done here fails before there is a recording; the error says so."""
+    try:
+        yield
+    except BaseException as error:
+        if not run.recording.exists():
+            shutil.rmtree(run.folder, ignore_errors=True)
+            error.add_note(f"Nothing was recorded; the empty run {run.run_id} was removed.")
+        raise
+
+
+def _run_jobs(
+    config: ExperimentConfig,
+    name: str | None,
+    recordings: str | os.PathLike[str] | None,
+    report: Callable[[Progress], None],
+) -> Iterator[Run]:
+    """Yield a run a seed; the folder is checked and the run stands on disk before anything heavy."""
+    called, folder = checked_name(name), recordings_folder(recordings)
+    for job in jobs_of(config):
+        yield _run_job(job, folder, called, report)
+
+
+def _run_job(job: Job, folder: Path, name: str | None, report: Callable[[Progress], None]) -> Run:
+    with interruptible() as interrupt:
+        run = create_run(folder, job.config, job.seed, name)
+        with unless_empty(run):
+            from runner.execution import run_job
+
+            run = run_job(job, run, report, interrupt)
+    if interrupt.came:
+        raise KeyboardInterrupt(f"run {run.run_id} was interrupted; what it recorded is in {run.recording}")
+    return run

@@ -1,0 +1,285 @@
+"""A run's measures, episodes and steps under readable names: as plain records, and as pandas frames.
+
+    import runner
+
+    run = runner.find_run("@latest", Path("recordings"))
+    runner.frames.evaluations(run).plot("episode", "finish_percent")
+
+A run is a `Run`, an open `Recording`, or the path of a recording. pandas comes with the extra `frames`;
+the records need nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from runner.errors import MissingExtra
+from runner.runs import Run
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    from runner.mdp import Mdp
+    from runner.recording.reader import Recording
+
+    Source = Run | Recording | str | os.PathLike[str]
+
+Phase = Literal["train", "eval"]
+
+
+def evaluations(run: Source) -> pd.DataFrame:
+    """Return a row for each evaluation: how the greedy policy did, and how training stood.
+
+    Columns: episode, finish_percent (NaN where the environment does not say what success is),
+    mean_length, mean_penalties, ...; a column for each event, such as `taxi_1.drop_off`: how often it came
+    in all trials; `mean_return.AGENT` and `training.…` for training at that moment.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        RecordingError: the recording cannot be read.
+    """
+    with _opened(run) as recording:
+        return _frame(
+            [
+                _flat(record, {"events": "", "mean_returns": "mean_return."})
+                for record in evaluation_records(recording)
+            ]
+        )
+
+
+def training(run: Source) -> pd.DataFrame:
+    """Return a row for each report of training: mean length, rewards, fill of the tables, schedules.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        RecordingError: the recording cannot be read.
+    """
+    with _opened(run) as recording:
+        return _frame([_flat(record, {}) for record in training_records(recording)])
+
+
+def episodes(
+    run: Source,
+    phase: Phase = "train",
+    start: int = 0,
+    stop: int | None = None,
+) -> pd.DataFrame:
+    """Return a row for each episode of a phase, number `start` up to `stop`.
+
+    Columns: episode, length, penalties, success, terminated, truncated, last_step, `return.AGENT`, and a
+    column for each event.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        RecordingError: the recording cannot be read.
+    """
+    with _opened(run) as recording:
+        records = recording.episodes(phase, start, stop)
+        columns = _plain_columns(records, ("episode", "length", "penalties", "success"))
+        columns |= _plain_columns(records, ("terminated", "truncated", "last_step"))
+        columns |= _by_name(records["returns"], [f"return.{agent}" for agent in agents_of(recording)])
+        columns |= _by_name(records["events"], event_names_of(recording))
+    return _frame(columns)
+
+
+def steps(
+    run: Source,
+    phase: Phase = "train",
+    *,
+    episode: int | None = None,
+    start: int = 0,
+    stop: int | None = None,
+) -> pd.DataFrame:
+    """Return a row for each step of a phase: of one episode, or number `start` up to `stop`.
+
+    Columns: step, episode, t, state, action (joint), next_state, `reward.AGENT`, terminated, truncated,
+    explored (bit i: agent i). All steps of a long run take some 70 bytes of memory each.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        RecordingError: the recording cannot be read, or has no such episode.
+    """
+    import numpy as np
+
+    from runner.recording import schema
+
+    with _opened(run) as recording:
+        if episode is None:
+            topic = schema.TRAIN_STEP if phase == "train" else schema.EVAL_STEP
+            blocks = [block.copy() for block in recording.blocks(topic, start, stop)]
+            records = np.concatenate(blocks) if blocks else np.empty(0, recording.dtypes[topic])
+        else:
+            records = recording.episode_steps(phase, episode)
+        columns = _plain_columns(records, ("step", "episode", "t", "state", "action", "next_state"))
+        columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in agents_of(recording)])
+        columns |= _plain_columns(records, ("terminated", "truncated", "explored"))
+    return _frame(columns)
+
+
+def transition_table(
+    env_id: str = "dualtaxi:DualTaxi-v1", kwargs: Mapping[str, Any] | None = None, rewards: str = "team"
+) -> pd.DataFrame:
+    """Return an environment's transition table in words: a row for each outcome that can happen.
+
+    Columns: state, action, probability, next_state, reward (of all agents together), is_over, and
+    `reward.AGENT` where `rewards` is `individual`.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        EnvironmentNotUsable: the environment is unknown, or has no transition table.
+    """
+    from runner.mdp import load_mdp
+
+    return _frame(transition_columns(load_mdp(env_id, kwargs or {}, rewards)))
+
+
+def transition_columns(mdp: Mdp) -> dict[str, NDArray[Any]]:
+    """Return the columns of `transition_table`, a value for each outcome with a probability above 0."""
+    import numpy as np
+
+    from runner.words import actions_in_words, states_in_words
+
+    states, actions = states_in_words(mdp), actions_in_words(mdp)
+    state, action, outcome = np.nonzero(mdp.probability)
+    at = (state, action, outcome)
+    columns = {
+        "state": states[state],
+        "action": actions[action],
+        "probability": mdp.probability[at],
+        "next_state": states[mdp.next_state[at]],
+        "reward": mdp.summed_rewards[at],
+        "is_over": mdp.terminated[at],
+    }
+    shared = mdp.rewards.shape[-1] == 1
+    own = {} if shared else _by_name(mdp.rewards[at], [f"reward.{agent}" for agent in mdp.agents])
+    return columns | own
+
+
+# --- plain records ------------------------------------------------------------------------------------
+
+
+def evaluation_records(recording: Recording) -> list[dict[str, Any]]:
+    """Return the evaluations of a recording, in order, as JSON can hold them.
+
+    Each has `episode` (training episodes before it), `finish_percent` (None where the environment does
+    not say what success is), `mean_length`, `mean_penalties`, ..., `events` by name, summed over the
+    trials, and under `training` what `training_records` has.
+    """
+    agents, events = agents_of(recording), event_names_of(recording)
+    return [_evaluation_record(metrics, agents, events) for metrics in recording.metrics("eval")]
+
+
+def training_records(recording: Recording) -> list[dict[str, Any]]:
+    """Return the reports of training of a recording, in order, as JSON can hold them."""
+    agents = agents_of(recording)
+    return [
+        {"episode": metrics["episode"], "step": metrics["step"]} | _training_side(metrics, agents)
+        for metrics in recording.metrics("train")
+    ]
+
+
+def agents_of(recording: Recording) -> list[str]:
+    """Return the names of the learners: one table and one reward each."""
+    return list(json.loads(recording.run["agents"]))
+
+
+def event_names_of(recording: Recording) -> list[str]:
+    """Return the names of the environment's events; none where it has none."""
+    return list(environment_of(recording)["event_names"])
+
+
+def environment_of(recording: Recording) -> dict[str, Any]:
+    """Return what the recording says of its environment beside the arrays."""
+    return dict(json.loads(recording.attachment("environment.json")))
+
+
+def _evaluation_record(
+    metrics: Mapping[str, Any], agents: Sequence[str], events: Sequence[str]
+) -> dict[str, Any]:
+    known = metrics["successes"] >= 0
+    return {
+        "evaluation": metrics["evaluation"],
+        "episode": metrics["episode"],
+        "step": metrics["step"],
+        "trials": metrics["trials"],
+        "successes": metrics["successes"] if known else None,
+        "finish_percent": metrics["finish_percent"] if known else None,
+        "mean_length": metrics["eval_mean_length"],
+        "mean_penalties": metrics["mean_penalties"],
+        "terminations": metrics["terminations"],
+        "mean_returns": dict(zip(agents, metrics["mean_returns"], strict=True)),
+        "events": dict(zip(events, metrics["events"], strict=True)),
+        "training": _training_side(metrics, agents),
+    }
+
+
+def _training_side(metrics: Mapping[str, Any], agents: Sequence[str]) -> dict[str, Any]:
+    """Return how training stood; a mean over no episodes yet is None."""
+    length = metrics["mean_length"]
+    return {
+        "mean_length": None if math.isnan(length) else length,
+        "reward_counts": [
+            {"reward": reward, "steps": steps}
+            for reward, steps in zip(metrics["rewards"], metrics["reward_counts"], strict=True)
+        ],
+        "zero_cells": dict(zip(agents, metrics["zero_cells"], strict=True)),
+        "percent_filled": dict(zip(agents, metrics["percent_filled"], strict=True)),
+        "epsilon": metrics["epsilon"],
+        "step_size": metrics["step_size"],
+        "discount": metrics["discount"],
+    }
+
+
+# --- inside -------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _opened(run: Source) -> Iterator[Recording]:
+    """Give the run's recording, opened, if there is pandas; one that is open already stays open."""
+    from runner.recording.reader import Recording, open_recording
+
+    _frame([])
+    if isinstance(run, Recording):
+        yield run
+        return
+    with open_recording(run.recording if isinstance(run, Run) else Path(run)) as recording:
+        yield recording
+
+
+def _frame(data: Any) -> pd.DataFrame:
+    """Return a frame of columns by name, or of rows."""
+    try:
+        import pandas
+    except ImportError as error:
+        raise MissingExtra("pandas", "frames", "a frame") from error
+    return pandas.DataFrame(data)
+
+
+def _flat(record: Mapping[str, Any], prefixes: Mapping[str, str]) -> dict[str, Any]:
+    """Return a record with its mappings spread out; what is unknown (None) is NaN."""
+    flat: dict[str, Any] = {}
+    for key, value in record.items():
+        if isinstance(value, Mapping):
+            before = prefixes.get(key, f"{key}.")
+            flat |= {f"{before}{name}": part for name, part in _flat(value, {}).items()}
+        else:
+            flat[key] = math.nan if value is None else value
+    return flat
+
+
+def _plain_columns(records: NDArray[np.void], names: Sequence[str]) -> dict[str, Any]:
+    """Return fields of records as arrays of their own."""
+    return {name: records[name].copy() for name in names}
+
+
+def _by_name(values: NDArray[Any], names: Sequence[str]) -> dict[str, Any]:
+    """Return the columns of [N, names] by name."""
+    return {name: values[:, i].copy() for i, name in enumerate(names)}
