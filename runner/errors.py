@@ -7,6 +7,7 @@ without a traceback and exits with `exit_code`.
     ├── ConfigError          a configuration cannot be used (file, line and key stand in the message)
     ├── EnvironmentNotUsable an environment is unknown, or has no transition table
     ├── RecordingError       a recording is damaged, foreign, or of an unknown version
+    ├── Diverged             a recording differs from what its job gives
     ├── RunNotFound          no run, or more than one, answers to a name
     ├── StorageError         the recordings folder cannot be written, or its disk is full
     └── MissingExtra         a command needs an optional package
@@ -34,6 +35,30 @@ class EnvironmentNotUsable(RunnerError):
 
 class RecordingError(RunnerError):
     """A recording cannot be read: damaged, not one of ours, or of an unknown version."""
+
+
+class Diverged(RunnerError):
+    """A recording differs from what its job gives; the first difference stands in the attributes."""
+
+    exit_code = 1
+
+    def __init__(
+        self,
+        topic: str,
+        field: str,
+        found: object,
+        expected: object,
+        episode: int | None = None,
+        step: int | None = None,
+    ) -> None:
+        self.topic, self.field, self.found, self.expected = topic, field, found, expected
+        self.episode, self.step = episode, step
+        place = "".join(
+            f", {name} {number}"
+            for name, number in (("episode", episode), ("step", step))
+            if number is not None
+        )
+        super().__init__(f"{topic}{place}: {field}: found {found}, expected {expected}")
 
 
 class RunNotFound(RunnerError):

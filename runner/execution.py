@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
@@ -14,7 +15,7 @@ import numpy as np
 
 from runner import runs
 from runner.config.model import RunTable
-from runner.errors import RunnerError
+from runner.errors import Diverged, RunnerError, StorageError
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import Mdp, description_bytes, load_mdp
@@ -22,8 +23,10 @@ from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.chunks import Packing
 from runner.recording.messages import QTable, encode, encode_log, encode_q_table
+from runner.recording.past import Past
 from runner.recording.reader import pack_array
-from runner.recording.recorder import Recorder
+from runner.recording.recorder import Recorder, storage_error
+from runner.recording.writer import RecordingFile
 from runner.runs import Run
 
 REPORT_SECONDS: Final = 0.1
@@ -63,34 +66,67 @@ def run_job(job: Job, run: Run, report: Report = lambda _: None, stop: Stop = la
     started = time.monotonic()
     try:
         mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
-        learner = Learner(job.config, mdp, job.seed, _initial_tables(job, run, mdp))
-        recorder = _recorder(job, run, learner)
+        learner = Learner(job.config, mdp, job.seed, configured_tables(job, run, mdp))
+        file = _create(run.folder / runs.RECORDING_FILE)
     except RunnerError as error:
         run.update(status="failed", summary={"error": str(error)})
         raise
+    with file:
+        describe(file, job, run, learner)
+        recorder = recorder_for(job, learner, file, beat=run.beat)
+        return execute(Session(job, learner, recorder, report, stop), file, run, started)
+
+
+def execute(session: Session, file: RecordingFile, run: Run, started: float) -> Run:
+    """Do what is left of a session's job, and close its recording; return the run as it then is."""
     try:
-        _describe(recorder, job, run, learner)
-        session = _Session(job, learner, recorder, report, stop)
         status = "finished" if session.run() else "interrupted"
-        topics = recorder.drain()
-        summary = session.summary(topics)
-        recorder.finish("result", {"json": json.dumps({"status": status, **summary}, sort_keys=True)})
+        summary = session.summary(session.recorder.drain())
+        _finish(file, {"status": status, **summary})
     except BaseException as error:
-        recorder.abandon()
-        status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-        run.update(status=status, summary={"error": str(error), "bytes": recorder.bytes_written})
+        session.recorder.abandon()
+        status = "interrupted" if isinstance(error, KeyboardInterrupt | Diverged) else "failed"
+        with contextlib.suppress(StorageError):  # a full disk may still have room for the index
+            _finish(file, {"status": status, "error": str(error)})
+        run.update(status=status, summary={"error": str(error), "bytes": file.size})
         raise
-    summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": recorder.bytes_written}
+    summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": file.size}
     return run.update(status=status, summary=summary)
 
 
-class _Session:
+def _create(path: Path) -> RecordingFile:
+    try:
+        return RecordingFile(path)
+    except OSError as error:
+        raise StorageError(
+            f"{path}: cannot be created ({error.strerror}); choose another --recordings."
+        ) from error
+
+
+def _finish(file: RecordingFile, result: dict[str, Any]) -> None:
+    """Write the result, the index and the summary."""
+    try:
+        file.add_metadata("result", {"json": json.dumps(result, sort_keys=True)})
+        file.finish()
+    except OSError as error:
+        file.cut_back()
+        raise storage_error(file, error) from error
+
+
+class Session:
     """One execution: alternates training and evaluation, and hands every block to the recorder."""
 
-    def __init__(self, job: Job, learner: Learner, recorder: Recorder, report: Report, stop: Stop) -> None:
+    def __init__(
+        self,
+        job: Job,
+        learner: Learner,
+        recorder: Recorder,
+        report: Report = lambda _: None,
+        stop: Stop = lambda: False,
+    ) -> None:
         self._config = job.config
         self._learner = learner
-        self._recorder = recorder
+        self.recorder = recorder
         self._report = report
         self._stop = stop
         self._progress = Progress(job.config.episodes)
@@ -101,13 +137,17 @@ class _Session:
         """Do the whole job; return False if it was stopped before the end."""
         self._log(f"training {self._config.episodes} episodes with {self._config.algorithm}")
         for episode in self._boundaries():
-            if not (self._train(episode) and self._evaluate(episode)):
-                self._log("interrupted", "WARNING")
-                return False
+            if not self._train(episode):
+                break
             if self._snapshot_is_due(episode):
                 self._snapshot()
-        self._log("finished")
-        return True
+            if not self._evaluate(episode):
+                break
+        else:
+            self._log("finished")
+            return True
+        self._log("interrupted", "WARNING")
+        return False
 
     def summary(self, topics: dict[str, str]) -> dict[str, Any]:
         """Return what is worth knowing of the run without opening its recording."""
@@ -118,9 +158,9 @@ class _Session:
             "content_digest": combine(topics),
             "topic_digests": topics,
             "episodes": self._learner.episode,
-            "train_steps": self._recorder.steps["train"],
-            "eval_steps": self._recorder.steps["eval"],
-            "messages": {name: count for name, count in self._recorder.counts.items() if count},
+            "train_steps": self.recorder.steps["train"],
+            "eval_steps": self.recorder.steps["eval"],
+            "messages": {name: count for name, count in self.recorder.counts.items() if count},
             "last_evaluation": last and evaluation_brief(last),
         }
 
@@ -135,7 +175,7 @@ class _Session:
 
     def _train(self, until_episode: int) -> bool:
         """Train up to an episode, reporting metrics on the way; return False if stopped."""
-        recorder, learner = self._recorder, self._learner
+        recorder, learner = self.recorder, self._learner
         every = self._config.log.every_steps if self._config.log else 2**62
         while learner.episode < until_episode:
             if self._stop():
@@ -159,7 +199,7 @@ class _Session:
         plan = self._config.evaluation
         if plan is None or (episode % plan.every and episode != self._config.episodes):
             return True
-        recorder, learner = self._recorder, self._learner
+        recorder, learner = self.recorder, self._learner
         learner.begin_evaluation()
         first = self._evaluated * plan.trials
         done, trials = first, []
@@ -187,11 +227,11 @@ class _Session:
     def _snapshot(self) -> None:
         for i, agent in enumerate(self._learner.agents):
             table = QTable(self._learner.step, self._learner.episode, agent, i, self._learner.table(i))
-            self._recorder.message(schema.Q_TABLE_TOPIC, encode_q_table(table))
+            self.recorder.message(schema.Q_TABLE_TOPIC, encode_q_table(table))
 
     def _log(self, text: str, level: str = "INFO") -> None:
-        steps = sum(self._recorder.steps.values())
-        self._recorder.message(
+        steps = sum(self.recorder.steps.values())
+        self.recorder.message(
             schema.LOG_TOPIC, encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level)
         )
 
@@ -204,10 +244,10 @@ class _Session:
         progress = self._progress
         progress.episode = self._learner.episode
         progress.train_steps, progress.eval_steps = (
-            self._recorder.steps["train"],
-            self._recorder.steps["eval"],
+            self.recorder.steps["train"],
+            self.recorder.steps["eval"],
         )
-        progress.bytes_written = self._recorder.bytes_written
+        progress.bytes_written = self.recorder.bytes_written
         self._report(progress)
 
 
@@ -239,23 +279,31 @@ def evaluation_brief(metrics: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _recorder(job: Job, run: Run, learner: Learner) -> Recorder:
+def recorder_for(
+    job: Job,
+    learner: Learner,
+    file: RecordingFile | None,
+    past: Past | None = None,
+    beat: Callable[[], None] = lambda: None,
+) -> Recorder:
+    """Return a recorder for what a learner does, into a file, packed as the job's configuration says."""
     plan = job.config.recording
     return Recorder(
-        run.folder / runs.RECORDING_FILE,
+        file,
         learners=len(learner.agents),
         events=len(learner.mdp.event_names),
         packing=Packing(plan.compression, plan.level or 0, plan.index),
         chunk_steps=plan.chunk_steps,
         record_steps=plan.steps == "all",
-        beat=run.beat,
+        past=past,
+        beat=beat,
     )
 
 
-def _describe(recorder: Recorder, job: Job, run: Run, learner: Learner) -> None:
+def describe(file: RecordingFile, job: Job, run: Run, learner: Learner) -> None:
     """Write what makes the recording self-contained."""
     mdp = learner.mdp
-    recorder.metadata(
+    file.add_metadata(
         "run",
         {
             "format_version": str(schema.FORMAT_VERSION),
@@ -269,15 +317,15 @@ def _describe(recorder: Recorder, job: Job, run: Run, learner: Learner) -> None:
             "events": str(len(mdp.event_names)),
         },
     )
-    recorder.metadata("config", {"json": json.dumps(job.config.to_mapping(), sort_keys=True)})
-    recorder.metadata("provenance", provenance())
+    file.add_metadata("config", {"json": json.dumps(job.config.to_mapping(), sort_keys=True)})
+    file.add_metadata("provenance", provenance())
     description = json.loads(description_bytes(mdp)) | {"arrays": sorted(mdp.arrays())}
-    recorder.attachment("environment.json", "application/json", json.dumps(description, indent=1).encode())
+    file.add_attachment("environment.json", "application/json", json.dumps(description, indent=1).encode())
     for name, array in sorted(mdp.arrays().items()):
-        recorder.attachment(f"environment/{name}.npy.zst", "application/zstd", pack_array(array))
+        file.add_attachment(f"environment/{name}.npy.zst", "application/zstd", pack_array(array))
 
 
-def _initial_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
+def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
     """Return the tables of the run that `initial_q` names, if it names one."""
     start = job.config.initial_q
     if not isinstance(start, RunTable):

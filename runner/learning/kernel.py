@@ -339,9 +339,11 @@ def replay(
 ) -> None:
     """Apply the updates of recorded training steps, in order, to the tables.
 
-    The outcome class is found from the recorded step by comparing rewards, so the replayed update is the
-    kernel's own, to the last bit.
+    A recorded step holds all that its update took in, so the replayed update is `train`'s own, to the last
+    bit.
     """
+    if not rules.learns:
+        return
     learners = len(model.width)
     for k in range(len(steps)):
         record = steps[k]

@@ -10,6 +10,7 @@ import struct
 import zlib
 from dataclasses import dataclass
 from functools import cache
+from typing import Final
 
 import lz4.frame
 import numpy as np
@@ -19,6 +20,10 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.schema import Topic
+
+MAX_CHUNK_BYTES: Final = 64 << 20
+"""The largest chunk that is read, packed or unpacked; the recorder's are below 16 MiB."""
+_MAX_WINDOW: Final = 1 << 27
 
 
 @dataclass(frozen=True)
@@ -118,9 +123,7 @@ def decompress(data: bytes | memoryview, compression: str, size: int, where: str
     """
     try:
         if compression == "zstd":
-            with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as stream:
-                records = stream.read(size)
-                more = stream.read(1)
+            records, more = _unpack_zstd(data, size)
         elif compression == "lz4":
             with lz4.frame.LZ4FrameDecompressor() as stream:
                 records = stream.decompress(bytes(data), max_length=size)
@@ -134,3 +137,15 @@ def decompress(data: bytes | memoryview, compression: str, size: int, where: str
     if len(records) != size or more:
         raise RecordingError(f"{where}: found a chunk of another size than the {size} bytes it declares")
     return records
+
+
+def _unpack_zstd(data: bytes | memoryview, size: int) -> tuple[bytes, bytes]:
+    """Return at most `size` unpacked bytes, and a byte if there are more.
+
+    A frame that declares its size is unpacked in one go: the size was compared first.
+    """
+    declared = zstandard.frame_content_size(data)
+    if declared == size:
+        return zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).decompress(data), b""
+    with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
+        return stream.read(size), stream.read(1)

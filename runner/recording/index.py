@@ -31,8 +31,6 @@ from runner.recording.schema import PROFILE
 
 T = TypeVar("T")
 
-MAX_CHUNK_BYTES: Final = 64 << 20
-"""The largest chunk that is read, packed or unpacked; the recorder's are below 16 MiB."""
 MAX_RECORD_BYTES: Final = 64 << 20
 _HEAD: Final = struct.Struct("<BQ")
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")

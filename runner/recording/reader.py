@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.mdp import Mdp, from_parts
 from runner.recording import schema
-from runner.recording.chunks import decompress
-from runner.recording.index import MAX_CHUNK_BYTES, ChunkEntry, read_index
+from runner.recording.chunks import MAX_CHUNK_BYTES, decompress
+from runner.recording.index import ChunkEntry, read_index
 from runner.recording.messages import QTable, decode, decode_q_table
 from runner.recording.schema import BLOCK_TOPICS, Topic
 

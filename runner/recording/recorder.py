@@ -1,21 +1,17 @@
-"""The recorder: blocks of records in, a recording on disk out, beside the thread that learns.
+"""The recorder: a learner fills message records in place, in buffers that go round, and commits them.
 
-    learner fills a block -> commit -> encoder threads (checksum, compression) -> writer thread -> file
-
-The learner fills message records in place, in buffers that go round; when all of them are under way it
-waits, so memory is bounded. Blocks reach the file, and the digest, in the order they were committed.
+When all buffers are under way the learner waits, so memory is bounded. What a recording already holds
+(its past) is compared with what is committed, not written again: so a run is resumed, and verified.
 """
 
 from __future__ import annotations
 
 import os
 import queue
-import threading
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -23,37 +19,24 @@ from numpy.typing import NDArray
 
 from runner.errors import StorageError
 from runner.recording import schema
-from runner.recording.chunks import Chunk, Packing, encode_chunk
-from runner.recording.digest import ContentHash
+from runner.recording.chunks import Packing
+from runner.recording.past import Past
+from runner.recording.pipeline import Pipeline
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 
 FLUSH_SECONDS: Final = 0.5
 """An open block is closed when it is this old; with the time to write it, well under a second."""
-SYNC_SECONDS: Final = 5.0
-"""How often the system is asked to put on disk what was written."""
 BLOCKS_UNDER_WAY: Final = 8
 EPISODES_A_BLOCK: Final = 2048
-ENCODERS: Final = 2
 
 
 @dataclass
 class _Block:
     """A buffer of records of one topic, and how far it is filled."""
 
-    topic: Topic
     records: NDArray[np.void]
     filled: int = 0
-
-
-@dataclass(frozen=True)
-class _Work:
-    """What the writer thread gets: records for the digest, perhaps a chunk for the file."""
-
-    topic: Topic
-    records: memoryview
-    chunk: Future[Chunk] | None
-    block: _Block | None = None
 
 
 @dataclass
@@ -63,256 +46,189 @@ class _Lane:
     topic: Topic
     counts: tuple[int, ...]
     capacity: int
+    write: bool
     open: _Block | None = None
     free: queue.SimpleQueue[_Block] = field(default_factory=queue.SimpleQueue)
     made: int = 0
 
 
 class Recorder:
-    """Records one run. Use as a context manager, or call `finish` or `abandon` in the end.
+    """Records one run; in the end call `drain`, or `abandon`.
 
     Args:
-        path: the file to create; must not exist.
+        file: the recording to write; None records nothing but the digest.
         learners: number of reward columns.
         events: number of event counters.
         packing: how chunks are packed.
         chunk_steps: the most steps in a chunk.
         record_steps: False keeps the steps' digest but not the steps.
+        past: what the recording already holds.
         beat: called about once a second while the recorder lives, from its own thread.
     """
 
     def __init__(
         self,
-        path: Path,
+        file: RecordingFile | None,
         learners: int,
         events: int,
         packing: Packing | None = None,
         chunk_steps: int = 16_384,
         record_steps: bool = True,
+        past: Past | None = None,
         beat: Callable[[], None] = lambda: None,
     ) -> None:
-        self._packing = packing or Packing()
-        self._record_steps = record_steps
-        self._beat = beat
-        self._hash = ContentHash()
+        self._file = file
+        self._past = past or Past()
         self._lanes = {
             topic: _Lane(
                 topic,
                 schema.block_counts(topic, learners, events),
-                chunk_steps if topic.message is schema.STEP else EPISODES_A_BLOCK,
+                capacity=chunk_steps if topic.message is schema.STEP else EPISODES_A_BLOCK,
+                write=record_steps or topic.message is not schema.STEP,
             )
             for topic in schema.BLOCK_TOPICS
         }
         self.steps = {"train": 0, "eval": 0}
-        """Steps recorded so far, a phase."""
+        """Steps committed so far, a phase."""
         self.counts = {topic.name: 0 for topic in schema.TOPICS}
-        """Messages recorded so far, a topic."""
-        self._failure: BaseException | None = None
+        """Messages committed so far, a topic."""
         self._last_flush = time.monotonic()
-        try:
-            self._file = RecordingFile(path)
-        except OSError as error:
-            raise StorageError(
-                f"{path}: cannot be created ({error.strerror}); choose another --recordings."
-            ) from error
-        self._encoders = ThreadPoolExecutor(ENCODERS, thread_name_prefix="encoder")
-        self._work: queue.Queue[_Work | None] = queue.Queue(maxsize=4 * BLOCKS_UNDER_WAY)
-        self._writer = threading.Thread(target=self._write_all, name="recording-writer", daemon=True)
-        self._writer.start()
+        self._pipeline = Pipeline(file, packing or Packing(), beat)
 
-    # --- what a learner does -------------------------------------------------------------------------
+    @property
+    def bytes_written(self) -> int:
+        """Bytes in the file so far."""
+        return self._file.size if self._file is not None else 0
 
     def block(self, topic: Topic) -> NDArray[np.void]:
         """Return the free records of the topic's open block, to be filled from the first on."""
         lane = self._lanes[topic]
         if lane.open is None:
             lane.open = self._take_block(lane)
-        return lane.open.records[lane.open.filled :]
+        free = lane.open.records[lane.open.filled :]
+        already = self._past.remaining(topic)
+        return free[:already] if already else free
 
     def commit(self, phase: str, steps: int, episodes: int) -> None:
         """Say how many records of the phase's blocks were filled; closes what is full or old.
 
         Raises:
             StorageError: the disk is full or failing; everything before is kept.
+            Diverged: a record differs from the one that the recording holds already.
         """
         self._raise_failure()
         step_topic, episode_topic = schema.PHASES[phase]
         other = self.steps["eval" if phase == "train" else "train"]
-        step_block, episode_block = self._lanes[step_topic].open, self._lanes[episode_topic].open
-        if steps and step_block is not None:
+        if steps:
             first = self.steps[phase] + other + 1
-            _stamp(step_block, np.arange(first, first + steps, dtype=np.uint64))
+            self._take(step_topic, np.arange(first, first + steps, dtype=np.uint64))
             self.steps[phase] += steps
-            self.counts[step_topic.name] += steps
-        if episodes and episode_block is not None:
-            fresh = episode_block.records[episode_block.filled : episode_block.filled + episodes]
-            _stamp(episode_block, fresh["last_step"].astype(np.uint64) + np.uint64(other + 1))
-            self.counts[episode_topic.name] += episodes
-        for topic in (step_topic, episode_topic):
-            block = self._lanes[topic].open
-            if block is not None and block.filled == len(block.records):
-                self._close_block(topic)
+        if episodes:
+            block = self._open(episode_topic)
+            ended_by = block.records["last_step"][block.filled : block.filled + episodes]
+            self._take(episode_topic, ended_by.astype(np.uint64) + np.uint64(other + 1))
         if time.monotonic() - self._last_flush > FLUSH_SECONDS:
             self.flush()
 
     def message(self, topic: Topic, payload: bytes) -> None:
         """Record one message of a topic of variable size, at the present logical time."""
         self._raise_failure()
-        log_time = (self.steps["train"] + self.steps["eval"]) * STEP_NANOSECONDS
+        log_time = sum(self.steps.values()) * STEP_NANOSECONDS
+        self.counts[topic.name] += 1
+        known = self._past.compare_message(topic, log_time, payload)
         header = np.zeros((), dtype=schema.HEADER)
         header["opcode"], header["channel_id"] = 5, topic.channel
         header["record_length"] = schema.HEADER_BYTES - 9 + len(payload)
         header["log_time"] = header["publish_time"] = log_time
         records = memoryview(header.tobytes() + payload)
         times = np.array([log_time], dtype=np.uint64)
-        chunk = self._encoders.submit(
-            encode_chunk, topic, records, times, np.zeros(1, np.uint64), self._packing
-        )
-        self.counts[topic.name] += 1
-        self._put(_Work(topic, records, chunk))
+        self._pipeline.send(topic, records, times, np.zeros(1, np.uint64), write=not known)
 
     def flush(self) -> None:
         """Close every open block, so that it is written now."""
-        for topic, lane in self._lanes.items():
+        for lane in self._lanes.values():
             if lane.open is not None and lane.open.filled:
-                self._close_block(topic)
+                self._close_block(lane)
         self._last_flush = time.monotonic()
 
-    # --- what stands beside the messages -------------------------------------------------------------
-
-    def metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        """Write a metadata record; only before the first message or through `finish`."""
-        self._file.add_metadata(name, entries)
-
-    def attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Write an attachment; only before the first message."""
-        self._file.add_attachment(name, media_type, data)
-
-    @property
-    def bytes_written(self) -> int:
-        """Bytes in the file so far."""
-        return self._file.size
-
-    # --- the end -------------------------------------------------------------------------------------
-
     def drain(self) -> dict[str, str]:
-        """Write everything committed, stop the threads, and return the hash of each topic."""
-        self.flush()
-        self._put(None)
-        self._writer.join()
-        self._encoders.shutdown()
-        self._raise_failure()
-        return self._hash.topics()
+        """Write everything committed, stop the threads, and return the hash of each topic.
 
-    def finish(self, name: str, entries: Mapping[str, str]) -> None:
-        """After `drain`: write a last metadata record, the index and the summary; close the file."""
-        try:
-            self._file.add_metadata(name, entries)
-            self._file.finish()
-        except OSError as error:
-            self._file.cut_back()
-            raise self._storage_error(error) from error
-        finally:
-            self._file.close()
+        Raises:
+            StorageError: the disk is full or failing; everything before is kept.
+        """
+        self.flush()
+        self._pipeline.close()
+        self._raise_failure()
+        return self._pipeline.hash.topics()
 
     def abandon(self) -> None:
-        """Stop the threads and close the file as it is: what was written stays readable."""
-        if self._writer.is_alive():
-            self._put(None)
-            self._writer.join()
-        self._encoders.shutdown(cancel_futures=True)
-        self._file.close()
+        """Stop the threads; what was written stays readable."""
+        self._pipeline.close()
 
-    # --- inside --------------------------------------------------------------------------------------
+    def _open(self, topic: Topic) -> _Block:
+        block = self._lanes[topic].open
+        assert block is not None, "commit without block"
+        return block
+
+    def _take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
+        """Take the next records of the topic's block in: give them their times, compare or keep them.
+
+        A record's time is the number of steps executed so far, 0.1 s each.
+        """
+        lane, block = self._lanes[topic], self._open(topic)
+        known = self._past.remaining(topic) > 0
+        fresh: Any = block.records[block.filled : block.filled + len(positions)]
+        times = positions * np.uint64(STEP_NANOSECONDS)
+        fresh["log_time"] = times
+        fresh["publish_time"] = times
+        block.filled += len(positions)
+        self.counts[topic.name] += len(positions)
+        if known:
+            self._past.compare_block(topic, fresh)
+            self._close_block(lane, write=False)
+            return
+        self._past.check_new(topic, fresh)
+        if block.filled == len(block.records):
+            self._close_block(lane)
 
     def _take_block(self, lane: _Lane) -> _Block:
         """Return a block to fill: a used one that came back, or a new one while there may be more."""
         if lane.made < BLOCKS_UNDER_WAY and lane.free.empty():
             lane.made += 1
-            records = schema.blank_records(lane.topic, lane.counts, lane.capacity)
-            return _Block(lane.topic, records.view(np.recarray))
-        while True:
-            try:
-                block = lane.free.get(timeout=1.0)
-            except queue.Empty:
-                self._raise_failure()
-                continue
-            block.filled = 0
-            return block
+            return _Block(schema.blank_records(lane.topic, lane.counts, lane.capacity).view(np.recarray))
+        block = lane.free.get()
+        block.filled = 0
+        return block
 
-    def _close_block(self, topic: Topic) -> None:
-        """Send the topic's open block on its way."""
-        lane = self._lanes[topic]
+    def _close_block(self, lane: _Lane, write: bool = True) -> None:
+        """Send the lane's open block on its way; it comes back when it was used."""
         block, lane.open = lane.open, None
         if block is None:
             return
         filled = block.records[: block.filled]
-        view = filled.view(np.uint8).data.cast("B")
-        chunk = None
-        if self._record_steps or topic.message is not schema.STEP:
-            offsets = np.arange(block.filled, dtype=np.uint64) * np.uint64(filled.itemsize)
-            chunk = self._encoders.submit(
-                encode_chunk, topic, view, filled["log_time"], offsets, self._packing
-            )
-        self._put(_Work(topic, view, chunk, block))
-
-    def _put(self, work: _Work | None) -> None:
-        self._work.put(work)
-
-    def _write_all(self) -> None:
-        """Take work in order: into the digest, into the file. After a failure only give blocks back."""
-        last_beat = last_sync = time.monotonic()
-        while True:
-            try:
-                work = self._work.get(timeout=1.0)
-            except queue.Empty:
-                self._beat()
-                continue
-            if work is None:
-                return
-            try:
-                if self._failure is None:
-                    self._write(work)
-            except BaseException as error:  # handed to the learner's thread
-                self._failure = error
-            if work.block is not None:
-                self._lanes[work.topic].free.put(work.block)
-            now = time.monotonic()
-            if now - last_beat > 1.0:
-                self._beat()
-                last_beat = now
-            if now - last_sync > SYNC_SECONDS and self._failure is None:
-                self._file.sync()
-                last_sync = now
-
-    def _write(self, work: _Work) -> None:
-        self._hash.update(work.topic, work.records)
-        if work.chunk is None:
-            return
-        try:
-            self._file.add_chunk(work.topic, work.chunk.result())
-        except OSError:
-            self._file.cut_back()
-            raise
-
-    def _raise_failure(self) -> None:
-        if isinstance(self._failure, OSError):
-            raise self._storage_error(self._failure) from self._failure
-        if self._failure is not None:
-            raise self._failure
-
-    def _storage_error(self, error: OSError) -> StorageError:
-        return StorageError(
-            f"{self._file.path}: writing failed ({error.strerror or os.strerror(error.errno or 0)}) after "
-            f"{self._file.size:,} bytes. What was written is kept and can be read; free some disk, or choose "
-            "another --recordings."
+        offsets = np.arange(block.filled, dtype=np.uint64) * np.uint64(filled.itemsize)
+        self._pipeline.send(
+            lane.topic,
+            filled.view(np.uint8).data.cast("B"),
+            filled["log_time"],
+            offsets,
+            write=write and lane.write,
+            used=partial(lane.free.put, block),
         )
 
+    def _raise_failure(self) -> None:
+        failure = self._pipeline.failure
+        if isinstance(failure, OSError) and self._file is not None:
+            raise storage_error(self._file, failure) from failure
+        if failure is not None:
+            raise failure
 
-def _stamp(block: _Block, positions: NDArray[np.uint64]) -> None:
-    """Set the logical time of the next records of a block: steps executed so far, 0.1 s each."""
-    fresh: Any = block.records[block.filled : block.filled + len(positions)]
-    times = positions * np.uint64(STEP_NANOSECONDS)
-    fresh["log_time"] = times
-    fresh["publish_time"] = times
-    block.filled += len(positions)
+
+def storage_error(file: RecordingFile, error: OSError) -> StorageError:
+    """Return the error that tells a user that writing failed, and what was kept."""
+    reason = error.strerror or os.strerror(error.errno or 0)
+    return StorageError(
+        f"{file.path}: writing failed ({reason}) after {file.size:,} bytes. What was written is kept and "
+        "can be read; free some disk, or choose another --recordings."
+    )

@@ -11,7 +11,8 @@ import struct
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import BinaryIO
+from types import TracebackType
+from typing import BinaryIO, Self
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -34,6 +35,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner import __version__
 from runner.recording.chunks import Chunk
+from runner.recording.contents import Contents
 from runner.recording.schema import PROFILE, TOPICS, Topic, file_descriptor_set
 
 LIBRARY = f"dualtaxi {__version__}"
@@ -48,8 +50,13 @@ class RecordingFile:
         Raises:
             OSError: it exists, or cannot be created.
         """
+        self._reset(path, path.open("xb", buffering=0))
+        self._append(MCAP0_MAGIC)
+        self._append(_bytes_of(Header(PROFILE, LIBRARY)) + schema_and_channel_bytes())
+
+    def _reset(self, path: Path, stream: BinaryIO) -> None:
         self.path = path
-        self._stream: BinaryIO = path.open("xb", buffering=0)
+        self._stream = stream
         self._crc = 0
         self._offset = 0
         self._attachments: list[AttachmentIndex] = []
@@ -59,8 +66,48 @@ class RecordingFile:
         self._start_time: int | None = None
         self._end_time = 0
         self._schemas, self._channels = schemas_and_channels()
-        self._append(MCAP0_MAGIC)
-        self._append(_bytes_of(Header(PROFILE, LIBRARY), *self._schemas, *self._channels))
+
+    @classmethod
+    def reopen(cls, path: Path, contents: Contents) -> RecordingFile:
+        """Open a recording to go on with it: what follows its last whole chunk is cut off.
+
+        Args:
+            path: the recording.
+            contents: what of it is good, as `contents.survey` found.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        file = cls.__new__(cls)
+        file._reset(path, path.open("r+b", buffering=0))
+        file._stream.truncate(contents.end)
+        file._take_over(contents)
+        return file
+
+    @classmethod
+    def inspect(cls, path: Path, contents: Contents) -> RecordingFile:
+        """Open a recording for reading, to ask what its `tail` should be."""
+        file = cls.__new__(cls)
+        file._reset(path, path.open("rb", buffering=0))
+        file._take_over(contents)
+        return file
+
+    def _take_over(self, contents: Contents) -> None:
+        self._crc = self._checksum(contents.end)
+        self._offset = self._stream.seek(contents.end)
+        self._attachments = list(contents.attachments)
+        self._metadata = list(contents.metadata)
+        for part in contents.chunks:
+            self._note_chunk(part.index, part.channel, part.messages)
+
+    def _checksum(self, end: int) -> int:
+        """Return the checksum of the first `end` bytes."""
+        crc, offset = 0, self._stream.seek(0)
+        while offset < end:
+            piece = self._stream.read(min(1 << 20, end - offset))
+            crc = zlib.crc32(piece, crc)
+            offset += len(piece)
+        return crc
 
     @property
     def size(self) -> int:
@@ -92,26 +139,27 @@ class RecordingFile:
     def add_chunk(self, topic: Topic, chunk: Chunk) -> None:
         """Append a chunk of one topic and its message index."""
         start = self._offset
-        self._append(chunk.record)
-        index_start = self._offset
-        if chunk.index:
-            self._append(chunk.index)
-        self._chunks.append(
-            ChunkIndex(
-                chunk_length=len(chunk.record),
-                chunk_start_offset=start,
-                compression=chunk.compression,
-                compressed_size=chunk.compressed_size,
-                message_end_time=chunk.end_time,
-                message_index_length=len(chunk.index),
-                message_index_offsets={topic.channel: index_start} if chunk.index else {},
-                message_start_time=chunk.start_time,
-                uncompressed_size=chunk.uncompressed_size,
-            )
+        self._append(chunk.record + chunk.index)
+        index_start = start + len(chunk.record)
+        index = ChunkIndex(
+            chunk_length=len(chunk.record),
+            chunk_start_offset=start,
+            compression=chunk.compression,
+            compressed_size=chunk.compressed_size,
+            message_end_time=chunk.end_time,
+            message_index_length=len(chunk.index),
+            message_index_offsets={topic.channel: index_start} if chunk.index else {},
+            message_start_time=chunk.start_time,
+            uncompressed_size=chunk.uncompressed_size,
         )
-        self._counts[topic.channel] += chunk.messages
-        self._start_time = min(chunk.start_time, self._start_time if self._start_time is not None else 2**63)
-        self._end_time = max(chunk.end_time, self._end_time)
+        self._note_chunk(index, topic.channel, chunk.messages)
+
+    def _note_chunk(self, index: ChunkIndex, channel: int, messages: int) -> None:
+        self._chunks.append(index)
+        self._counts[channel] += messages
+        start = index.message_start_time
+        self._start_time = start if self._start_time is None else min(start, self._start_time)
+        self._end_time = max(index.message_end_time, self._end_time)
 
     def sync(self) -> None:
         """Ask the system to put on disk what was written."""
@@ -124,20 +172,31 @@ class RecordingFile:
 
     def finish(self) -> None:
         """Write the end of the data section, the summary and the footer, and put all on disk."""
-        self._append(_bytes_of(DataEnd(self._crc)))
-        summary_start = self._offset
+        self._append(self.tail())
+        self.sync()
+
+    def tail(self) -> bytes:
+        """Return what a finished recording has behind its data: data end, summary, footer, magic."""
+        data_end = _bytes_of(DataEnd(self._crc))
+        summary_start = self._offset + len(data_end)
         summary, offsets = self._summary(summary_start)
         offsets_start = summary_start + len(summary)
-        body = summary + offsets
-        crc = zlib.crc32(body)
+        crc = zlib.crc32(summary + offsets)
         crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, offsets_start), crc)
         footer = Footer(summary_start=summary_start, summary_offset_start=offsets_start, summary_crc=crc)
-        self._append(body + _bytes_of(footer) + MCAP0_MAGIC)
-        self.sync()
+        return b"".join((data_end, summary, offsets, _bytes_of(footer), MCAP0_MAGIC))
 
     def close(self) -> None:
         """Close the file as it is."""
         self._stream.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
     def _append(self, data: bytes) -> None:
         view = memoryview(data)
@@ -198,6 +257,12 @@ def schemas_and_channels() -> tuple[list[Schema], list[Channel]]:
         for topic in TOPICS
     ]
     return schemas, channels
+
+
+def schema_and_channel_bytes() -> bytes:
+    """Return the records that stand behind the header of every recording."""
+    schemas, channels = schemas_and_channels()
+    return _bytes_of(*schemas, *channels)
 
 
 def _bytes_of(*records: McapRecord) -> bytes:

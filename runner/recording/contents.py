@@ -1,0 +1,216 @@
+"""What of a recording is good: a walk through all of its records, by which it is resumed or repaired.
+
+Unlike the reader's index, this looks at every byte: each chunk is unpacked and its checksum compared.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
+from mcap.writer import MCAP0_MAGIC
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.chunks import MAX_CHUNK_BYTES, decompress
+
+_HEAD = struct.Struct("<BQ")
+_RESULT = "result"
+
+
+@dataclass(frozen=True)
+class Part:
+    """A good chunk: its index entry, channel and number of messages."""
+
+    index: ChunkIndex
+    channel: int
+    messages: int
+
+
+@dataclass
+class Contents:
+    """The good records of a recording, up to `end`."""
+
+    end: int = 0
+    """Offset behind the last good record that a continued recording keeps."""
+    size: int = 0
+    """Bytes of the file."""
+    reason: str = ""
+    """Why the walk stopped before the end of the data section; empty if it did not."""
+    chunks: list[Part] = field(default_factory=list)
+    attachments: list[AttachmentIndex] = field(default_factory=list)
+    metadata: list[MetadataIndex] = field(default_factory=list)
+
+
+def survey(path: Path, keep_result: bool = False) -> Contents:
+    """Return what of a recording is good, from its beginning to the first record that is not.
+
+    Args:
+        path: the recording.
+        keep_result: whether a `result` record counts; who goes on writing leaves it out and writes anew.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            return _survey(stream, keep_result)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+
+
+def _survey(stream: BinaryIO, keep_result: bool) -> Contents:
+    contents = Contents(size=stream.seek(0, 2))
+    surveyor = _Surveyor(contents, keep_result)
+    for opcode, at, body in walk(stream, contents.size):
+        if opcode == Opcode.DATA_END:
+            return contents
+        try:
+            surveyor.take(opcode, at, body)
+        except (RecordingError, struct.error, ValueError, EndOfFile) as error:
+            contents.reason = str(error) or f"the record at {at} cannot be read"
+            return contents
+    contents.reason = f"the file ends at {contents.size}, in the middle of the data"
+    return contents
+
+
+class _Surveyor:
+    """Takes the records of a data section in order and notes the good ones."""
+
+    def __init__(self, contents: Contents, keep_result: bool) -> None:
+        self._contents = contents
+        self._keep_result = keep_result
+        self._indexed = True
+        """Whether every chunk is followed by its message index."""
+        self._pending: Part | None = None
+
+    def take(self, opcode: int, at: int, body: bytes) -> None:
+        """Take one record; raises an error if it is damaged."""
+        contents, end = self._contents, at + 9 + len(body)
+        if opcode == Opcode.CHUNK:
+            part = read_chunk(body, at)
+            if self._indexed:
+                self._pending = part
+                return
+            contents.chunks.append(part)
+        elif opcode == Opcode.MESSAGE_INDEX and self._pending is not None:
+            self._take_index(self._pending, at, body)
+        elif opcode == Opcode.METADATA:
+            name = _name(body, 0)
+            if name == _RESULT and not self._keep_result:
+                return
+            if name == "config":
+                self._indexed = _is_indexed(body)
+            contents.metadata.append(MetadataIndex(offset=at, length=9 + len(body), name=name))
+        elif opcode == Opcode.ATTACHMENT:
+            contents.attachments.append(_attachment_index(body, at))
+        elif opcode not in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL):
+            raise RecordingError(f"found a record of kind {opcode} at {at}, expected none there")
+        contents.end = end
+
+    def _take_index(self, part: Part, at: int, body: bytes) -> None:
+        (channel,) = struct.unpack_from("<H", body)
+        part.index.message_index_offsets[channel] = at
+        part.index.message_index_length = 9 + len(body)
+        self._contents.chunks.append(part)
+        self._pending = None
+
+
+def _is_indexed(body: bytes) -> bool:
+    """Return whether the recording's configuration asks for message indexes."""
+    config = json.loads(Metadata.read(ReadDataStream(BytesIO(body))).metadata["json"])
+    return bool(config["recording"]["index"] == "message")
+
+
+def walk(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:
+    """Yield (opcode, offset, body) of the whole records of a file, until one is cut off or absurd."""
+    offset = len(MCAP0_MAGIC)
+    while offset + 9 <= size:
+        stream.seek(offset)
+        opcode, length = _HEAD.unpack(stream.read(9))
+        if length > min(size - offset - 9, MAX_CHUNK_BYTES) or not 1 <= opcode <= Opcode.DATA_END:
+            return
+        yield opcode, offset, stream.read(length)
+        offset += 9 + length
+
+
+def read_chunk(body: bytes, offset: int) -> Part:
+    """Return what the index says of a chunk record, after unpacking it and comparing its checksum.
+
+    Raises:
+        RecordingError: it is damaged, or holds messages of no topic, or of several.
+    """
+    where = f"chunk at {offset}"
+    start, end, size, crc, name_length = struct.unpack_from("<QQQII", body)
+    compression = body[32 : 32 + name_length].decode("ascii")
+    (packed,) = struct.unpack_from("<Q", body, 32 + name_length)
+    data = memoryview(body)[40 + name_length :]
+    if packed != len(data) or size > MAX_CHUNK_BYTES:
+        raise RecordingError(f"{where}: its sizes contradict each other")
+    records = decompress(data, compression, size, where)
+    if zlib.crc32(records) != crc:
+        raise RecordingError(f"{where}: its content does not match its checksum")
+    channel, messages = _messages(records, where)
+    index = ChunkIndex(
+        chunk_length=9 + len(body),
+        chunk_start_offset=offset,
+        compression=compression,
+        compressed_size=packed,
+        message_end_time=end,
+        message_index_length=0,
+        message_index_offsets={},
+        message_start_time=start,
+        uncompressed_size=size,
+    )
+    return Part(index, channel, messages)
+
+
+def _messages(records: bytes, where: str) -> tuple[int, int]:
+    """Return the channel of a chunk's messages and how many there are."""
+    if len(records) < schema.HEADER_BYTES:
+        raise RecordingError(f"{where}: holds no whole message")
+    _, length, channel = struct.unpack_from("<BQH", records)
+    if channel in {topic.channel for topic in schema.BLOCK_TOPICS}:
+        if len(records) % (9 + length):
+            raise RecordingError(f"{where}: its messages differ in size")
+        return channel, len(records) // (9 + length)
+    at = messages = 0
+    while at < len(records):
+        at += 9 + struct.unpack_from("<Q", records, at + 1)[0]
+        messages += 1
+    return channel, messages
+
+
+def _attachment_index(body: bytes, offset: int) -> AttachmentIndex:
+    """Return an attachment's index entry, after comparing its checksum."""
+    stream = ReadDataStream(BytesIO(body))
+    log_time, create_time = stream.read8(), stream.read8()
+    name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
+    size = stream.read8()
+    (crc,) = struct.unpack("<I", body[-4:])
+    if stream.count + size + 4 != len(body) or zlib.crc32(body[:-4]) != crc:
+        raise RecordingError(f"attachment at {offset}: its content does not match its checksum")
+    return AttachmentIndex(
+        offset=offset,
+        length=9 + len(body),
+        log_time=log_time,
+        create_time=create_time,
+        data_size=size,
+        name=name,
+        media_type=media_type,
+    )
+
+
+def _name(body: bytes, at: int) -> str:
+    (length,) = struct.unpack_from("<I", body, at)
+    return body[at + 4 : at + 4 + length].decode()

@@ -1,0 +1,143 @@
+"""Whether a recording's bytes are what its recorder must have written, every one of them.
+
+Each record is walked and each checksum compared (one of zero counts as missing); message indexes, the
+end of the data section, summary and footer are built anew from the data and compared byte by byte.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.chunks import decompress, message_index
+from runner.recording.contents import survey, walk
+from runner.recording.writer import RecordingFile, schema_and_channel_bytes
+
+Times = NDArray[np.uint64]
+_BLOCK_CHANNELS = {topic.channel for topic in schema.BLOCK_TOPICS}
+
+
+def check_integrity(path: Path) -> None:
+    """Check every byte of a finished recording.
+
+    Raises:
+        RecordingError: something is wrong; the first such thing is named with its offset.
+    """
+    with path.open("rb") as stream:
+        _check_beginning(stream, path)
+        size = stream.seek(0, 2)
+        for opcode, offset, body in walk(stream, size):
+            if opcode == Opcode.DATA_END:
+                break
+            _check_record(stream, path, opcode, offset, body)
+    contents = survey(path, keep_result=True)
+    if contents.reason:
+        raise RecordingError(f"{path}: {contents.reason}; `repair` or `resume` mends it.")
+    with RecordingFile.inspect(path, contents) as file:
+        expected = file.tail()
+    with path.open("rb") as stream:
+        stream.seek(contents.end)
+        found = stream.read(len(expected) + 1)
+    if found != expected:
+        _refuse_tail(path, contents.end, found, expected)
+
+
+def _check_beginning(stream: BinaryIO, path: Path) -> None:
+    """Compare magic, header, schemas and channels; only the library's version may differ."""
+    start = stream.read(len(MCAP0_MAGIC) + 9)
+    if start[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
+        raise RecordingError(f"{path}: found {start[:8]!r} at 0, expected the MCAP magic.")
+    opcode, length = struct.unpack("<BQ", start[len(MCAP0_MAGIC) :].ljust(9, b"\0"))
+    expected = schema_and_channel_bytes()
+    stream.seek(len(MCAP0_MAGIC) + 9 + min(length, 4096))
+    if opcode != Opcode.HEADER or stream.read(len(expected)) != expected:
+        raise RecordingError(f"{path}: found other schemas or channels than every recording begins with.")
+
+
+def _check_record(stream: BinaryIO, path: Path, opcode: int, offset: int, body: bytes) -> None:
+    """Check one record of the data section beyond what `survey` does."""
+    if opcode == Opcode.CHUNK and struct.unpack_from("<I", body, 24)[0] == 0:
+        raise RecordingError(f"{path}: the chunk at {offset} has no checksum.")
+    if opcode == Opcode.ATTACHMENT and body[-4:] == b"\0\0\0\0":
+        raise RecordingError(f"{path}: the attachment at {offset} has no checksum.")
+    if opcode == Opcode.CHUNK:
+        _check_chunk(stream, path, offset, body)
+
+
+def _check_chunk(stream: BinaryIO, path: Path, offset: int, body: bytes) -> None:
+    """Compare a chunk's times and the message index behind it with its messages."""
+    where = f"{path}: chunk at {offset}"
+    start, end, size, _, name_length = struct.unpack_from("<QQQII", body)
+    compression = body[32 : 32 + name_length].decode("ascii", "replace")
+    records = decompress(memoryview(body)[40 + name_length :], compression, size, where)
+    channel, times, offsets = _places(records, where)
+    if (start, end) != (int(times[0]), int(times[-1])):
+        raise RecordingError(f"{where}: found times {start} to {end}, expected {times[0]} to {times[-1]}.")
+    stream.seek(offset + 9 + len(body))
+    expected = message_index(channel, times, offsets)
+    found = stream.read(len(expected))
+    if found[:1] == bytes([Opcode.MESSAGE_INDEX]) and found != expected:
+        raise RecordingError(f"{where}: the message index behind it does not lead to its messages.")
+
+
+def _places(records: bytes, where: str) -> tuple[int, Times, Times]:
+    """Return channel, times and offsets of a chunk's messages; checks what every message must have."""
+    times, offsets, channels = [], [], set()
+    at = 0
+    if len(records) >= schema.HEADER_BYTES:
+        _, length, channel = struct.unpack_from("<BQH", records)
+        if channel in _BLOCK_CHANNELS and length and len(records) % (9 + length) == 0:
+            return _block_places(records, 9 + length, channel, where)
+    while at + schema.HEADER_BYTES <= len(records):
+        opcode, length, channel, sequence, log_time, publish_time = struct.unpack_from("<BQHIQQ", records, at)
+        if opcode != Opcode.MESSAGE or sequence or publish_time != log_time:
+            raise RecordingError(f"{where}: found a message at {at} that no recorder writes.")
+        times.append(log_time)
+        offsets.append(at)
+        channels.add(channel)
+        at += 9 + length
+    if at != len(records) or len(channels) != 1:
+        raise RecordingError(f"{where}: found {len(channels)} channels and {len(records) - at} stray bytes.")
+    return channels.pop(), np.array(times, dtype=np.uint64), np.array(offsets, dtype=np.uint64)
+
+
+def _block_places(records: bytes, size: int, channel: int, where: str) -> tuple[int, Times, Times]:
+    layout = np.dtype([*schema.HEADER, ("data", "u1", (size - schema.HEADER_BYTES,))])
+    block = np.frombuffer(records, layout)
+    times = block["log_time"]
+    constant = (
+        (block["opcode"] == Opcode.MESSAGE)
+        & (block["record_length"] == size - 9)
+        & (block["channel_id"] == channel)
+        & (block["sequence"] == 0)
+        & (block["publish_time"] == times)
+    )
+    if not constant.all():
+        raise RecordingError(
+            f"{where}: found a message at {int(np.argmin(constant)) * size} that no recorder writes."
+        )
+    return channel, times, np.arange(len(block), dtype=np.uint64) * np.uint64(size)
+
+
+def _refuse_tail(path: Path, end: int, found: bytes, expected: bytes) -> None:
+    pairs = enumerate(zip(found, expected, strict=False))
+    at = next((k for k, (left, right) in pairs if left != right), min(len(found), len(expected)))
+    if at < len(expected) and at < 13:
+        what = "the checksum of the data section"
+    elif at < len(expected):
+        what = "the summary or footer"
+    else:
+        what = "the end of the file: there are bytes behind it"
+    crc = zlib.crc32(found)
+    raise RecordingError(
+        f"{path}: found damage at {end + at} in {what} (read {len(found)} bytes, CRC {crc:08x})."
+    )

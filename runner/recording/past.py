@@ -1,0 +1,183 @@
+"""What a recording already holds, to be compared with what a run of the same job gives.
+
+A job fixes its content, so running it again gives the recorded messages, byte for byte, and then those
+that are still missing. That is how a run is resumed, and how a recording is verified.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import Diverged
+from runner.recording import schema
+from runner.recording.messages import decode
+from runner.recording.schema import BLOCK_TOPICS, MessageType, Topic
+
+PLACES = ("step", "episode")
+
+if TYPE_CHECKING:
+    from runner.recording.reader import Recording
+
+
+class Past:
+    """The messages of a recording, topic by topic, taken off as they are compared.
+
+    Args:
+        recording: whose; None for a run without a past.
+        complete: whether a message that the recording does not hold is a difference, not new.
+        without_steps: whether the recording leaves its steps out.
+    """
+
+    def __init__(
+        self, recording: Recording | None = None, complete: bool = False, without_steps: bool = False
+    ) -> None:
+        self.complete = complete
+        """Whether a message that the recording does not hold is a difference, not new."""
+        self._remaining: dict[Topic, int] = {}
+        self._blocks: dict[Topic, Iterator[NDArray[np.void]]] = {}
+        self._block: dict[Topic, NDArray[np.void]] = {}
+        self._messages: dict[Topic, Iterator[tuple[int, bytes]]] = {}
+        self._logged: set[tuple[int, bytes]] = set()
+        self._unrecorded = {topic for topic in BLOCK_TOPICS if without_steps and topic.message is schema.STEP}
+        if recording is None:
+            return
+        for topic in BLOCK_TOPICS:
+            self._remaining[topic] = recording.count(topic)
+            self._blocks[topic] = recording.blocks(topic)
+        for topic in set(schema.TOPICS) - set(BLOCK_TOPICS) - {schema.LOG_TOPIC}:
+            self._messages[topic] = recording.messages(topic)
+        self._logged = set(recording.messages(schema.LOG_TOPIC))
+
+    def remaining(self, topic: Topic) -> int:
+        """Return how many messages of a fixed-width topic are still to be compared."""
+        return self._remaining.get(topic, 0)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether every step and episode was compared."""
+        return not any(self._remaining.values())
+
+    def compare_block(self, topic: Topic, records: NDArray[np.void]) -> None:
+        """Compare records with the next recorded ones, as many as there are.
+
+        Raises:
+            Diverged: they differ; the first record and field that do are named.
+        """
+        done = 0
+        while done < len(records) and self._remaining[topic]:
+            block = self._block.get(topic)
+            if block is None or not len(block):
+                block = next(self._blocks[topic])
+            n = min(len(block), len(records) - done)
+            expected = records[done : done + n]
+            if block[:n].tobytes() != expected.tobytes():
+                raise _difference(topic, block[:n], expected)
+            self._block[topic] = block[n:]
+            self._remaining[topic] -= n
+            done += n
+
+    def compare_message(self, topic: Topic, log_time: int, payload: bytes) -> bool:
+        """Compare a message with the next recorded one; return False if there is none.
+
+        Raises:
+            Diverged: they differ, or the recording should be complete and is not.
+        """
+        if topic is schema.LOG_TOPIC:
+            return self.complete or (log_time, payload) in self._logged
+        recorded = next(self._messages.get(topic, iter(())), None)
+        if recorded is None:
+            if self.complete:
+                raise Diverged(topic.name, "message", "none", f"one at {log_time} ns")
+            return False
+        if recorded != (log_time, payload):
+            raise _message_difference(topic.message, topic.name, recorded, (log_time, payload))
+        return True
+
+    def check_new(self, topic: Topic, records: NDArray[np.void]) -> None:
+        """Say that records came that the recording does not hold.
+
+        Raises:
+            Diverged: the recording should be complete.
+        """
+        if self.complete and topic not in self._unrecorded and len(records):
+            place = _place(records[0])
+            raise Diverged(topic.name, "message", "none", "one more", **place)
+
+    def check_over(self) -> None:
+        """Say that the run is over.
+
+        Raises:
+            Diverged: the recording holds more.
+        """
+        for topic, remaining in self._remaining.items():
+            if remaining:
+                raise Diverged(topic.name, "messages", f"{remaining} more", "none")
+        for topic, messages in self._messages.items():
+            if next(messages, None) is not None:
+                raise Diverged(topic.name, "messages", "more", "none")
+
+
+def _difference(topic: Topic, found: NDArray[np.void], expected: NDArray[np.void]) -> Diverged:
+    """Return the error that names the first record and field in which two blocks differ."""
+    names = [name for name in (found.dtype.names or ()) if not name.startswith("tag_")]
+    tags = [name for name in (found.dtype.names or ()) if name.startswith("tag_")]
+    differs = {name: _rows_differ(found[name], expected[name]) for name in names + tags}
+    first = min(int(np.argmax(rows)) for rows in differs.values() if rows.any())
+    name = next(name for name, rows in differs.items() if rows[first])
+    return Diverged(
+        topic.name, name, _plain(found[first][name]), _plain(expected[first][name]), **_place(expected[first])
+    )
+
+
+def _rows_differ(found: NDArray[Any], expected: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which rows differ in any byte."""
+    rows = len(found)
+    left = np.ascontiguousarray(found).view(np.uint8).reshape(rows, -1)
+    right = np.ascontiguousarray(expected).view(np.uint8).reshape(rows, -1)
+    return np.asarray((left != right).any(axis=1))
+
+
+def _message_difference(
+    message: MessageType, topic: str, found: tuple[int, bytes], expected: tuple[int, bytes]
+) -> Diverged:
+    was, should = decode(message, found[1]), decode(message, expected[1])
+    place: dict[str, int] = {key: should[key] for key in PLACES if key in should}
+    if found[0] != expected[0]:
+        return Diverged(topic, "log_time", found[0], expected[0], **place)
+    for name in should:
+        if was[name] != should[name] and not _both_nan(was[name], should[name]):
+            if name == "data":
+                return _cell_difference(topic, was, should, place)
+            return Diverged(topic, name, was[name], should[name], **place)
+    return Diverged(topic, "bytes", f"{len(found[1])} bytes", "other bytes of the same meaning", **place)
+
+
+def _cell_difference(
+    topic: str, found: dict[str, Any], expected: dict[str, Any], place: dict[str, int]
+) -> Diverged:
+    """Return the error that names the first cell in which two Q-tables differ."""
+    left, right = (np.frombuffer(values["data"], "<f8") for values in (found, expected))
+    if left.shape != right.shape:
+        return Diverged(topic, "data", f"{len(left)} cells", f"{len(right)} cells", **place)
+    cell = int(np.argmax(left.view("<i8") != right.view("<i8")))
+    state, action = divmod(cell, int(expected["shape"][-1]))
+    return Diverged(topic, f"data[{state}, {action}]", float(left[cell]), float(right[cell]), **place)
+
+
+def _both_nan(left: Any, right: Any) -> bool:
+    return isinstance(left, float) and left != left and right != right  # noqa: PLR0124
+
+
+def _place(record: np.void) -> dict[str, int]:
+    """Return the episode and step of a step or episode record."""
+    names = record.dtype.names or ()
+    step = "step" if "step" in names else "last_step"
+    return {"episode": int(record["episode"]), "step": int(record[step])}
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -1,0 +1,128 @@
+"""From records to the file, beside the thread that learns: threads that checksum, compress and write.
+
+    send(records) -> encoder threads (checksum, compression) -> writer thread (digest, file)
+
+Work reaches the digest and the file in the order it was sent; how much can be under way is bounded.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.recording.chunks import Chunk, Packing, encode_chunk
+from runner.recording.digest import ContentHash
+from runner.recording.schema import Topic
+from runner.recording.writer import RecordingFile
+
+ENCODERS: Final = 2
+WORK_UNDER_WAY: Final = 32
+SYNC_SECONDS: Final = 5.0
+"""How often the system is asked to put on disk what was written."""
+_BEAT_SECONDS: Final = 1.0
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Records for the digest, perhaps a chunk of them for the file, and whom to tell when they are used."""
+
+    topic: Topic
+    records: memoryview
+    chunk: Future[Chunk] | None
+    used: Callable[[], None]
+
+
+class Pipeline:
+    """Takes whole message records in order; `close` waits until all is written.
+
+    Args:
+        file: where chunks go; None for the digest alone.
+        packing: how chunks are packed.
+        beat: called about once a second from the writer's thread.
+    """
+
+    def __init__(self, file: RecordingFile | None, packing: Packing, beat: Callable[[], None]) -> None:
+        self.hash = ContentHash()
+        self.failure: BaseException | None = None
+        """What went wrong in the writer's thread; from then on nothing more is written."""
+        self._file = file
+        self._packing = packing
+        self._beat = beat
+        self._encoders = ThreadPoolExecutor(ENCODERS, thread_name_prefix="encoder")
+        self._work: queue.Queue[_Work | None] = queue.Queue(maxsize=WORK_UNDER_WAY)
+        self._writer = threading.Thread(target=self._run, name="recording-writer", daemon=True)
+        self._writer.start()
+
+    def send(
+        self,
+        topic: Topic,
+        records: memoryview,
+        log_times: NDArray[np.uint64],
+        offsets: NDArray[np.uint64],
+        write: bool = True,
+        used: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Send message records of one topic on their way; waits while too many are.
+
+        Args:
+            topic: the topic of all of them.
+            records: their bytes; must not change until `used` is called.
+            log_times: nanoseconds, one a record.
+            offsets: where each begins.
+            write: False leaves them out of the file; the digest covers them all the same.
+            used: called when they were written, from the writer's thread.
+        """
+        chunk = None
+        if write and self._file is not None:
+            chunk = self._encoders.submit(encode_chunk, topic, records, log_times, offsets, self._packing)
+        self._work.put(_Work(topic, records, chunk, used))
+
+    def close(self) -> None:
+        """Wait until everything sent is written, or was given up after a failure; stop the threads."""
+        if self._writer.is_alive():
+            self._work.put(None)
+            self._writer.join()
+        self._encoders.shutdown(cancel_futures=True)
+
+    def _run(self) -> None:
+        last_beat = last_sync = time.monotonic()
+        while True:
+            try:
+                work = self._work.get(timeout=_BEAT_SECONDS)
+            except queue.Empty:
+                self._beat()
+                continue
+            if work is None:
+                return
+            now = time.monotonic()
+            try:
+                if self.failure is None:
+                    self._write(work)
+                    if now - last_sync > SYNC_SECONDS and self._file is not None:
+                        self._file.sync()
+                        last_sync = now
+            except BaseException as error:  # handed to the learner's thread
+                self.failure = error
+            work.used()
+            if now - last_beat > _BEAT_SECONDS:
+                self._beat()
+                last_beat = now
+
+    def _write(self, work: _Work) -> None:
+        self.hash.update(work.topic, work.records)
+        if work.chunk is None or self._file is None:
+            return
+        chunk = work.chunk.result()
+        try:
+            self._file.add_chunk(work.topic, chunk)
+        except OSError:
+            self._file.cut_back()
+            raise
