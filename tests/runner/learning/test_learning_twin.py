@@ -14,8 +14,10 @@ from runner.errors import EnvironmentNotUsable
 from runner.learning.learner import Learner
 from runner.mdp import Mdp
 from tests.runner.learning.harness import (
+    COMPETITIVE,
+    GAMES,
+    RULES,
     SMALL,
-    SMALL_MAP,
     assert_same_records,
     assert_same_tables,
     evaluate,
@@ -23,62 +25,6 @@ from tests.runner.learning.harness import (
     train,
 )
 from tests.runner.learning.oracle import Episode, Step, Twin
-
-COMPETITIVE = {"mode": "competitive"}
-INDEPENDENT_LEARNERS = {"tables": "per_agent", "rewards": "team"}
-LINEAR = {"schedule": "linear", "start": 0.9, "end": 0.1}
-EXPONENTIAL = {"schedule": "exponential", "start": 0.97, "floor": 0.05}
-PIECEWISE = {"schedule": "piecewise"}
-
-GAMES = {
-    "published cooperative": {},
-    "published competitive": COMPETITIVE,
-    "published team of learners": INDEPENDENT_LEARNERS,
-    "slipping": {"env": {"kwargs": {"slip": 0.2}}} | COMPETITIVE,
-    "frozen lake": {"env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": True}}},
-    "taxi": {"env": {"id": "Taxi-v4"}},
-    "taxi in the rain": {"env": {"id": "Taxi-v4", "kwargs": {"is_rainy": True, "fickle_passenger": True}}},
-    "cliff": {"env": {"id": "CliffWalking-v1", "kwargs": {"max_episode_steps": 70}}},
-}
-RULES = {
-    "cooperative": {},
-    "competitive": COMPETITIVE,
-    "team of learners": INDEPENDENT_LEARNERS,
-    "slipping": {"env": {"kwargs": {"map": SMALL_MAP, "slip": 0.2, "max_episode_steps": 90}}},
-    "each explores alone": COMPETITIVE | {"exploration": "independent"},
-    "one table explores alone": {"exploration": "independent"},
-    "epsilon exploits": {"quirks": {"epsilon_exploits": True}, "epsilon": 0.2},
-    "second table by first action": COMPETITIVE | {"quirks": {"second_table_uses_first_action": True}},
-    "bootstrap after the end": {"quirks": {"bootstrap_after_termination": True}, "initial_q": 3.0},
-    "every quirk": COMPETITIVE
-    | {
-        "exploration": "independent",
-        "epsilon": LINEAR | {"over": 70},
-        "quirks": {
-            "epsilon_exploits": True,
-            "second_table_uses_first_action": True,
-            "bootstrap_after_termination": True,
-        },
-    },
-    "optimistic": {"initial_q": 100.5, "epsilon": 0.0},
-    "initially random": COMPETITIVE | {"initial_q": {"random": {"low": -1.25, "high": 0.7}}},
-    "random agents": {"algorithm": "random"},
-    "random agents alone": COMPETITIVE
-    | {"algorithm": "random", "exploration": "independent", "quirks": {"epsilon_exploits": True}},
-    "full steps, no discount": {"step_size": 1.0, "discount": 1.0},
-    "short-sighted": {"discount": 0.0},
-    "linear": {"epsilon": LINEAR | {"over": 61}, "step_size": LINEAR | {"over": 300, "by": "step"}},
-    "exponential": {
-        "epsilon": EXPONENTIAL | {"factor": 0.93},
-        "discount": EXPONENTIAL | {"factor": 0.9997, "by": "step"},
-        "step_size": EXPONENTIAL | {"factor": 0.99},
-    },
-    "piecewise": {
-        "epsilon": PIECEWISE | {"points": [[0, 1.0], [7, 0.3], [8, 0.9], [90, 0.05]], "floor": 0.1},
-        "discount": PIECEWISE | {"points": [[0, 0.7], [1000, 0.99]], "by": "step"},
-        "step_size": PIECEWISE | {"points": [[0, 0.3]]},
-    },
-}
 
 
 def assert_kernel_is_twin(config, mdp, seed, blocks, until=(10**6, 1200), trials=2) -> Twin:

@@ -1,0 +1,51 @@
+"""Replay: recorded steps, applied to a table before them, give the table after them, bit for bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from runner.learning import kernel
+from runner.learning.learner import Learner
+from tests.runner.learning.harness import GAMES, RULES, SMALL, Played, experiment, train
+
+
+def replayed(config, mdp, seed, steps, tables=None):
+    """Return the tables after these steps."""
+    learner = Learner(config, mdp, seed, tables)
+    kernel.replay(learner.model, learner.tables, learner.rules, steps)
+    return learner.tables
+
+
+@pytest.mark.parametrize("rules", RULES)
+def test_all_steps_replayed_give_the_tables(rules):
+    config, mdp = experiment(SMALL, {"epsilon": 0.4, "step_size": 0.3}, RULES[rules])
+    learner = Learner(config, mdp, 2)
+    steps = train(learner, 10**6, 3000, block=1000).steps
+    again = replayed(config, mdp, 2, steps)
+    for kept in ("q", "greedy", "value"):
+        assert getattr(again, kept).tobytes() == getattr(learner.tables, kept).tobytes()
+
+
+@pytest.mark.parametrize("game", GAMES)
+def test_steps_after_a_snapshot_give_the_tables_from_it(game):
+    config, mdp = experiment(GAMES[game], {"epsilon": 0.6, "step_size": 0.3, "initial_q": "random"})
+    learner = Learner(config, mdp, 11)
+    before: Played = train(learner, 10**6, 1777, block=1000)
+    snapshot = [learner.table(i).copy() for i in range(len(learner.agents))]
+    after = train(learner, 10**6, 4000, block=1000)
+    assert (
+        replayed(config, mdp, 11, before.steps).q.tobytes() == np.concatenate(snapshot, axis=None).tobytes()
+    )
+    assert replayed(config, mdp, 11, after.steps, snapshot).q.tobytes() == learner.tables.q.tobytes()
+
+
+def test_the_greedy_action_and_value_kept_beside_a_table_are_always_its_own():
+    config, mdp = experiment(SMALL, {"mode": "competitive"}, epsilon=0.7, step_size=0.5)
+    learner = Learner(config, mdp, 5)
+    for step in range(50, 2000, 50):
+        train(learner, 10**6, step, block=1000)
+        for i in range(2):
+            table = learner.table(i)
+            assert np.array_equal(learner.tables.greedy[i], table.argmax(axis=1))
+            assert np.array_equal(learner.tables.value[i], table.max(axis=1))
