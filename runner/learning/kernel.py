@@ -332,21 +332,24 @@ def evaluate(
 
 @numba.njit(cache=True, nogil=True)
 def replay(
-    model: Model,
-    tables: Tables,
-    rules: Rules,
-    steps: NDArray[np.void],
+    model: Model, tables: Tables, rules: Rules, steps: NDArray[np.void], rows: NDArray[np.float64]
 ) -> None:
     """Apply the updates of recorded training steps, in order, to the tables.
 
     A recorded step holds all that its update took in, so the replayed update is `train`'s own, to the last
-    bit.
+    bit. Where `rows` ([steps, L, widest], or empty) has room, row k gets each learner's values of the state
+    before step k's update: what it saw when it chose.
     """
-    if not rules.learns:
-        return
     learners = len(model.width)
     for k in range(len(steps)):
         record = steps[k]
+        if k < len(rows):
+            for i in range(learners):
+                row = tables.offset[i] + record.state * model.width[i]
+                for action in range(model.width[i]):
+                    rows[k, i, action] = tables.q[row + action]
+        if not rules.learns:
+            continue
         step_size = schedule_value(rules.step_size, record.episode, record.step)
         discount = schedule_value(rules.discount, record.episode, record.step)
         for i in range(learners):

@@ -13,7 +13,7 @@ from tests.runner.learning.harness import GAMES, RULES, SMALL, Played, experimen
 def replayed(config, mdp, seed, steps, tables=None):
     """Return the tables after these steps."""
     learner = Learner(config, mdp, seed, tables)
-    kernel.replay(learner.model, learner.tables, learner.rules, steps)
+    kernel.replay(learner.model, learner.tables, learner.rules, steps, np.empty((0, 0, 0)))
     return learner.tables
 
 
