@@ -22,6 +22,14 @@ from runner.errors import EnvironmentNotUsable, nearest
 
 MAX_EVENTS = 31
 MAX_AGENTS = 31
+_DTYPES = {
+    "next_state": np.int32,
+    "probability": np.float64,
+    "rewards": np.float64,
+    "terminated": np.bool_,
+    "events": np.uint32,
+    "start": np.float64,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,21 +115,28 @@ class Mdp:
 
 
 def from_parts(description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Mdp:
-    """Return the Mdp that `description()` and `arrays()` came from, checked like a new one."""
-    penalty = description["penalty_below"]
-    mdp = Mdp(
-        env_id=description["env_id"],
-        kwargs=description["kwargs"],
-        step_limit=description["step_limit"],
-        agents=tuple(description["agents"]),
-        action_counts=tuple(description["action_counts"]),
-        event_names=tuple(description["event_names"]),
-        success_events=tuple(description["success_events"]),
-        penalty_below=-np.inf if penalty is None else penalty,
-        scene=description["scene"],
-        **arrays,
-    )
-    _check(mdp)
+    """Return the Mdp that `description()` and `arrays()` came from, checked like a new one.
+
+    Raises:
+        EnvironmentNotUsable: they do not describe an environment.
+    """
+    try:
+        penalty = description["penalty_below"]
+        mdp = Mdp(
+            env_id=description["env_id"],
+            kwargs=description["kwargs"],
+            step_limit=description["step_limit"],
+            agents=tuple(description["agents"]),
+            action_counts=tuple(description["action_counts"]),
+            event_names=tuple(description["event_names"]),
+            success_events=tuple(description["success_events"]),
+            penalty_below=-np.inf if penalty is None else penalty,
+            scene=description["scene"],
+            **arrays,
+        )
+        _check(mdp)
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+        raise EnvironmentNotUsable(f"what is said of the environment makes no sense: {error!r}") from error
     return mdp
 
 
@@ -159,8 +174,15 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
     env.close()
     _check(mdp)
     if rewards == "individual" and mdp.rewards.shape[-1] != len(mdp.agents):
-        raise EnvironmentNotUsable(f"{env_id} does not pay its agents one by one: set `rewards: team`.")
+        raise _one_reward_only(env_id)
     return mdp
+
+
+def _one_reward_only(env_id: str) -> EnvironmentNotUsable:
+    return EnvironmentNotUsable(
+        f"environment {env_id!r} does not pay its agents one by one: set `rewards: team` "
+        "(`mode: competitive` means individual rewards)."
+    )
 
 
 def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
@@ -185,6 +207,8 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
     try:
         return gymnasium.make(name, disable_env_checker=True, **kwargs)
     except (TypeError, ValueError, KeyError, gymnasium.error.Error, ImportError) as error:
+        if "competitive" in kwargs and "'competitive'" in str(error):
+            raise _one_reward_only(env_id) from error
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
         raise EnvironmentNotUsable(f"environment {env_id!r} cannot be made with {given}: {error}") from error
 
@@ -235,6 +259,10 @@ def _check(mdp: Mdp) -> None:
     """Refuse arrays that contradict each other: an environment, or a recording, may bring anything."""
     shape = mdp.next_state.shape
     problems = [
+        (f"{name} must be of {np.dtype(kind)}", getattr(mdp, name).dtype == kind)
+        for name, kind in _DTYPES.items()
+    ]
+    problems += [
         ("next_state must have three axes", mdp.next_state.ndim == 3 and mdp.next_state.size > 0),
         ("next_state must name states", _within(mdp.next_state, 0, shape[0])),
         ("shapes must agree", mdp.probability.shape == mdp.terminated.shape == mdp.events.shape == shape),
@@ -248,7 +276,11 @@ def _check(mdp: Mdp) -> None:
         ),
         ("the agents' actions must make the joint actions", int(np.prod(mdp.action_counts)) == shape[1]),
         ("each agent needs a number of actions", len(mdp.agents) == len(mdp.action_counts)),
+        ("each agent needs at least one action", all(count >= 1 for count in mdp.action_counts)),
         (f"at most {MAX_AGENTS} agents", 1 <= len(mdp.agents) <= MAX_AGENTS),
+        ("the step limit must be a number from 0", isinstance(mdp.step_limit, int) and mdp.step_limit >= 0),
+        ("the scene's arrays must have a row a state", _rows(mdp.scene_cells) == _rows(mdp.scene_carriers)),
+        ("the scene's arrays must have a row a state", _rows(mdp.scene_cells) in (None, shape[0])),
         (f"at most {MAX_EVENTS} events", len(mdp.event_names) <= MAX_EVENTS),
         ("success events must be events", set(mdp.success_events) <= set(mdp.event_names)),
     ]
@@ -259,6 +291,10 @@ def _check(mdp: Mdp) -> None:
 
 def _within(values: NDArray[Any], low: int, high: int) -> bool:
     return bool(values.size) and int(values.min()) >= low and int(values.max()) < high
+
+
+def _rows(array: NDArray[Any] | None) -> int | None:
+    return None if array is None else len(array)
 
 
 def _sums_to_one(probability: NDArray[np.float64]) -> bool:
