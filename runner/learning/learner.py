@@ -36,7 +36,7 @@ class Learner:
         self.model: Model = build_model(mdp, config.tables)
         self.agents = ("agency",) if config.tables == "joint" and len(mdp.agents) > 1 else mdp.agents
         self.rules = rules_of(config)
-        _check_first_action(self.rules, self.model)
+        _check_fit(config, mdp, self.model)
         self.tables = _tables(self.model, mdp.states)
         self._fill_tables(initial)
         log = config.log
@@ -178,12 +178,18 @@ def rules_of(config: ExperimentConfig) -> Rules:
     )
 
 
-def _check_first_action(rules: Rules, model: Model) -> None:
-    """Refuse to update a table at an action it may not have: the kernel would write outside its row."""
-    if rules.first_action_for_all and len(set(model.width)) > 1:
+def _check_fit(config: ExperimentConfig, mdp: Mdp, model: Model) -> None:
+    """Refuse an experiment that this environment would make go wrong, or go on for ever."""
+    if config.quirks.second_table_uses_first_action and len(set(model.width)) > 1:
+        # The kernel would write outside a row.
         raise EnvironmentNotUsable(
             "quirks.second_table_uses_first_action needs agents with equally many actions, found "
             f"{' and '.join(map(str, model.width))}: leave the quirk out."
+        )
+    if config.evaluation is not None and mdp.step_limit == 0:
+        raise EnvironmentNotUsable(
+            f"environment {mdp.env_id!r} has no step limit, so that a greedy trial may never end: set one "
+            "(`env.kwargs.max_episode_steps: 200`), or leave evaluation out (`evaluation: null`)."
         )
 
 
