@@ -155,3 +155,15 @@ def test_the_second_table_takes_the_first_action_only_where_it_has_one():
     uneven = replace(mdp, action_counts=(9, 4))
     with pytest.raises(EnvironmentNotUsable, match=r"second_table_uses_first_action.*9 and 4"):
         Learner(config, uneven, 0)
+
+
+def test_where_nothing_ends_an_episode_there_is_no_evaluation():
+    endless = {"env": {"id": "CliffWalking-v1"}}
+    with pytest.raises(EnvironmentNotUsable, match=r"no step limit.*max_episode_steps.*evaluation: null"):
+        Learner(*experiment(endless), 0)
+    config, mdp = experiment(endless, evaluation=None, epsilon=0.5)
+    twin, learner = Twin(config, mdp, 6), Learner(config, mdp, 6)
+    twin.train(10**6, 2500)
+    played = train(learner, 10**6, 2500, block=100)
+    assert_same_records(played.steps, twin.training.steps, Step)
+    assert not played.steps["truncated"].any()
