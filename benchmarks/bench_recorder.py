@@ -15,6 +15,7 @@ from benchmarks.learners import NO_LIMIT, blocks, tutorial_learner
 from runner.recording import schema
 from runner.recording.chunks import Packing
 from runner.recording.recorder import Recorder
+from runner.recording.writer import RecordingFile
 
 WRITER_LEVEL = 3
 """What `mcap.writer.Writer` compresses with: it cannot be told otherwise."""
@@ -90,17 +91,18 @@ def wire_messages(records: NDArray[Any]) -> list[tuple[int, bytes]]:
 
 def record(path: Path, records: NDArray[Any], packing: Packing) -> None:
     """Hand step records to the recorder, block by block, as a learner does."""
-    recorder = Recorder(path, learners=1, events=0, packing=packing)
     raw, size = records.view(np.uint8), records.itemsize
-    done = 0
-    while done < len(records):
-        block = recorder.block(schema.TRAIN_STEP)
-        n = min(len(block), len(records) - done)
-        block[:n].view(np.uint8)[:] = raw[done * size : (done + n) * size]
-        recorder.commit("train", n, 0)
-        done += n
-    recorder.drain()
-    recorder.finish("result", {"json": "{}"})
+    with RecordingFile(path) as file:
+        recorder = Recorder(file, learners=1, events=0, packing=packing)
+        done = 0
+        while done < len(records):
+            block = recorder.block(schema.TRAIN_STEP)
+            n = min(len(block), len(records) - done)
+            block[:n].view(np.uint8)[:] = raw[done * size : (done + n) * size]
+            recorder.commit("train", n, 0)
+            done += n
+        recorder.drain()
+        file.finish()
 
 
 def write(path: Path, messages: list[tuple[int, bytes]]) -> None:

@@ -30,7 +30,7 @@ def measure(quick: bool) -> list[Figure]:
             ratios,
             "x",
             (300, 400),
-            detail="DualTaxi cooperative, one joint table, epsilon 0.8; the kernel trains the tutorial through",
+            detail="DualTaxi cooperative, one joint table, epsilon 0.8; the kernel does all of the tutorial",
         ),
         figure("  kernel", [value / 1e6 for value in kernel], "M steps/s"),
         figure(

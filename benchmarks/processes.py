@@ -88,5 +88,5 @@ def run_config(config: str, *overrides: str, environment: Mapping[str, str] | No
 def run_command(config: str, recordings: str, *overrides: str) -> list[str]:
     """Return the command that runs a shipped configuration."""
     sets = [part for override in overrides for part in ("--set", override)]
-    begin = [sys.executable, "-m", "benchmarks.run_job"]
-    return [*begin, f"configs/{config}.yaml", "--recordings", recordings, *sets]
+    begin = [sys.executable, "-m", "runner", "run", f"configs/{config}.yaml"]
+    return [*begin, "--recordings", recordings, "--json", *sets]
