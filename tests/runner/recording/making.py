@@ -1,0 +1,49 @@
+"""Runs made for tests: small, quick, with every kind of message."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from runner.config import ExperimentConfig, from_mapping
+from runner.execution import run_job
+from runner.job import Job
+from runner.runs import Run, create_run
+
+SMALL_MAP = ["+---+", "|A: |", "| |B|", "+---+"]
+TAXIS: dict[str, Any] = {
+    "name": "taxis",
+    "mode": "competitive",
+    "env": {"kwargs": {"map": SMALL_MAP, "max_episode_steps": 90}},
+    "episodes": 60,
+    "epsilon": 0.4,
+    "step_size": 0.3,
+    "evaluation": {"every": 20, "trials": 3},
+    "log": {"every_steps": 500, "window": 200},
+    "snapshots": {"every": 30},
+}
+"""Two learners, a dozen events; about 3,000 training and 700 evaluation steps."""
+LAKE: dict[str, Any] = {
+    "name": "lake",
+    "env": {"id": "FrozenLake-v1", "kwargs": {"max_episode_steps": 20}},
+    "episodes": 12,
+    "epsilon": 1.0,
+    "evaluation": {"every": 6, "trials": 2},
+    "log": {"every_steps": 30},
+    "snapshots": {"every": 6},
+}
+"""One learner, no events; the smallest recording that has every topic."""
+
+
+def experiment(*parts: dict[str, Any], **values: Any) -> ExperimentConfig:
+    """Return the experiment that these parts describe together; later ones win."""
+    merged: dict[str, Any] = {}
+    for part in (*parts, values):
+        merged |= part
+    return from_mapping(merged)
+
+
+def make_run(folder: Path, *parts: dict[str, Any], seed: int = 0, **values: Any) -> Run:
+    """Return a finished run of an experiment."""
+    config = experiment(*parts, **values)
+    return run_job(Job(config, seed), create_run(folder, config, seed))
