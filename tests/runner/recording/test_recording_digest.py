@@ -1,0 +1,134 @@
+"""The content digest: recomputed from the file by the official reader, and moved by nothing but content."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from blake3 import blake3
+from mcap.reader import make_reader
+
+from runner.execution import Session, recorder_for
+from runner.job import Job
+from runner.learning.learner import Learner
+from runner.mdp import load_mdp
+from runner.recording import open as open_recording
+from runner.recording import pipeline, recorder, schema
+from tests.runner.learning.oracle import Twin
+from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
+
+PACKINGS = [
+    {"compression": "lz4"},
+    {"compression": "none", "index": "chunk"},
+    {"compression": "zstd", "level": 9, "index": "chunk", "chunk_steps": 256},
+    {"chunk_steps": 65_536},
+    {"steps": "none"},
+]
+
+
+def digest_of(path: Path) -> tuple[str, dict[str, str]]:
+    """Return content digest and topic hashes by their definition, from what the official reader gives."""
+    hashes = {}
+    with path.open("rb") as stream:
+        for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages(
+            log_time_order=False
+        ):
+            record = struct.pack(
+                "<BQHIQQ",
+                5,
+                22 + len(message.data),
+                message.channel_id,
+                0,
+                message.log_time,
+                message.log_time,
+            )
+            hashes.setdefault(channel.topic, blake3()).update(record + message.data)
+    del hashes["/log"]
+    topics = {topic: hashes[topic].hexdigest() for topic in sorted(hashes)}
+    whole = blake3(b"dualtaxi content 0\n")
+    for topic, found in topics.items():
+        whole.update(struct.pack("<I", len(topic)) + topic.encode() + bytes.fromhex(found))
+    return whole.hexdigest(), topics
+
+
+def said(run) -> tuple[str, dict[str, str]]:
+    """Return the digests that a run's summary states."""
+    return run.summary["content_digest"], run.summary["topic_digests"]
+
+
+@pytest.mark.parametrize("made_of", [TAXIS, LAKE, LAKE | {"evaluation": None, "log": None}])
+def test_the_digest_is_what_its_definition_says(made_of, tmp_path):
+    run = make_run(tmp_path, made_of)
+    assert said(run) == digest_of(run.recording)
+    with open_recording(run.recording) as recording:
+        assert (recording.result["content_digest"], recording.result["topic_digests"]) == said(run)
+
+
+@pytest.mark.parametrize("packing", PACKINGS, ids=lambda packing: "-".join(map(str, packing.values())))
+def test_how_it_is_packed_does_not_matter(packing, taxis, tmp_path):
+    assert said(make_run(tmp_path, TAXIS, recording=packing)) == said(taxis)
+
+
+def test_when_chunks_are_flushed_does_not_matter(taxis, tmp_path, monkeypatch):
+    monkeypatch.setattr(recorder, "FLUSH_SECONDS", 0)
+    monkeypatch.setattr(pipeline, "SYNC_SECONDS", 0)
+    monkeypatch.setattr(recorder, "EPISODES_A_BLOCK", 2)
+    run = make_run(tmp_path, TAXIS, recording={"chunk_steps": 256})
+    assert said(run) == said(taxis) == digest_of(run.recording)
+    assert run.summary["bytes"] > taxis.summary["bytes"], "there are more chunks than with the clock's"
+
+
+def test_what_it_is_called_and_how_often_it_is_done_does_not_matter(taxis, tmp_path):
+    assert said(make_run(tmp_path, TAXIS, name="another")) == said(taxis)
+    assert said(make_run(tmp_path, TAXIS, seeds=[5, 0])) == said(taxis)
+
+
+@pytest.mark.parametrize(
+    "other", [{"episodes": 61}, {"epsilon": 0.41}, {"evaluation": {"every": 20, "trials": 4}}, {"log": None}]
+)
+def test_other_content_has_another_digest(other, taxis, tmp_path):
+    assert said(make_run(tmp_path, TAXIS, other))[0] != said(taxis)[0]
+
+
+def test_each_seed_has_its_own(tmp_path):
+    assert len({said(make_run(tmp_path, LAKE, seed=seed))[0] for seed in range(5)}) == 5
+
+
+def test_what_differs_shows_in_the_hash_of_its_topic_and_in_no_other(tmp_path):
+    first, second = (make_run(tmp_path, LAKE, snapshots={"every": every}) for every in (6, 4))
+    differing = {topic for topic, found in said(first)[1].items() if said(second)[1][topic] != found}
+    assert differing == {"/q_table"}
+
+
+def test_leaving_the_steps_out_leaves_only_them_out(taxis, tmp_path):
+    run = make_run(tmp_path, TAXIS, recording={"steps": "none"})
+    assert run.summary["messages"] == taxis.summary["messages"], "what was done is counted all the same"
+    with open_recording(run.recording) as bare, open_recording(taxis.recording) as full:
+        assert bare.count(schema.TRAIN_STEP) == bare.count(schema.EVAL_STEP) == 0
+        for topic in set(schema.TOPICS) - {schema.TRAIN_STEP, schema.EVAL_STEP}:
+            assert list(bare.messages(topic)) == list(full.messages(topic))
+    _, topics = digest_of(run.recording)
+    assert topics == {topic: found for topic, found in said(taxis)[1].items() if not topic.endswith("/step")}
+
+
+@pytest.mark.parametrize("made_of", [TAXIS, LAKE, TAXIS | {"algorithm": "random"}])
+def test_recording_changes_nothing(made_of, tmp_path):
+    """Recorded, computed without a file, and computed by the plain-Python twin: the same tables and steps."""
+    run = make_run(tmp_path, made_of, seed=4)
+    config = experiment(made_of)
+    mdp = load_mdp(config.env.id, config.env.kwargs, config.rewards)
+    learner = Learner(config, mdp, 4)
+    unrecorded = Session(Job(config, 4), learner, recorder_for(Job(config, 4), learner, None))
+    assert unrecorded.run()
+    assert unrecorded.recorder.drain() == said(run)[1]
+    twin = Twin(config, mdp, 4)
+    twin.train(config.episodes, 10**9)
+    with open_recording(run.recording) as recording:
+        last = list(recording.snapshots())[-len(twin.tables) :]
+        steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
+    for i, table in enumerate(twin.tables):
+        assert last[i].values.tobytes() == learner.table(i).tobytes() == np.array(table).tobytes()
+    for name in ("step", "episode", "t", "state", "action", "next_state", "rewards", "explored"):
+        assert steps[name].tolist() == [getattr(step, name) for step in twin.training.steps]
