@@ -6,7 +6,7 @@ import contextlib
 import json
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -82,12 +82,12 @@ def execute(session: Session, file: RecordingFile, run: Run, started: float) -> 
     try:
         status = "finished" if session.run() else "interrupted"
         summary = session.summary(session.recorder.drain())
-        _finish(file, {"status": status, **summary})
+        write_result(file, {"status": status, **summary})
     except BaseException as error:
         session.recorder.abandon()
         status = "interrupted" if isinstance(error, KeyboardInterrupt | Diverged) else "failed"
         with contextlib.suppress(StorageError):  # a full disk may still have room for the index
-            _finish(file, {"status": status, "error": str(error)})
+            write_result(file, {"status": status, "error": str(error)})
         run.update(status=status, summary={"error": str(error), "bytes": file.size})
         raise
     summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": file.size}
@@ -103,7 +103,7 @@ def _create(path: Path) -> RecordingFile:
         ) from error
 
 
-def _finish(file: RecordingFile, result: dict[str, Any]) -> None:
+def write_result(file: RecordingFile, result: dict[str, Any]) -> None:
     """Write the result, the index and the summary."""
     try:
         file.add_metadata("result", {"json": json.dumps(result, sort_keys=True)})
@@ -161,6 +161,7 @@ class Session:
             "train_steps": self.recorder.steps["train"],
             "eval_steps": self.recorder.steps["eval"],
             "messages": {name: count for name, count in self.recorder.counts.items() if count},
+            "steps_recorded": self._config.recording.steps == "all",
             "last_evaluation": last and evaluation_brief(last),
         }
 
@@ -300,8 +301,10 @@ def recorder_for(
     )
 
 
-def describe(file: RecordingFile, job: Job, run: Run, learner: Learner) -> None:
-    """Write what makes the recording self-contained."""
+def describe(
+    file: RecordingFile, job: Job, run: Run, learner: Learner, made_by: Mapping[str, str] | None = None
+) -> None:
+    """Write what makes the recording self-contained; `made_by` is its provenance if not this process's."""
     mdp = learner.mdp
     file.add_metadata(
         "run",
@@ -318,7 +321,7 @@ def describe(file: RecordingFile, job: Job, run: Run, learner: Learner) -> None:
         },
     )
     file.add_metadata("config", {"json": json.dumps(job.config.to_mapping(), sort_keys=True)})
-    file.add_metadata("provenance", provenance())
+    file.add_metadata("provenance", made_by or provenance())
     description = json.loads(description_bytes(mdp)) | {"arrays": sorted(mdp.arrays())}
     file.add_attachment("environment.json", "application/json", json.dumps(description, indent=1).encode())
     for name, array in sorted(mdp.arrays().items()):
@@ -334,23 +337,21 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
 
 
 def recorded_tables(start: RunTable, recordings: Path, mdp: Mdp, job: Job) -> list[Any]:
-    """Return a recorded run's tables at the last snapshot, or at the step asked for.
+    """Return a recorded run's tables after its last training step, or the step asked for.
 
     Raises:
-        RunnerError: there is no such run or snapshot, or its tables have another shape.
+        RunnerError: there is no such run or step, or its tables have another shape.
     """
+    from runner.analysis.tables import tables_at
     from runner.recording.reader import open_recording
 
     source = runs.find_run(start.run, recordings)
     with open_recording(source.recording) as recording:
-        wanted = [table for table in recording.snapshots() if start.step is None or table.step == start.step]
-    step = wanted[-1].step if wanted else None
-    tables = [table.values for table in wanted if table.step == step]
+        steps = recording.count(schema.TRAIN_STEP) or source.summary.get("train_steps", 0)
+        tables = tables_at(recording, steps if start.step is None else start.step)
     joint = job.config.tables == "joint"
     shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
     if [table.shape for table in tables] != shapes:
-        found = [table.shape for table in tables] or "no snapshot"
-        raise RunnerError(
-            f"initial_q: run {source.run_id} has {found} there, expected tables of shape {shapes}."
-        )
+        found = [table.shape for table in tables]
+        raise RunnerError(f"initial_q: run {source.run_id} has tables of shape {found}, expected {shapes}.")
     return tables

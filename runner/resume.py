@@ -15,7 +15,6 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from runner import runs
-from runner.analysis.verify import differing_provenance, initial_tables
 from runner.config import from_mapping
 from runner.errors import RunnerError
 from runner.execution import Report, Session, Stop, configured_tables, execute, recorder_for, run_job
@@ -28,6 +27,7 @@ from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
 from runner.recording.writer import RecordingFile
 from runner.runs import Run
+from runner.verify import differing_provenance, initial_tables
 
 DECISIVE = ("dualtaxi", "git", "python", "machine", "package.numpy", "package.numba", "package.llvmlite")
 """Provenance that a continued run must share with its beginning, unless told otherwise."""

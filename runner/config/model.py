@@ -143,6 +143,11 @@ class Evaluation(Section):
 
     every: Count = Field(description="Training episodes between evaluations.")
     trials: Annotated[int, Field(ge=1, le=10**6)] = Field(description="Greedy episodes in an evaluation.")
+    start: Literal["random", "each"] | Annotated[int, Field(ge=0, lt=2**31)] = Field(
+        default="random",
+        description="The states that trials start in: random, as training episodes do; each of the "
+        "environment's start states in turn; or the state of this number.",
+    )
 
 
 class Log(Section):
@@ -224,7 +229,9 @@ class _Settings(Section):
     algorithm: Literal["q_learning", "random"] = Field(
         default="q_learning", description="What learns: Q-learning, or random actions that learn nothing."
     )
-    episodes: Count = Field(description="How many episodes to train for.")
+    episodes: Annotated[int, Field(ge=0, le=10**12)] = Field(
+        description="How many episodes to train for; 0 only evaluates the initial tables."
+    )
     step_size: StepSize = Field(
         default=0.1, description="How far an update moves a value towards its target: above 0, at most 1."
     )

@@ -67,6 +67,8 @@ class Tally(NamedTuple):
 Index = np.uint64
 """What the hot loops index with: numba leaves out the arithmetic for negative indices."""
 
+START_RANDOM, START_EACH = -1, -2
+
 CURSOR = np.dtype([("step", "<i8"), ("episode", "<i8"), ("t", "<i8"), ("state", "<i8")])
 """Where a phase stands: steps taken, current episode, steps in it, current state (if t > 0)."""
 
@@ -277,8 +279,12 @@ def evaluate(
     steps: NDArray[np.void],
     episodes: NDArray[np.void],
     until_episode: int,
+    start: int,
 ) -> tuple[int, int]:
-    """Play `policy` (the joint action of each state; -1 for a random one) as `train` trains."""
+    """Play `policy` (the joint action of each state; -1 for a random one) as `train` trains.
+
+    `start` is the state that trials start in, or `START_RANDOM`, or `START_EACH` for all in turn.
+    """
     at = cursor[0]
     step, episode, t, state = at.step, at.episode, at.t, Index(at.state)
     learners = len(model.width)
@@ -288,7 +294,12 @@ def evaluate(
     filled = ended = 0
     while filled < len(steps) and ended < len(episodes) and episode < until_episode:
         if t == 0:
-            state = _start_state(model, draws.draw(draws.key(seed, draws.EVALUATION_START, episode), 0))
+            if start >= 0:
+                state = Index(start)
+            elif start == START_EACH:
+                state = Index(model.start_states[episode % len(model.start_states)])
+            else:
+                state = _start_state(model, draws.draw(draws.key(seed, draws.EVALUATION_START, episode), 0))
             chance = draws.key(seed, draws.EVALUATION_OUTCOME, episode)
         action = np.int64(policy[state])
         explored = 0

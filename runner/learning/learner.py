@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig
 from runner.config.model import RandomTable
-from runner.errors import EnvironmentNotUsable
+from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.learning import kernel
 from runner.learning.kernel import Rules, Tables, Tally
 from runner.learning.model import Model, build_model
@@ -45,6 +45,7 @@ class Learner:
         self._cursor = np.zeros(1, kernel.CURSOR).view(np.recarray)
         self._eval_cursor = np.zeros(1, kernel.CURSOR).view(np.recarray)
         self._policy = np.zeros(mdp.states, np.int32)
+        self._start = _trial_start(config, mdp)
         self._success = np.array([name in mdp.success_events for name in mdp.event_names], dtype=np.bool_)
 
     @property
@@ -101,6 +102,7 @@ class Learner:
             steps,
             episodes,
             until_episode,
+            self._start,
         )
         self._mark_success(episodes[:ended])
         return filled, ended
@@ -158,6 +160,16 @@ class Learner:
         for i in range(len(self.model.width)):
             self.tables.greedy[i] = self.table(i).argmax(axis=1)
             self.tables.value[i] = self.table(i).max(axis=1)
+
+
+def _trial_start(config: ExperimentConfig, mdp: Mdp) -> int:
+    """Return where trials start, as the kernel wants it."""
+    start = config.evaluation.start if config.evaluation else "random"
+    if isinstance(start, str):
+        return kernel.START_EACH if start == "each" else kernel.START_RANDOM
+    if start >= mdp.states:
+        raise ConfigError(f"evaluation.start: found state {start}, expected one of 0 to {mdp.states - 1}.")
+    return start
 
 
 def rules_of(config: ExperimentConfig) -> Rules:

@@ -98,7 +98,7 @@ class _Surveyor:
         """Take one record; raises an error if it is damaged."""
         contents, end = self._contents, at + 9 + len(body)
         if opcode == Opcode.CHUNK:
-            part = read_chunk(body, at)
+            part, _ = read_chunk(body, at)
             if self._indexed:
                 self._pending = part
                 return
@@ -110,7 +110,7 @@ class _Surveyor:
             if name == _RESULT and not self._keep_result:
                 return
             if name == "config":
-                self._indexed = _is_indexed(body)
+                self._indexed = asks_for_indexes(metadata_of(body)[1])
             contents.metadata.append(MetadataIndex(offset=at, length=9 + len(body), name=name))
         elif opcode == Opcode.ATTACHMENT:
             contents.attachments.append(_attachment_index(body, at))
@@ -126,12 +126,6 @@ class _Surveyor:
         self._pending = None
 
 
-def _is_indexed(body: bytes) -> bool:
-    """Return whether the recording's configuration asks for message indexes."""
-    config = json.loads(Metadata.read(ReadDataStream(BytesIO(body))).metadata["json"])
-    return bool(config["recording"]["index"] == "message")
-
-
 def walk(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:
     """Yield (opcode, offset, body) of the whole records of a file, until one is cut off or absurd."""
     offset = len(MCAP0_MAGIC)
@@ -144,8 +138,8 @@ def walk(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:
         offset += 9 + length
 
 
-def read_chunk(body: bytes, offset: int) -> Part:
-    """Return what the index says of a chunk record, after unpacking it and comparing its checksum.
+def read_chunk(body: bytes, offset: int) -> tuple[Part, bytes]:
+    """Return what the index says of a chunk record, and its message records, after comparing its checksum.
 
     Raises:
         RecordingError: it is damaged, or holds messages of no topic, or of several.
@@ -172,7 +166,7 @@ def read_chunk(body: bytes, offset: int) -> Part:
         message_start_time=start,
         uncompressed_size=size,
     )
-    return Part(index, channel, messages)
+    return Part(index, channel, messages), records
 
 
 def _messages(records: bytes, where: str) -> tuple[int, int]:
@@ -193,22 +187,43 @@ def _messages(records: bytes, where: str) -> tuple[int, int]:
 
 def _attachment_index(body: bytes, offset: int) -> AttachmentIndex:
     """Return an attachment's index entry, after comparing its checksum."""
-    stream = ReadDataStream(BytesIO(body))
-    log_time, create_time = stream.read8(), stream.read8()
-    name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
-    size = stream.read8()
-    (crc,) = struct.unpack("<I", body[-4:])
-    if stream.count + size + 4 != len(body) or zlib.crc32(body[:-4]) != crc:
-        raise RecordingError(f"attachment at {offset}: its content does not match its checksum")
+    name, media_type, data = attachment_of(body, offset)
     return AttachmentIndex(
         offset=offset,
         length=9 + len(body),
-        log_time=log_time,
-        create_time=create_time,
-        data_size=size,
+        log_time=0,
+        create_time=0,
+        data_size=len(data),
         name=name,
         media_type=media_type,
     )
+
+
+def attachment_of(body: bytes, offset: int) -> tuple[str, str, bytes]:
+    """Return the name, media type and data of an attachment record.
+
+    Raises:
+        RecordingError: its checksum does not match, or it has times, which no recorder writes.
+    """
+    stream = ReadDataStream(BytesIO(body))
+    times = stream.read8(), stream.read8()
+    name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
+    size = stream.read8()
+    data = body[stream.count : -4]
+    if len(data) != size or times != (0, 0) or zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
+        raise RecordingError(f"attachment at {offset}: its content does not match its checksum")
+    return name, media_type, data
+
+
+def metadata_of(body: bytes) -> tuple[str, dict[str, str]]:
+    """Return the name and entries of a metadata record."""
+    record = Metadata.read(ReadDataStream(BytesIO(body)))
+    return record.name, dict(record.metadata)
+
+
+def asks_for_indexes(config: dict[str, str]) -> bool:
+    """Return whether a recording's configuration asks for message indexes."""
+    return bool(json.loads(config["json"])["recording"]["index"] == "message")
 
 
 def _name(body: bytes, at: int) -> str:

@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import BinaryIO, Final, TypeVar
+from typing import BinaryIO, Final, NamedTuple, TypeVar
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -18,7 +18,6 @@ from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
     Channel,
-    ChunkIndex,
     Footer,
     Header,
     MetadataIndex,
@@ -29,17 +28,19 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import RecordingError
 from runner.recording.schema import PROFILE
 
+K = TypeVar("K")
 T = TypeVar("T")
 
 MAX_RECORD_BYTES: Final = 64 << 20
 _HEAD: Final = struct.Struct("<BQ")
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
+_CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
+_OFFSET_ENTRY: Final = struct.Struct("<HQ")
 _FOOTER_BYTES: Final = 9 + 20
 _TAIL_BYTES: Final = _FOOTER_BYTES + len(MCAP0_MAGIC)
 
 
-@dataclass(frozen=True)
-class ChunkEntry:
+class ChunkEntry(NamedTuple):
     """A chunk: where it stands, and what it says of itself."""
 
     offset: int
@@ -128,31 +129,25 @@ def _from_summary(stream: BinaryIO, path: str, footer: Footer, size: int) -> Ind
     for opcode, offset, body in _records(view, start, path):
         if opcode == Opcode.SCHEMA:
             schema = _parse(Schema, body, path, offset)
-            index.schemas[schema.id] = schema
+            _put(index.schemas, schema.id, schema, path, "schema")
         elif opcode == Opcode.CHANNEL:
             channel = _parse(Channel, body, path, offset)
-            index.channels[channel.id] = channel
+            _put(index.channels, channel.id, channel, path, "channel")
         elif opcode == Opcode.CHUNK_INDEX:
-            entry = _parse(ChunkIndex, body, path, offset)
-            _within(path, "chunk", entry.chunk_start_offset, entry.chunk_length, start)
-            index.chunks.append(
-                ChunkEntry(
-                    entry.chunk_start_offset,
-                    entry.chunk_length,
-                    entry.message_start_time,
-                    entry.message_end_time,
-                    entry.uncompressed_size,
-                    tuple(entry.message_index_offsets),
-                )
-            )
+            chunk = _chunk_entry(body, path, offset)
+            _within(path, "chunk", chunk.offset, chunk.length, start)
+            if index.chunks and chunk.offset < index.chunks[-1].offset + index.chunks[-1].length:
+                raise RecordingError(f"{path}: the index has chunks that overlap, at {chunk.offset}.")
+            index.chunks.append(chunk)
         elif opcode == Opcode.ATTACHMENT_INDEX:
             attachment = _parse(AttachmentIndex, body, path, offset)
             _within(path, "attachment", attachment.offset, attachment.length, start)
-            index.attachments[attachment.name] = (attachment.offset, attachment.length)
+            place = (attachment.offset, attachment.length)
+            _put(index.attachments, attachment.name, place, path, "attachment")
         elif opcode == Opcode.METADATA_INDEX:
             metadata = _parse(MetadataIndex, body, path, offset)
             _within(path, "metadata", metadata.offset, metadata.length, start)
-            index.metadata[metadata.name] = (metadata.offset, metadata.length)
+            _put(index.metadata, metadata.name, (metadata.offset, metadata.length), path, "metadata")
     return index
 
 
@@ -193,14 +188,14 @@ def _note(index: Index, stream: BinaryIO, path: str, opcode: int, offset: int, l
         body = stream.read(min(length, MAX_RECORD_BYTES))
         if opcode == Opcode.SCHEMA:
             schema = _parse(Schema, body, path, offset)
-            index.schemas[schema.id] = schema
+            _put(index.schemas, schema.id, schema, path, "schema")
         elif opcode == Opcode.CHANNEL:
             channel_record = _parse(Channel, body, path, offset)
-            index.channels[channel_record.id] = channel_record
+            _put(index.channels, channel_record.id, channel_record, path, "channel")
         elif opcode == Opcode.METADATA:
-            index.metadata[_name(body, 0, path, offset)] = (offset, 9 + length)
+            _put(index.metadata, _name(body, 0, path, offset), (offset, 9 + length), path, "metadata")
         else:
-            index.attachments[_name(body, 16, path, offset)] = (offset, 9 + length)
+            _put(index.attachments, _name(body, 16, path, offset), (offset, 9 + length), path, "attachment")
 
 
 def _records(view: memoryview, base: int, path: str) -> Iterator[tuple[int, int, bytes]]:
@@ -220,6 +215,19 @@ def _records(view: memoryview, base: int, path: str) -> Iterator[tuple[int, int,
         at += 9 + length
 
 
+def _chunk_entry(body: bytes, path: str, offset: int) -> ChunkEntry:
+    """Return the entry in a ChunkIndex record: there are thousands, so not by the library's reader."""
+    try:
+        start, end, chunk_offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(body)
+        channels = tuple(channel for channel, _ in _OFFSET_ENTRY.iter_unpack(body[36 : 36 + map_bytes]))
+        at = 36 + map_bytes + 8
+        (name_length,) = struct.unpack_from("<I", body, at)
+        (uncompressed,) = struct.unpack_from("<Q", body, at + 4 + name_length + 8)
+    except struct.error as error:
+        raise RecordingError(f"{path}: the ChunkIndex record at {offset} cannot be read.") from error
+    return ChunkEntry(chunk_offset, length, start, end, uncompressed, channels)
+
+
 def _parse(kind: type[T], body: bytes, path: str, offset: int) -> T:
     """Return the record in these bytes."""
     try:
@@ -235,6 +243,13 @@ def _name(body: bytes, at: int, path: str, offset: int) -> str:
         return body[at + 4 : at + 4 + length].decode()
     except (struct.error, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: the record at {offset} has no readable name.") from error
+
+
+def _put(known: dict[K, T], key: K, value: T, path: str, what: str) -> None:
+    """Add what may stand in a file once."""
+    if key in known:
+        raise RecordingError(f"{path}: has {what} {key!r} twice.")
+    known[key] = value
 
 
 def _within(path: str, what: str, offset: int, length: int, end: int) -> None:

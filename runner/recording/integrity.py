@@ -79,7 +79,7 @@ def _check_chunk(stream: BinaryIO, path: Path, offset: int, body: bytes) -> None
     start, end, size, _, name_length = struct.unpack_from("<QQQII", body)
     compression = body[32 : 32 + name_length].decode("ascii", "replace")
     records = decompress(memoryview(body)[40 + name_length :], compression, size, where)
-    channel, times, offsets = _places(records, where)
+    channel, times, offsets = places(records, where)
     if (start, end) != (int(times[0]), int(times[-1])):
         raise RecordingError(f"{where}: found times {start} to {end}, expected {times[0]} to {times[-1]}.")
     stream.seek(offset + 9 + len(body))
@@ -89,7 +89,7 @@ def _check_chunk(stream: BinaryIO, path: Path, offset: int, body: bytes) -> None
         raise RecordingError(f"{where}: the message index behind it does not lead to its messages.")
 
 
-def _places(records: bytes, where: str) -> tuple[int, Times, Times]:
+def places(records: bytes, where: str) -> tuple[int, Times, Times]:
     """Return channel, times and offsets of a chunk's messages; checks what every message must have."""
     times, offsets, channels = [], [], set()
     at = 0

@@ -68,6 +68,7 @@ class Recording:
             self._stream.close()
             raise
         self._kept: OrderedDict[int, bytes] = OrderedDict()
+        self._known_numbers: dict[Topic, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -97,6 +98,13 @@ class Recording:
     def run(self) -> dict[str, str]:
         """Id, name, seed, job and creation of the run."""
         return self.metadata("run")
+
+    @cached_property
+    def lost(self) -> dict[str, list[list[int]]]:
+        """Messages that a repair could not save: topic to [first, behind the last] numbers; mostly none."""
+        if "repair" not in self._index.metadata:
+            return {}
+        return dict(_json(self.metadata("repair"), "repair", self.path)["lost"])
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -190,9 +198,13 @@ class Recording:
         }
 
     def count(self, topic: Topic) -> int:
-        """Return how many messages a topic has; for one of variable size it reads them."""
+        """Return the number behind a topic's last message: how many there are, if none was lost.
+
+        For a topic of variable size it reads them.
+        """
         if topic in BLOCK_TOPICS:
-            return int(self._ends(topic)[-1]) if len(self._ends(topic)) else 0
+            ends = self._numbers(topic)[1]
+            return int(ends[-1]) if len(ends) else 0
         return sum(1 for _ in self.messages(topic))
 
     def blocks(self, topic: Topic, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
@@ -201,11 +213,11 @@ class Recording:
         Each block is a read-only structured array with the fields of the message, and those of the MCAP
         record (`log_time` in nanoseconds, ...).
         """
-        ends = self._ends(topic)
+        firsts, ends = self._numbers(topic)
         stop = int(ends[-1]) if stop is None and len(ends) else (stop or 0)
         chunks = self._chunks_of[topic.channel]
         for k in range(int(np.searchsorted(ends, start, side="right")), len(chunks)):
-            first = int(ends[k - 1]) if k else 0
+            first = int(firsts[k])
             if first >= stop:
                 return
             block = self._block(topic, chunks[k])
@@ -270,6 +282,13 @@ class Recording:
     # --- inside ------------------------------------------------------------------------------------
 
     def _check_version(self) -> None:
+        topics = {topic.channel: topic.name for topic in schema.TOPICS}
+        for number, channel in self._index.channels.items():
+            if topics.get(number) != channel.topic:
+                raise RecordingError(
+                    f"{self.path}: found channel {number} for {channel.topic!r}, "
+                    f"expected {topics.get(number)!r}: not written by dualtaxi."
+                )
         version = self.run.get("format_version", "?")
         if version != str(schema.FORMAT_VERSION):
             raise RecordingError(
@@ -295,12 +314,22 @@ class Recording:
             raise self._damaged(entry, "no whole message")
         return int(_MESSAGE_HEAD.unpack_from(data)[2])
 
-    def _ends(self, topic: Topic) -> NDArray[np.int64]:
-        """Return, for each chunk of a fixed-width topic, how many messages there are up to its end."""
-        size = self.dtypes[topic].itemsize
-        return np.cumsum(
-            [entry.uncompressed_size // size for entry in self._chunks_of[topic.channel]], dtype=np.int64
-        )
+    def _numbers(self, topic: Topic) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return, for each chunk of a fixed-width topic, the number of its first message and behind its last.
+
+        Messages are numbered as recorded; where a repair lost some, the numbers go on behind the gap.
+        """
+        if topic not in self._known_numbers:
+            size = self.dtypes[topic].itemsize
+            counts = [entry.uncompressed_size // size for entry in self._chunks_of[topic.channel]]
+            ends = np.cumsum(counts, dtype=np.int64)
+            firsts = ends - np.array(counts, dtype=np.int64)
+            for start, stop in self.lost.get(topic.name, []):
+                behind = firsts >= start
+                firsts[behind] += stop - start
+                ends[behind] += stop - start
+            self._known_numbers[topic] = firsts, ends
+        return self._known_numbers[topic]
 
     def _block(self, topic: Topic, entry: ChunkEntry) -> NDArray[np.void]:
         """Return a chunk of a fixed-width topic as an array, after looking at its constant bytes."""

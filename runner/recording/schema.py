@@ -174,6 +174,9 @@ BLOCK_TOPICS: Final = (TRAIN_STEP, EVAL_STEP, TRAIN_EPISODE, EVAL_EPISODE)
 PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_EPISODE)}
 """The step and the episode topic of each phase."""
 
+NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode"}
+"""The field that numbers the messages of a fixed-width topic, from 0."""
+
 _WIDTH: dict[int, str] = {_DOUBLE: "<f8", _FIXED32: "<u4", _SFIXED64: "<i8", _BOOL: "?"}
 _WIRE: dict[int, int] = {_DOUBLE: 1, _SFIXED64: 1, _FIXED32: 5, _BOOL: 0, _STRING: 2, _BYTES: 2}
 

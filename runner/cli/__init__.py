@@ -1,0 +1,140 @@
+"""The command line: parse, call one function, render, exit.
+
+A command is imported when it is invoked, and imports what is heavy when it needs it, so that help and
+completion are there at once. `COMMANDS` says where each one is and what it is for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import os
+import sys
+from typing import Any, Final
+
+import click
+
+from runner import __version__
+from runner.errors import RunnerError, nearest
+
+COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
+    "Do": {
+        "run": ("runner.cli.commands.run", "Train, evaluate and record an experiment."),
+    },
+    "Look": {
+        "ls": ("runner.cli.commands.ls", "List the recorded runs."),
+        "show": ("runner.cli.commands.show", "Tell all about a run: evaluations, tables, configuration."),
+        "play": ("runner.cli.commands.play", "Replay a recorded episode in the terminal."),
+        "table": ("runner.cli.commands.table", "Print an environment's transition table in words."),
+    },
+    "Set up": {
+        "config": ("runner.cli.commands.config", "Check a configuration; print the schema of one."),
+        "completion": ("runner.cli.commands.completion", "Print the completion script of a shell."),
+    },
+}
+"""Section -> command -> its module, which has it as `command`, and its short help."""
+
+INTERRUPTED: Final = 130
+
+_EPILOG = """\b
+First steps:
+  dualtaxi run configs/quick.yaml     learn for a second, recording every step
+  dualtaxi show @latest               what came of it
+  dualtaxi play @latest               see it drive
+
+\b
+A RUN is named by its id, a prefix of it, its name, a path, or @latest
+(NAME@latest: the newest of that name). Runs are kept in the folder given by
+--recordings, else by $DUALTAXI_RECORDINGS, else in ./recordings.
+
+\b
+Results go to stdout, everything else to stderr; NO_COLOR is respected.
+Exit codes:
+  0    fine
+  1    something differs or was found; the disk is full
+  2    wrong usage or input
+  130  interrupted
+"""
+
+
+class Failure(click.ClickException):
+    """A `RunnerError`, told without a traceback."""
+
+    def __init__(self, error: RunnerError) -> None:
+        super().__init__("\n".join([str(error), *getattr(error, "__notes__", [])]))
+        self.exit_code = error.exit_code  # type: ignore[misc]  # Click's own classes do so
+
+    def show(self, file: Any = None) -> None:
+        """Print the message; several lines begin at the margin, as places in files should."""
+        before = "" if "\n" in self.message else "Error: "
+        click.echo(f"{before}{self.message}", file=file or sys.stderr)
+
+
+class LazyGroup(click.Group):
+    """The commands of `COMMANDS`, imported one by one when asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Return the names, section by section."""
+        return [name for section in COMMANDS.values() for name in section]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """Import a command."""
+        for section in COMMANDS.values():
+            if cmd_name in section:
+                command: click.Command = importlib.import_module(section[cmd_name][0]).command
+                return command
+        return None
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command that is meant, or suggest one."""
+        known = self.list_commands(ctx)
+        if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
+            ctx.fail(f"there is no command {args[0]!r}.{nearest(args[0], known)}")
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the sections of commands, from their short help alone."""
+        width = max(len(name) for name in self.list_commands(ctx))
+        for title, section in COMMANDS.items():
+            with formatter.section(title):
+                formatter.write_dl([(f"{name:{width}}", text) for name, (_, text) in section.items()])
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; what a user can mend, or wanted, is no traceback."""
+        try:
+            result = super().invoke(ctx)
+            sys.stdout.flush()
+        except RunnerError as error:
+            raise Failure(error) from error
+        except KeyboardInterrupt:
+            raise click.exceptions.Exit(INTERRUPTED) from None
+        except BrokenPipeError:
+            _forget_stdout()
+            raise click.exceptions.Exit(0) from None
+        return result
+
+
+def _forget_stdout() -> None:
+    """Point stdout at nothing: its reader has left, and Python would complain about it at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@click.group(
+    cls=LazyGroup,
+    epilog=_EPILOG,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+)
+@click.version_option(__version__, prog_name="dualtaxi", message="%(prog)s %(version)s")
+def cli() -> None:
+    """Record, replay and compare reinforcement-learning runs, every step of them."""
+
+
+def main() -> None:
+    """Run the command line; the console script."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+    cli(prog_name="dualtaxi")

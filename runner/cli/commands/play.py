@@ -1,0 +1,147 @@
+"""`dualtaxi play`: a recorded episode in the terminal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.output import print_json
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+    from runner.cli.episode import Episode
+    from runner.recording.reader import Recording
+
+
+class _Trial(click.ParamType):  # type: ignore[type-arg]  # generic in newer versions only
+    """`N:TRIAL`, a trial of the evaluation after N training episodes."""
+
+    name = "N:TRIAL"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        """Return both numbers."""
+        if isinstance(value, tuple):
+            return value
+        after, colon, trial = value.partition(":")
+        if not after.isdecimal() or (colon and not trial.isdecimal()):
+            self.fail(f"found {value!r}, expected N:TRIAL, such as 3000:0", param, ctx)
+        return int(after), int(trial or 0)
+
+
+@click.command("play")
+@run_argument
+@click.option("--episode", type=click.IntRange(0), metavar="N", help="A training episode, counted from 0.")
+@click.option(
+    "--eval",
+    "trial",
+    type=_Trial(),
+    metavar="N:TRIAL",
+    help="A trial, counted from 0, of the evaluation after N training episodes.",
+)
+@click.option(
+    "--speed",
+    type=click.FloatRange(0, min_open=True),
+    default=4.0,
+    show_default=True,
+    metavar="STEPS",
+    help="Steps a second.",
+)
+@recordings_option
+@json_option
+def command(
+    run_name: str,
+    episode: int | None,
+    trial: tuple[int, int] | None,
+    speed: float,
+    recordings: Path | None,
+    as_json: bool,
+) -> None:
+    r"""Replay a recorded episode of RUN, frame by frame, with actions and rewards.
+
+    Without a choice it is the first trial of the last evaluation. All is drawn from the recording: its
+    environment need not be installed. Where stdout is no terminal, the frames come one after another,
+    without waiting. With --json: a line for each step. Ctrl-C ends it.
+
+    \b
+    Examples:
+      dualtaxi play @latest
+      dualtaxi play k3v9m2xq --eval 3000:7 --speed 10
+      dualtaxi play k3v9m2xq --episode 0 | less
+    """
+    if episode is not None and trial is not None:
+        raise click.UsageError("--episode and --eval exclude each other: choose one.")
+    from runner.cli.episode import Episode
+    from runner.recording.reader import open_recording
+
+    run = find(run_name, recordings)
+    with open_recording(run.recording) as recording:
+        phase, number, title = _chosen(recording, episode, trial)
+        played = Episode(recording, phase, number, f"{run.name}, seed {run.seed}: {title}")
+    if as_json:
+        for step in played.steps():
+            print_json(step, indent=None)
+    else:
+        _show(played, speed)
+
+
+def _chosen(recording: Recording, episode: int | None, trial: tuple[int, int] | None) -> tuple[str, int, str]:
+    """Return phase, number and title of the episode that is meant.
+
+    Raises:
+        RecordingError: the recording has no such evaluation or trial, or no episode at all.
+    """
+    from runner.errors import RecordingError
+    from runner.recording.schema import TRAIN_EPISODE
+
+    if episode is not None:
+        return "train", episode, f"training episode {episode:,}"
+    evaluations = recording.metrics("eval")
+    if trial is None and not evaluations:
+        last = max(recording.count(TRAIN_EPISODE) - 1, 0)
+        return "train", last, f"training episode {last:,}"
+    after, number = trial or (evaluations[-1]["episode"], 0)
+    for metrics in evaluations:
+        if metrics["episode"] == after and number < metrics["trials"]:
+            index = metrics["evaluation"] * metrics["trials"] + number
+            return "eval", index, f"evaluation after {after:,} training episodes, trial {number}"
+        if metrics["episode"] == after:
+            raise RecordingError(
+                f"--eval: found trial {number}, expected one from 0 to {metrics['trials'] - 1}."
+            )
+    known = [metrics["episode"] for metrics in evaluations]
+    nearest = min(known, key=lambda one: abs(one - after), default=None)
+    hint = "there are no evaluations" if nearest is None else f"the nearest is after {nearest}"
+    raise RecordingError(f"--eval: no evaluation after {after} training episodes; {hint} (of {len(known)}).")
+
+
+def _show(played: Episode, speed: float) -> None:
+    """Draw the frames in one place of the terminal, or one after another where there is none."""
+    from runner.cli.output import console
+
+    drawn = console()
+    if not drawn.is_terminal:
+        for frame in played.frames():
+            click.echo("\n".join(line.rstrip() for line in frame.plain.splitlines()) + "\n")
+        return
+    from rich.live import Live
+
+    with Live(console=drawn, auto_refresh=False) as live:
+        for frame in _paced(played.frames(), 1 / speed):
+            live.update(frame, refresh=True)
+
+
+def _paced(frames: Iterator[Text], seconds: float) -> Iterator[Text]:
+    """Yield the frames at even intervals, the first at once."""
+    due = time.monotonic()
+    for frame in frames:
+        time.sleep(max(due - time.monotonic(), 0))
+        yield frame
+        due = max(due + seconds, time.monotonic())

@@ -1,0 +1,175 @@
+"""`dualtaxi run`: train, evaluate and record."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli import INTERRUPTED
+from runner.cli.options import config_argument, json_option, recordings_option, set_option
+from runner.cli.output import amount, duration, print_json, say, size
+
+if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
+    from rich.console import RenderableType
+
+    from runner.config import ExperimentConfig
+    from runner.job import Job
+    from runner.runs import Run
+
+
+@click.command("run")
+@config_argument
+@click.option("--seed", type=click.IntRange(0, 2**64 - 1), metavar="N", help="The seed, or the only one.")
+@set_option
+@click.option("--name", help="What the run is called.  [default: the configuration's name]")
+@recordings_option
+@json_option
+@click.pass_context
+def command(
+    ctx: click.Context,
+    config: Path,
+    seed: int | None,
+    overrides: tuple[str, ...],
+    name: str | None,
+    recordings: Path | None,
+    as_json: bool,
+) -> None:
+    r"""Train, evaluate and record the experiment in the file CONFIG.
+
+    Every step goes into a recording of its own folder. Several seeds make one run each, one after the
+    other. Ctrl-C ends a run properly: what it recorded is kept; a second Ctrl-C kills it.
+
+    Steps and disk are estimated first. The estimate takes it that evaluation trials and the first 500
+    training episodes last half the step limit, and later ones a tenth; "at most" is all of the limit.
+
+    With --json: a line for each run.
+
+    \b
+    Examples:
+      dualtaxi run configs/quick.yaml
+      dualtaxi run configs/cooperative.yaml --seed 7 --set discount=0.9 --name patient
+      dualtaxi run configs/quick.yaml --set 'seeds={count: 3}' --json
+    """
+    from runner.api import checked_name, experiment_of
+    from runner.job import jobs_of
+    from runner.runs import recordings_folder
+
+    experiment = experiment_of(config, overrides, seed)
+    called, folder = checked_name(name), recordings_folder(recordings)
+    for number, job in enumerate(jobs_of(experiment)):
+        run, interrupted = _run_one(job, folder, called, number)
+        if as_json:
+            print_json(_as_json(run), indent=None)
+        else:
+            _summarise(run, blank=number > 0)
+        sys.stdout.flush()
+        if interrupted:
+            done, left = run.summary["episodes"], len(experiment.seeds) - number - 1
+            say(
+                f"Interrupted: {done:,} of {experiment.episodes:,} episodes are kept in {run.recording}."
+                + (f" {left} seeds were not begun." if left else "")
+            )
+            ctx.exit(INTERRUPTED)
+
+
+def _run_one(job: Job, folder: Path, name: str | None, number: int) -> tuple[Run, bool]:
+    """Run a job; return its run, and whether it was interrupted."""
+    from runner.api import interruptible, unless_empty
+    from runner.cli.progress import progress_line
+    from runner.runs import create_run
+
+    run = create_run(folder, job.config, job.seed, name)
+    label = f"seed {run.seed}" if len(job.config.seeds) > 1 else ""
+    with unless_empty(run):
+        if number == 0:
+            _announce(job.config, folder)
+        with (
+            interruptible(second=signal.SIG_DFL) as interrupt,
+            progress_line(label, job.config.episodes) as report,
+        ):
+            from runner.execution import run_job
+            from runner.learning.compilation import announced
+
+            with announced(lambda: say("Compiling the learning kernel, this once: a few seconds.")):
+                run = run_job(job, run, report, interrupt)
+    return run, interrupt.came and run.status == "interrupted"
+
+
+def _announce(config: ExperimentConfig, folder: Path) -> None:
+    """Tell what is to come; ask, where someone can answer, when the disk would not hold it."""
+    from runner.cli.estimate import estimate, free_bytes, step_limit
+
+    limit, seeds = step_limit(config), len(config.seeds)
+    free = free_bytes(folder)
+    runs = f"{seeds} runs of {config.episodes:,} episodes" if seeds > 1 else f"{config.episodes:,} episodes"
+    if not limit:
+        say(f"{runs} without a step limit: nobody knows how long; {size(free)} of disk are free.")
+        return
+    one = estimate(config, limit)
+    say(
+        f"{runs}: about {amount(one.typical_steps * seeds)} steps, {size(one.typical_bytes * seeds)} "
+        f"(at most {amount(one.most_steps * seeds)}, {size(one.most_bytes * seeds)})."
+    )
+    if free >= one.typical_bytes * seeds:
+        return
+    say(f"The disk of {folder} has {size(free)} left, which may be too little.")
+    if sys.stdin.isatty() and sys.stderr.isatty() and not click.confirm("Go on?", err=True):
+        raise click.exceptions.Exit(1)
+
+
+def _as_json(run: Run) -> dict[str, Any]:
+    """Return what programs want to know of a run that is over."""
+    summary = run.summary
+    return {
+        "run_id": run.run_id,
+        "name": run.name,
+        "seed": run.seed,
+        "status": run.status,
+        "path": str(run.recording.absolute()),
+        "content_digest": summary["content_digest"],
+        "episodes": summary["episodes"],
+        "train_steps": summary["train_steps"],
+        "eval_steps": summary["eval_steps"],
+        "seconds": summary["seconds"],
+        "bytes": summary["bytes"],
+        "last_evaluation": summary["last_evaluation"],
+    }
+
+
+def _summarise(run: Run, blank: bool) -> None:
+    """Print what came of a run and what to type next."""
+    from runner.cli.evaluations import evaluation_table, some
+    from runner.cli.output import console, draw, facts
+    from runner.frames import environment_of, evaluation_records
+    from runner.recording.reader import open_recording
+
+    with open_recording(run.recording) as recording:
+        records = evaluation_records(recording)
+        successes = environment_of(recording)["success_events"]
+    parts: list[RenderableType] = [""] if blank else []
+    if records:
+        shown = some(records)
+        parts.append(evaluation_table(shown, successes, console()))
+        if len(shown) < len(records):
+            parts.append(f"{len(shown)} of {len(records)} evaluations; `dualtaxi show {run.run_id}` has all.")
+        parts.append("")
+    draw(*parts, facts(_result(run, records[-1]["episode"] if records else None)))
+
+
+def _result(run: Run, evaluated: int | None) -> dict[str, str]:
+    """Return what there is to say of a run at its end; `evaluated` is when it was last evaluated."""
+    summary = run.summary
+    each = summary["bytes"] / max(summary["train_steps"] + summary["eval_steps"], 1)
+    play = f"--eval {evaluated}:0" if evaluated is not None else "--episode 0"
+    return {
+        "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
+        "steps": f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation, "
+        f"in {duration(summary['seconds'])}",
+        "digest": summary["content_digest"],
+        "file": f"{run.recording}  {size(summary['bytes'])}, {each:.0f} bytes a step",
+        "next": f"dualtaxi show {run.run_id}\ndualtaxi play {run.run_id} {play}",
+    }

@@ -1,0 +1,164 @@
+"""`dualtaxi show`: all about one run."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.output import UNKNOWN, age, console, draw, duration, facts, print_json, size, title
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from runner.recording.reader import Recording
+    from runner.runs import Run
+
+
+@click.command("show")
+@run_argument
+@recordings_option
+@json_option
+def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
+    r"""Tell all about a run: what it is, its evaluations, its tables, configuration and provenance.
+
+    With --json also the whole series: under `eval` an object for each evaluation, with the training
+    episodes before it, finish_percent, mean_length, mean_penalties and the count of every event; under
+    `train` one for each report of training.
+
+    \b
+    Examples:
+      dualtaxi show @latest
+      dualtaxi show k3v9m2xq --json
+    """
+    run = find(run_name, recordings)
+    if not run.recording.is_file():
+        told = _without_recording(run)
+    else:
+        from runner.recording.reader import open_recording
+
+        with open_recording(run.recording) as recording:
+            told = describe(run, recording)
+    if as_json:
+        print_json(told)
+    else:
+        _draw(run, told)
+
+
+def describe(run: Run, recording: Recording) -> dict[str, Any]:
+    """Return all about a run as JSON can hold it."""
+    from runner.frames import environment_of, evaluation_records, training_records
+    from runner.recording.schema import EVAL_STEP, TRAIN_EPISODE, TRAIN_STEP
+
+    summary = run.summary
+    return {
+        **_identity(run),
+        "bytes": recording.size,
+        "content_digest": summary.get("content_digest"),
+        "topic_digests": summary.get("topic_digests"),
+        "episodes": summary.get("episodes", recording.count(TRAIN_EPISODE)),
+        "train_steps": summary.get("train_steps", recording.count(TRAIN_STEP)),
+        "eval_steps": summary.get("eval_steps", recording.count(EVAL_STEP)),
+        "seconds": summary.get("seconds"),
+        "config": _config(run, recording),
+        "provenance": recording.provenance,
+        "success_events": environment_of(recording)["success_events"],
+        "tables": _tables(recording),
+        "eval": evaluation_records(recording),
+        "train": training_records(recording),
+    }
+
+
+def _config(run: Run, recording: Recording) -> dict[str, Any]:
+    """Return the recording's configuration, in the order of keys in which people read it."""
+    readable: dict[str, Any] = run.facts.get("config", {})
+    return readable if readable == recording.config else recording.config
+
+
+def _identity(run: Run) -> dict[str, Any]:
+    return {
+        "run_id": run.run_id,
+        "name": run.name,
+        "seed": run.seed,
+        "status": run.status,
+        "created": run.facts["created"],
+        "path": str(run.recording.absolute()),
+    }
+
+
+def _without_recording(run: Run) -> dict[str, Any]:
+    """Return what `run.json` alone tells: the run never came to record anything, or its file is gone."""
+    unknown = dict.fromkeys(("content_digest", "train_steps", "eval_steps", "episodes", "seconds"))
+    nothing: dict[str, Any] = {"bytes": 0, "provenance": {}, "tables": [], "eval": [], "train": []}
+    told = {key: run.summary.get(key) for key in unknown}
+    return {**_identity(run), **told, **nothing, "config": run.facts.get("config", {})}
+
+
+def _tables(recording: Recording) -> list[dict[str, Any]]:
+    """Return size and fill of each table, as last reported."""
+    from runner.frames import agents_of
+
+    reports = [*recording.metrics("train"), *recording.metrics("eval")]
+    last = max(reports, key=lambda report: report["step"], default=None)
+    agents = agents_of(recording)
+    if last is None:
+        return [{"agent": agent} for agent in agents]
+    return [
+        {"agent": agent, "step": last["step"], "zero_cells": zero, "percent_filled": filled}
+        for agent, zero, filled in zip(agents, last["zero_cells"], last["percent_filled"], strict=True)
+    ]
+
+
+def _draw(run: Run, told: dict[str, Any]) -> None:
+    from runner.cli.evaluations import evaluation_table
+
+    parts: list[RenderableType] = [facts(_head(run, told))]
+    if told["eval"]:
+        parts += [title("Evaluations"), evaluation_table(told["eval"], told["success_events"], console())]
+    if told["tables"]:
+        fill = {table["agent"]: _fill_in_words(table) for table in told["tables"]}
+        parts += [title("Tables"), facts(fill)]
+    parts += [title("Configuration"), facts({key: _yaml(value) for key, value in told["config"].items()})]
+    if told["provenance"]:
+        parts += [title("Provenance"), facts(told["provenance"])]
+    draw(*parts)
+
+
+def _head(run: Run, told: dict[str, Any]) -> dict[str, str]:
+    ago = age((datetime.now(UTC) - run.created).total_seconds())
+    head = {
+        "run": f"{run.run_id}  {run.name}, seed {run.seed}",
+        "status": f"{told['status']}, begun {ago} ago"
+        + (f", took {duration(told['seconds'])}" if told["seconds"] is not None else ""),
+    }
+    if run.summary.get("error"):
+        head["error"] = run.summary["error"]
+    if told["train_steps"] is not None:
+        head["steps"] = (
+            f"{told['train_steps']:,} of training in {told['episodes']:,} episodes, "
+            f"{told['eval_steps']:,} of evaluation"
+        )
+    return head | {
+        "digest": told["content_digest"] or f"{UNKNOWN} (told when a run ends properly)",
+        "file": f"{run.recording}  {size(told['bytes'])}" if told["bytes"] else "no recording",
+    }
+
+
+def _fill_in_words(table: dict[str, Any]) -> str:
+    if "step" not in table:
+        return UNKNOWN
+    return (
+        f"{table['percent_filled']:.1f} % filled, {table['zero_cells']:,} cells are still zero, "
+        f"after {table['step']:,} steps"
+    )
+
+
+def _yaml(value: Any) -> str:
+    """Return a value as a configuration would say it, on one line."""
+    import yaml
+
+    text = yaml.safe_dump(value, default_flow_style=True, width=10**6, sort_keys=False)
+    return text.removesuffix("\n").removesuffix("\n...")

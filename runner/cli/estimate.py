@@ -1,0 +1,82 @@
+"""How many steps a run may take, and how much disk: known only roughly before it has learned.
+
+At most, every episode lasts until the step limit. Typically they do not: an agent that learns soon gets
+to the end. The typical figure takes half the limit for each evaluation trial and for the first
+500 training episodes, and a tenth of it for the others; for random actions half of it throughout. Those
+are rules of thumb from the shipped experiments, whose steps came out between a quarter of it and all of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from runner.config import ExperimentConfig
+
+CLUMSY_EPISODES: Final = 500
+CLUMSY, SKILLED = 0.5, 0.1
+"""Typical length of an episode as a share of the step limit: at first and in trials; later."""
+BYTES_A_STEP: Final = {"zstd": 15, "lz4": 30, "none": 100}
+"""By compression, measured; without the message index."""
+INDEX_BYTES: Final = 16
+"""Of the message index, a step."""
+OTHER_BYTES: Final = 2
+"""Of all else, spread over the steps."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Steps and bytes of one run."""
+
+    typical_steps: int
+    typical_bytes: int
+    most_steps: int
+    most_bytes: int
+
+
+def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
+    """Return the estimate of one seed of an experiment; `step_limit` of its environment must not be 0."""
+    trials = 0
+    if config.evaluation is not None:
+        evaluations = -(-config.episodes // config.evaluation.every) + 1
+        trials = evaluations * config.evaluation.trials
+    learns = config.algorithm != "random"
+    clumsy = min(config.episodes, CLUMSY_EPISODES) if learns else config.episodes
+    typical = round(step_limit * (CLUMSY * (clumsy + trials) + SKILLED * (config.episodes - clumsy)))
+    most = step_limit * (config.episodes + trials)
+    rate = _bytes_a_step(config)
+    return Estimate(typical, typical * rate, most, most * rate)
+
+
+def _bytes_a_step(config: ExperimentConfig) -> int:
+    plan = config.recording
+    if plan.steps == "none":
+        return OTHER_BYTES
+    return BYTES_A_STEP[plan.compression] + (INDEX_BYTES if plan.index == "message" else 0) + OTHER_BYTES
+
+
+def step_limit(config: ExperimentConfig) -> int:
+    """Return after how many steps the environment truncates an episode; 0 if never, or if there is no such.
+
+    What is wrong with the environment is told when it is made.
+    """
+    import gymnasium
+
+    given = config.env.kwargs.get("max_episode_steps")
+    if isinstance(given, int):
+        return max(given, 0)
+    module, _, name = config.env.id.rpartition(":")
+    if module:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(module)
+    spec = gymnasium.registry.get(name)
+    return (spec.max_episode_steps or 0) if spec else 0
+
+
+def free_bytes(folder: Path) -> int:
+    """Return how much the disk of a folder would still take."""
+    return shutil.disk_usage(folder).free

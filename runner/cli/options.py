@@ -1,0 +1,70 @@
+"""The arguments and options that commands share, and how they complete in a shell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from click.shell_completion import CompletionItem
+
+from runner.errors import RunnerError
+
+
+class RunName(click.ParamType):  # type: ignore[type-arg]  # generic in newer versions only
+    """The name of a run; completes ids and names."""
+
+    name = "run"
+
+    def shell_complete(
+        self,
+        ctx: click.Context,
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        """Return the ids and names that begin so, the newest first; paths, once there is a slash."""
+        from runner.runs import list_runs, recordings_folder
+
+        if "/" in incomplete or "\\" in incomplete:
+            return [CompletionItem(incomplete, type="file")]
+        try:
+            runs = list_runs(recordings_folder(ctx.params.get("recordings")))
+        except RunnerError:
+            return []
+        found = {"@latest": "the newest run"} if runs else {}
+        found |= {run.run_id: f"{run.name}, seed {run.seed}" for run in runs}
+        names = [run.name for run in runs]
+        found |= {name: "the run of this name" for name in names if names.count(name) == 1}
+        found |= {f"{name}@latest": "the newest of this name" for name in names if names.count(name) > 1}
+        return [
+            CompletionItem(name, help=text) for name, text in found.items() if name.startswith(incomplete)
+        ]
+
+
+run_argument: Final = click.argument("run_name", metavar="RUN", type=RunName())
+
+config_argument: Final = click.argument("config", metavar="CONFIG", type=click.Path(path_type=Path))
+
+recordings_option: Final = click.option(
+    "--recordings",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    help="The folder of runs.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
+)
+
+json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs to read.")
+
+set_option: Final = click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Put another value in the configuration, such as evaluation.trials=50. May be repeated.",
+)
+
+
+def find(name: str, recordings: Path | None) -> Any:
+    """Return the run of a name, or of a path, in the chosen folder."""
+    from runner.runs import find_run, recordings_folder
+
+    return find_run(name, recordings_folder(recordings))

@@ -1,0 +1,73 @@
+"""The progress line of a run: on a terminal's stderr, gone when the run is over."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+from runner.cli.output import number, size
+
+if TYPE_CHECKING:
+    from runner.execution import Progress
+
+REDRAWS_A_SECOND = 5
+
+
+@contextlib.contextmanager
+def progress_line(label: str, episodes: int) -> Iterator[Callable[[Progress], None]]:
+    """Give what `run_job` reports to: it keeps the line up to date, where there is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    columns = [
+        *([rich_progress.TextColumn(label, markup=False)] if label else []),
+        rich_progress.BarColumn(bar_width=None),
+        rich_progress.TextColumn("{task.completed:,}/{task.total:,}"),
+        rich_progress.TextColumn("{task.fields[facts]}", markup=False),
+        rich_progress.TimeRemainingColumn(compact=True),
+    ]
+    with rich_progress.Progress(
+        *columns,
+        console=Console(stderr=True, highlight=False),
+        transient=True,
+        refresh_per_second=REDRAWS_A_SECOND,
+        expand=True,
+    ) as bar:
+        task = bar.add_task("", total=episodes, facts="")
+        speed = _Speed()
+
+        def report(progress: Progress) -> None:
+            bar.update(task, completed=progress.episode, facts=facts_in_words(progress, speed.of(progress)))
+
+        yield report
+
+
+class _Speed:
+    """Steps a second since the first report: what came before was not learning."""
+
+    def __init__(self) -> None:
+        self._first: tuple[float, int] | None = None
+
+    def of(self, progress: Progress) -> float | None:
+        """Return the speed, None as long as there is nothing to say."""
+        now, steps = time.monotonic(), progress.train_steps + progress.eval_steps
+        if self._first is None:
+            self._first = now, steps
+        seconds = now - self._first[0]
+        return (steps - self._first[1]) / seconds if seconds else None
+
+
+def facts_in_words(progress: Progress, speed: float | None) -> str:
+    """Return steps a second, the latest finish percent and the size so far."""
+    facts = []
+    if speed is not None:
+        facts.append(f"{speed / 1e6:.1f}M steps/s" if speed >= 1e6 else f"{speed / 1e3:.0f}k steps/s")
+    if progress.evaluations:
+        facts.append(f"{number(progress.evaluations[-1]['finish_percent'])} % finished")
+    return "  ".join([*facts, size(progress.bytes_written)])

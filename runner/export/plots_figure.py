@@ -1,0 +1,235 @@
+"""Panels drawn with Matplotlib: one figure for print, or a small SVG a panel for a page.
+
+Groups of runs differ in colour and marker, agents in the kind of line, so that nothing is told by colour
+alone; the colours are those of Okabe and Ito. Percent goes from 0 to 100, and what cannot be negative
+begins at zero.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from runner.errors import MissingExtra, RunnerError
+from runner.export.plots import Curve, Group, Panel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SUFFIXES: Final = (".png", ".svg", ".pdf")
+
+COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
+_MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
+_DASHES: Final = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
+_BAND_OPACITY: Final = 0.2
+_INK: Final = "#1b1f24"
+_STYLE: Final = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 8.5,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 8.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": _INK,
+    "axes.labelcolor": _INK,
+    "text.color": _INK,
+    "xtick.color": _INK,
+    "ytick.color": _INK,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "legend.fontsize": 7.5,
+    "legend.frameon": False,
+    "lines.linewidth": 1.5,
+    "grid.linewidth": 0.5,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "dualtaxi",
+    "pdf.fonttype": 42,
+    "savefig.dpi": 160,
+}
+
+
+def matplotlib_of(purpose: str) -> Any:
+    """Return the module `matplotlib`.
+
+    Raises:
+        MissingExtra: it is not installed.
+    """
+    try:
+        import matplotlib as mpl
+        import matplotlib.figure
+    except ImportError as error:
+        raise MissingExtra("matplotlib", "plots", purpose) from error
+    return mpl
+
+
+def save_figure(path: Path, groups: Sequence[Group], panels: Sequence[Panel]) -> None:
+    """Write one figure of all panels, as the path's suffix says.
+
+    Raises:
+        MissingExtra: Matplotlib is not installed.
+        RunnerError: the suffix is none of `SUFFIXES`, or the file cannot be written.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise RunnerError(f"{path}: found the ending {path.suffix!r}, expected one of {', '.join(SUFFIXES)}.")
+    mpl = matplotlib_of("a plot")
+    with mpl.rc_context(_STYLE):
+        figure = draw_figure(groups, panels)
+        stamp = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower(), {})
+        try:
+            figure.savefig(path, metadata=stamp)
+        except OSError as error:
+            raise RunnerError(f"{path}: cannot be written ({error.strerror}).") from error
+
+
+def draw_figure(groups: Sequence[Group], panels: Sequence[Panel]) -> Figure:
+    """Return the figure of all panels, three beside each other, with a legend of the groups above."""
+    mpl = matplotlib_of("a plot")
+    columns = min(3, len(panels))
+    rows = math.ceil(len(panels) / columns)
+    head = 0.55 + 0.19 * len(groups)
+    height = head + 2.05 * rows + 0.3
+    with mpl.rc_context(_STYLE):
+        figure: Figure = mpl.figure.Figure(figsize=(max(3.4 * columns, 6.8), height), layout="constrained")
+        figure.get_layout_engine().set(  # type: ignore[union-attr]
+            rect=(0, 0.22 / height, 1, 1 - (head + 0.22) / height), h_pad=0.08, w_pad=0.08
+        )
+        for number, panel in enumerate(panels):
+            draw_panel(figure.add_subplot(rows, columns, number + 1), panel, len(groups))
+        _heading(figure, groups, height)
+        figure.text(0.01, 0.06 / height, footnote(groups), fontsize=7.5, va="bottom")
+    return figure
+
+
+def panel_svg(panel: Panel, groups: int, width: float = 4.0, height: float = 2.5) -> str:
+    """Return one panel as an SVG element for a page: its ink is the page's text colour."""
+    mpl = matplotlib_of("a report")
+    with mpl.rc_context(_STYLE | {"savefig.transparent": True}):
+        figure = mpl.figure.Figure(figsize=(width, height), layout="constrained")
+        draw_panel(figure.add_subplot(), panel, groups)
+        buffer = io.StringIO()
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    return _for_page(buffer.getvalue(), panel)
+
+
+def draw_panel(axes: Axes, panel: Panel, groups: int) -> None:
+    """Draw a panel on axes."""
+    for curve in panel.curves:
+        _draw_curve(axes, panel, curve, groups)
+    axes.set_title(panel.title)
+    axes.set_ylabel(panel.unit)
+    axes.set_xlabel("training episodes")
+    axes.grid(visible=True, alpha=0.25)
+    axes.set_axisbelow(True)
+    _honest_axes(axes, panel)
+    _legend(axes, panel, groups)
+
+
+def footnote(groups: Sequence[Group]) -> str:
+    """Return what lines and bands mean."""
+    if max(len(group.runs) for group in groups) == 1:
+        return "Each line is one run, every report of it. Evaluations follow the greedy policy."
+    return (
+        "Lines: median over the runs of a configuration; bands: from the lowest run to the highest. "
+        "Evaluations follow the greedy policy."
+    )
+
+
+def _draw_curve(axes: Axes, panel: Panel, curve: Curve, groups: int) -> None:
+    line = panel.lines.index(curve.line)
+    by_line = groups == 1 and len(panel.lines) > 1
+    colour = COLOURS[(line if by_line else curve.group) % len(COLOURS)]
+    marker = _MARKERS[(line if by_line else curve.group) % len(_MARKERS)]
+    axes.plot(
+        curve.episodes,
+        curve.median,
+        color=colour,
+        linestyle=_DASHES[line % len(_DASHES)],
+        marker=marker,
+        markersize=3.2,
+        markevery=max(len(curve.episodes) // 8, 1),
+        label=curve.line,
+    )
+    if (curve.high > curve.low).any():
+        axes.fill_between(
+            curve.episodes, curve.low, curve.high, color=colour, alpha=_BAND_OPACITY, linewidth=0
+        )
+
+
+def _honest_axes(axes: Axes, panel: Panel) -> None:
+    """Begin at zero what cannot be negative, end percent at 100, and mark zero elsewhere."""
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.set_xlim(left=0)
+    if panel.percent:
+        axes.set_ylim(0, 100)
+        axes.margins(y=0)
+    elif panel.at_least_zero:
+        top = max(float(np.max(curve.high)) for curve in panel.curves)
+        axes.set_ylim(0, top * 1.06 or 1.0)
+    else:
+        axes.axhline(0, color=_INK, linewidth=0.6)
+    if max(float(np.max(np.abs(curve.high))) for curve in panel.curves) >= 10_000:
+        axes.yaxis.set_major_formatter(EngFormatter(sep=""))
+
+
+def _legend(axes: Axes, panel: Panel, groups: int) -> None:
+    """Name the lines of a panel where it has several; the groups are named once for all panels."""
+    from matplotlib.lines import Line2D
+
+    if len(panel.lines) < 2:
+        return
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=COLOURS[number % len(COLOURS)] if groups == 1 else _INK,
+            linestyle=_DASHES[number % len(_DASHES)],
+            marker=_MARKERS[number % len(_MARKERS)] if groups == 1 else "",
+            markersize=3.2,
+            label=line.replace("_", " ") or "all",
+        )
+        for number, line in enumerate(panel.lines)
+    ]
+    axes.legend(handles=handles, loc="best", ncols=2 if len(handles) > 4 else 1, handlelength=2.2)
+
+
+def _heading(figure: Figure, groups: Sequence[Group], height: float) -> None:
+    """Write above the panels which colour is which runs."""
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], color=COLOURS[i % len(COLOURS)], marker=_MARKERS[i % len(_MARKERS)], markersize=4)
+        for i in range(len(groups))
+    ]
+    figure.text(0.01, 1 - 0.1 / height, "Metrics over training episodes", fontsize=13, weight="bold", va="top")
+    figure.legend(
+        handles,
+        [group.described for group in groups],
+        loc="upper left",
+        bbox_to_anchor=(0.0, 1 - 0.35 / height),
+        fontsize=8.5,
+        borderaxespad=0.2,
+    )
+
+
+def _for_page(svg: str, panel: Panel) -> str:
+    """Return the `<svg>` element alone, named for readers of the page, with ink that follows the page."""
+    element = svg[svg.index("<svg") :]
+    element = re.sub(r"<metadata>.*?</metadata>", "", element, flags=re.DOTALL)
+    element = element.replace(_INK, "currentColor")
+    element = re.sub(r' width="[\d.]+pt" height="[\d.]+pt"', "", element, count=1)
+    name = re.sub(r"\W+", "-", panel.metric)
+    element = re.sub(r'(id="|#)(?=[A-Za-z])', rf"\g<1>{name}-", element)
+    return element.replace("<svg ", f'<svg role="img" aria-label="{panel.title} over training episodes" ', 1)
