@@ -180,12 +180,12 @@ def test_one_problem_is_one_line_that_says_where_what_and_how(told, text, line):
 
 
 @pytest.mark.parametrize(
-    "value", ["'12'", "12.0", "true", "0", "-3", "null", "[1]", "{a: 1}", "10000000000000", "1_000"]
+    "value", ["'12'", "12.0", "true", "-3", "null", "[1]", "{a: 1}", "10000000000000", "1_000"]
 )
 def test_episodes_are_counted_in_whole_numbers(told, value):
     (line,) = told(f"episodes: {value}")
     assert line.startswith("x.yaml:1:1: episodes: found ")
-    assert line.endswith(", expected a whole number from 1 to 10^12")
+    assert line.endswith(", expected a whole number from 0 to 10^12")
 
 
 def test_every_problem_is_listed_in_the_order_of_the_file(told):
@@ -262,7 +262,7 @@ def test_a_file_and_an_override_that_disagree(told):
 
 def test_python_values_are_held_to_the_same():
     for values, line in [
-        ({}, "episodes: missing, expected a whole number from 1 to 10^12"),
+        ({}, "episodes: missing, expected a whole number from 0 to 10^12"),
         ({"episodes": 1, 2: 3}, "2: unknown key, which is not even text"),
         ({"episodes": "1"}, "episodes: found '1', expected"),
         (

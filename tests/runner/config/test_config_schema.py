@@ -89,7 +89,7 @@ def test_the_tutorials_settings():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"episodes": 0},
+        {"episodes": -1},
         {"episodes": 1, "epsilonn": 1},
         {"episodes": 1, "epsilon": 1.5},
         {"episodes": 1, "step_size": 0},
