@@ -16,7 +16,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from runner import frames
+    import runner.frames as frames  # noqa: PLR0402
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
     from runner.errors import RunnerError

@@ -190,6 +190,10 @@ def find_run(name: str, recordings: Path) -> Run:
             f"  {run.run_id}  {run.name}  seed {run.seed}  {run.created:%Y-%m-%d %H:%M}" for run in found
         )
         raise RunNotFound(f"{name!r} answers to {len(found)} runs; name one by its id:\n{several}")
+    if not runs:
+        raise RunNotFound(
+            f"no run {name!r}: there are no runs in {recordings} yet. `dualtaxi run` makes one."
+        )
     hint = nearest(name, [run.name for run in runs] + [run.run_id for run in runs])
     raise RunNotFound(
         f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {len(runs)} there are."

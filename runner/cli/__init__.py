@@ -61,13 +61,13 @@ class Failure(click.ClickException):
     """A `RunnerError`, told without a traceback."""
 
     def __init__(self, error: RunnerError) -> None:
-        super().__init__("\n".join([str(error), *getattr(error, "__notes__", [])]))
+        told = str(error) if "\n" in str(error) else f"Error: {error}"
+        super().__init__("\n".join([told, *getattr(error, "__notes__", [])]))
         self.exit_code = error.exit_code  # type: ignore[misc]  # Click's own classes do so
 
     def show(self, file: Any = None) -> None:
-        """Print the message; several lines begin at the margin, as places in files should."""
-        before = "" if "\n" in self.message else "Error: "
-        click.echo(f"{before}{self.message}", file=file or sys.stderr)
+        """Print the message; problems of which each has a line begin at the margin, with their places."""
+        click.echo(self.message, file=file or sys.stderr)
 
 
 class LazyGroup(click.Group):

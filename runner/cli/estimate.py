@@ -59,10 +59,10 @@ def _bytes_a_step(config: ExperimentConfig) -> int:
     return BYTES_A_STEP[plan.compression] + (INDEX_BYTES if plan.index == "message" else 0) + OTHER_BYTES
 
 
-def step_limit(config: ExperimentConfig) -> int:
-    """Return after how many steps the environment truncates an episode; 0 if never, or if there is no such.
+def step_limit(config: ExperimentConfig) -> int | None:
+    """Return after how many steps the environment truncates an episode; 0 for never, None if it is unknown.
 
-    What is wrong with the environment is told when it is made.
+    What is wrong with an unknown environment is told when it is made.
     """
     import gymnasium
 
@@ -74,7 +74,7 @@ def step_limit(config: ExperimentConfig) -> int:
         with contextlib.suppress(ImportError):
             importlib.import_module(module)
     spec = gymnasium.registry.get(name)
-    return (spec.max_episode_steps or 0) if spec else 0
+    return (spec.max_episode_steps or 0) if spec else None
 
 
 def free_bytes(folder: Path) -> int:

@@ -6,14 +6,16 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from runner.cli.output import number, size
 
 if TYPE_CHECKING:
     from runner.execution import Progress
 
-REDRAWS_A_SECOND = 5
+REDRAWS_A_SECOND: Final = 5
+BAR_WIDTH: Final = 20
+"""Short of the edge, where the terminal's echo of Ctrl-C would break the line and leave it behind."""
 
 
 @contextlib.contextmanager
@@ -27,7 +29,7 @@ def progress_line(label: str, episodes: int) -> Iterator[Callable[[Progress], No
 
     columns = [
         *([rich_progress.TextColumn(label, markup=False)] if label else []),
-        rich_progress.BarColumn(bar_width=None),
+        rich_progress.BarColumn(bar_width=BAR_WIDTH),
         rich_progress.TextColumn("{task.completed:,}/{task.total:,}"),
         rich_progress.TextColumn("{task.fields[facts]}", markup=False),
         rich_progress.TimeRemainingColumn(compact=True),
@@ -37,7 +39,6 @@ def progress_line(label: str, episodes: int) -> Iterator[Callable[[Progress], No
         console=Console(stderr=True, highlight=False),
         transient=True,
         refresh_per_second=REDRAWS_A_SECOND,
-        expand=True,
     ) as bar:
         task = bar.add_task("", total=episodes, facts="")
         speed = _Speed()

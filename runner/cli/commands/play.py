@@ -83,6 +83,7 @@ def command(
 
     run = find(run_name, recordings)
     with open_recording(run.recording) as recording:
+        _require_steps(recording)
         phase, number, title = _chosen(recording, episode, trial)
         played = Episode(recording, phase, number, f"{run.name}, seed {run.seed}: {title}")
     if as_json:
@@ -90,6 +91,21 @@ def command(
             print_json(step, indent=None)
     else:
         _show(played, speed)
+
+
+def _require_steps(recording: Recording) -> None:
+    """Refuse a recording that was made without steps.
+
+    Raises:
+        RecordingError: it was.
+    """
+    from runner.errors import RecordingError
+
+    if recording.config["recording"]["steps"] == "none":
+        raise RecordingError(
+            f"{recording.path}: was recorded without steps (recording.steps: none), so there is nothing to "
+            "play. Run it again with --set recording.steps=all: the same seed gives the same steps."
+        )
 
 
 def _chosen(recording: Recording, episode: int | None, trial: tuple[int, int] | None) -> tuple[str, int, str]:

@@ -68,11 +68,7 @@ def command(
             _summarise(run, blank=number > 0)
         sys.stdout.flush()
         if interrupted:
-            done, left = run.summary["episodes"], len(experiment.seeds) - number - 1
-            say(
-                f"Interrupted: {done:,} of {experiment.episodes:,} episodes are kept in {run.recording}."
-                + (f" {left} seeds were not begun." if left else "")
-            )
+            _tell_interrupted(run, experiment, begun=number + 1)
             ctx.exit(INTERRUPTED)
 
 
@@ -99,6 +95,14 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int) -> tuple[Run
     return run, interrupt.came and run.status == "interrupted"
 
 
+def _tell_interrupted(run: Run, config: ExperimentConfig, begun: int) -> None:
+    """Say what is kept, and what was not begun."""
+    done, left = run.summary["episodes"], len(config.seeds) - begun
+    say(f"Interrupted: {done:,} of {config.episodes:,} episodes are kept in {run.recording}.")
+    if left:
+        say(f"Not begun: {left} of {len(config.seeds)} seeds, from {config.seeds[begun]} on.")
+
+
 def _announce(config: ExperimentConfig, folder: Path) -> None:
     """Tell what is to come; ask, where someone can answer, when the disk would not hold it."""
     from runner.cli.estimate import estimate, free_bytes, step_limit
@@ -106,7 +110,9 @@ def _announce(config: ExperimentConfig, folder: Path) -> None:
     limit, seeds = step_limit(config), len(config.seeds)
     free = free_bytes(folder)
     runs = f"{seeds} runs of {config.episodes:,} episodes" if seeds > 1 else f"{config.episodes:,} episodes"
-    if not limit:
+    if limit is None:
+        return
+    if limit == 0:
         say(f"{runs} without a step limit: nobody knows how long; {size(free)} of disk are free.")
         return
     one = estimate(config, limit)
