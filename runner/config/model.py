@@ -138,12 +138,26 @@ InitialTable = Annotated[
 ]
 
 
+def _trial_start(value: object) -> object:
+    state = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
+    if value in ("random", "each") or state:
+        return value
+    raise refusal((), f"found {value!r:.60}, expected 'random', 'each', or a state's number from 0")
+
+
+TrialStart = Annotated[
+    Literal["random", "each"] | int,
+    PlainValidator(_trial_start),
+    WithJsonSchema({"anyOf": [{"enum": ["random", "each"]}, {"type": "integer", "minimum": 0}]}),
+]
+
+
 class Evaluation(Section):
     """When the greedy policy is tried out, and how often each time."""
 
     every: Count = Field(description="Training episodes between evaluations.")
     trials: Annotated[int, Field(ge=1, le=10**6)] = Field(description="Greedy episodes in an evaluation.")
-    start: Literal["random", "each"] | Annotated[int, Field(ge=0, lt=2**31)] = Field(
+    start: TrialStart = Field(
         default="random",
         description="The states that trials start in: random, as training episodes do; each of the "
         "environment's start states in turn; or the state of this number.",

@@ -378,3 +378,9 @@ def test_a_flood_of_problems_is_counted_instead_of_listed(told):
     lines = told("episodes: 1\nseeds: [" + "x, " * 1000 + "]")
     assert len(lines) == 201
     assert lines[-1] == "... and 800 more"
+
+
+@pytest.mark.parametrize("value", ["foo", "-1", "1.5", "[1]", "true", "{a: 1}"])
+def test_trials_start_at_random_in_each_or_in_one_state(told, value):
+    (line,) = told(f"episodes: 1\nevaluation: {{every: 1, trials: 1, start: {value}}}")
+    assert line.endswith("expected 'random', 'each', or a state's number from 0")
