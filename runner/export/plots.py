@@ -96,18 +96,20 @@ class Panel:
 
 
 MOST_NAMED: Final = 6
+SHARES: Final = "training.reward"
+"""The metric whose lines are shares of a whole."""
 
 _TITLES: Final = {
     "finish_percent": ("Evaluation trials that succeed", "percent of trials"),
     "mean_length": ("Length of evaluation trials", "steps, mean"),
     "mean_penalties": ("Penalties in evaluation trials", "a trial, mean"),
     "mean_return": ("Return of evaluation trials", "summed reward, mean"),
-    "training.mean_length": ("Length of training episodes", "steps, mean of the last"),
-    "training.mean_reward": ("Reward in training", "a step, mean"),
+    "training.mean_length": ("Length of training episodes", "steps, running mean"),
+    "training.mean_reward": ("Reward in training", "a step, running mean"),
     "training.percent_filled": ("Q-table filled", "percent of its cells"),
     "training.zero_cells": ("Q-table cells still zero", "cells"),
     "training.schedule": ("Schedules", "value"),
-    "training.reward": ("Training steps by reward", "percent of steps"),
+    SHARES: ("Training steps by reward", "percent of recent steps"),
 }
 """Metric -> title and unit, in the order they are shown; events come after the evaluation's."""
 
@@ -153,7 +155,7 @@ def panels_of(groups: Sequence[Group]) -> list[Panel]:
             if curve is not None:
                 curves.setdefault(metric, []).append(curve)
     if len(groups) > 1:  # as many lines as rewards: too many for several groups, whose mean is shown
-        curves.pop("training.reward", None)
+        curves.pop(SHARES, None)
     if not curves:
         runs = ", ".join(run.run_id for group in groups for run in group.runs)
         raise RunnerError(
@@ -188,7 +190,7 @@ def _training(side: Mapping[str, Any]) -> Readings:
     if steps:
         mean = sum(reward * count for reward, count in counts.items()) / steps
         readings["training.mean_reward"] = {"": mean}
-        readings["training.reward"] = {f"{r:g}": 100 * count / steps for r, count in counts.items()}
+        readings[SHARES] = {f"{r:g}": 100 * count / steps for r, count in counts.items()}
     return readings | {
         "training.percent_filled": dict(side["percent_filled"]),
         "training.zero_cells": dict(side["zero_cells"]),
@@ -203,8 +205,8 @@ def _metrics(group: Group) -> Iterator[tuple[str, str]]:
         for _, readings in (*run.evaluation, *run.training):
             for metric, lines in readings.items():
                 seen.update(dict.fromkeys((metric, line) for line in lines))
-    rewards = sorted((pair for pair in seen if pair[0] == "training.reward"), key=lambda pair: float(pair[1]))
-    yield from (pair for pair in seen if pair[0] != "training.reward")
+    rewards = sorted((pair for pair in seen if pair[0] == SHARES), key=lambda pair: float(pair[1]))
+    yield from (pair for pair in seen if pair[0] != SHARES)
     yield from rewards
 
 
@@ -236,7 +238,7 @@ def _points(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[int, 
     """Return value by episode; a reward that did not come is 0 percent of the steps."""
     source = run.training if metric.startswith("training.") else run.evaluation
     at_evaluations = {episode for episode, _ in run.evaluation}
-    missing = 0.0 if metric == "training.reward" else np.nan
+    missing = 0.0 if metric == SHARES else np.nan
     points = {
         episode: readings[metric].get(line, missing)
         for episode, readings in source
@@ -248,7 +250,7 @@ def _points(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[int, 
 def _panel(metric: str, curves: tuple[Curve, ...]) -> Panel:
     if metric.startswith("event."):
         kind = event_in_words(metric.removeprefix("event."))
-        return Panel(metric, f"Event: {kind}", "a trial, mean", curves)
+        return Panel(metric, f"Event: {kind}", "times a trial, mean", curves)
     return Panel(metric, *_TITLES[metric], curves)
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from runner.errors import MissingExtra, RunnerError
-from runner.export.plots import Curve, Group, Panel
+from runner.export.plots import SHARES, Curve, Group, Panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,6 +51,8 @@ _STYLE: Final = {
     "legend.frameon": False,
     "lines.linewidth": 1.5,
     "grid.linewidth": 0.5,
+    "grid.color": _INK,
+    "grid.alpha": 0.15,
     "svg.fonttype": "none",
     "svg.hashsalt": "dualtaxi",
     "pdf.fonttype": 42,
@@ -72,50 +74,68 @@ def matplotlib_of(purpose: str) -> Any:
     return mpl
 
 
+def check_suffix(path: Path) -> None:
+    """Refuse a file that no figure can be written to.
+
+    Raises:
+        RunnerError: its suffix is none of `SUFFIXES`.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise RunnerError(f"{path}: found the ending {path.suffix!r}, expected one of {', '.join(SUFFIXES)}.")
+
+
 def save_figure(path: Path, groups: Sequence[Group], panels: Sequence[Panel]) -> None:
     """Write one figure of all panels, as the path's suffix says.
 
     Raises:
         MissingExtra: Matplotlib is not installed.
-        RunnerError: the suffix is none of `SUFFIXES`, or the file cannot be written.
+        OSError: the file cannot be written.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise RunnerError(f"{path}: found the ending {path.suffix!r}, expected one of {', '.join(SUFFIXES)}.")
     mpl = matplotlib_of("a plot")
+    stamp = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower(), {})
     with mpl.rc_context(_STYLE):
-        figure = draw_figure(groups, panels)
-        stamp = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower(), {})
-        try:
-            figure.savefig(path, metadata=stamp)
-        except OSError as error:
-            raise RunnerError(f"{path}: cannot be written ({error.strerror}).") from error
+        draw_figure(groups, panels).savefig(path, metadata=stamp)
 
 
 def draw_figure(groups: Sequence[Group], panels: Sequence[Panel]) -> Figure:
     """Return the figure of all panels, three beside each other, with a legend of the groups above."""
     mpl = matplotlib_of("a plot")
     columns = min(3, len(panels))
-    rows = math.ceil(len(panels) / columns)
-    head = 0.55 + 0.19 * len(groups)
-    height = head + 2.05 * rows + 0.3
+    narrow = [panel for panel in panels if not is_wide(panel)]
+    wide = [panel for panel in panels if is_wide(panel)]
+    rows = math.ceil(len(narrow) / columns) + len(wide)
+    head, foot = 0.55 + 0.19 * len(groups), 0.22
+    height = head + 2.2 * rows + foot
     with mpl.rc_context(_STYLE):
         figure: Figure = mpl.figure.Figure(figsize=(max(3.4 * columns, 6.8), height), layout="constrained")
         figure.get_layout_engine().set(  # type: ignore[union-attr]
-            rect=(0, 0.22 / height, 1, 1 - (head + 0.22) / height), h_pad=0.08, w_pad=0.08
+            rect=(0, foot / height, 1, 1 - (head + foot) / height), h_pad=0.08, w_pad=0.08
         )
-        for number, panel in enumerate(panels):
-            draw_panel(figure.add_subplot(rows, columns, number + 1), panel, len(groups))
+        grid = figure.add_gridspec(rows, columns)
+        for number, panel in enumerate(narrow):
+            draw_panel(figure.add_subplot(grid[divmod(number, columns)]), panel, len(groups))
+        for number, panel in enumerate(wide):  # the last column is for its legend
+            place = grid[rows - len(wide) + number, : max(columns - 1, 1)]
+            draw_panel(figure.add_subplot(place), panel, len(groups))
         _heading(figure, groups, height)
         figure.text(0.01, 0.06 / height, footnote(groups), fontsize=7.5, va="bottom")
     return figure
 
 
-def panel_svg(panel: Panel, groups: int, width: float = 4.0, height: float = 2.5) -> str:
+def is_wide(panel: Panel) -> bool:
+    """Return whether a panel takes all the room beside it: it has a legend of many lines."""
+    return panel.metric == SHARES
+
+
+def panel_svg(panel: Panel, groups: int) -> str:
     """Return one panel as an SVG element for a page: its ink is the page's text colour."""
     mpl = matplotlib_of("a report")
+    width = 8.0 if is_wide(panel) else 4.0
     with mpl.rc_context(_STYLE | {"savefig.transparent": True}):
-        figure = mpl.figure.Figure(figsize=(width, height), layout="constrained")
-        draw_panel(figure.add_subplot(), panel, groups)
+        figure = mpl.figure.Figure(figsize=(width, 2.5))
+        right = 0.8 if is_wide(panel) else 0.97
+        axes = figure.add_axes((0.68 / width, 0.19, right - 0.68 / width, 0.63))
+        draw_panel(axes, panel, groups)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     return _for_page(buffer.getvalue(), panel)
@@ -123,15 +143,18 @@ def panel_svg(panel: Panel, groups: int, width: float = 4.0, height: float = 2.5
 
 def draw_panel(axes: Axes, panel: Panel, groups: int) -> None:
     """Draw a panel on axes."""
-    for curve in panel.curves:
-        _draw_curve(axes, panel, curve, groups)
-    axes.set_title(panel.title)
+    if panel.metric == SHARES:
+        _draw_shares(axes, panel)
+    else:
+        for curve in panel.curves:
+            _draw_curve(axes, panel, curve, groups)
+        _legend(axes, panel, groups)
+    axes.set_title(panel.title, pad=18 if _has_legend(panel) else 6)
     axes.set_ylabel(panel.unit)
     axes.set_xlabel("training episodes")
-    axes.grid(visible=True, alpha=0.25)
+    axes.grid(visible=True)
     axes.set_axisbelow(True)
     _honest_axes(axes, panel)
-    _legend(axes, panel, groups)
 
 
 def footnote(groups: Sequence[Group]) -> str:
@@ -165,30 +188,70 @@ def _draw_curve(axes: Axes, panel: Panel, curve: Curve, groups: int) -> None:
         )
 
 
+def _draw_shares(axes: Axes, panel: Panel) -> None:
+    """Draw shares of a whole on top of each other, the lowest reward darkest and at the bottom."""
+    from matplotlib import colormaps
+
+    colours = colormaps["cividis"](np.linspace(0, 1, len(panel.curves)))
+    bottom = np.zeros_like(panel.curves[0].median)
+    for curve, colour in zip(panel.curves, colours, strict=True):
+        top = bottom + np.interp(panel.curves[0].episodes, curve.episodes, curve.median)
+        axes.fill_between(
+            panel.curves[0].episodes,
+            bottom,
+            top,
+            color=colour,
+            linewidth=0.3,
+            edgecolor="white",
+            label=curve.line,
+        )
+        bottom = top
+    legend = axes.legend(
+        title="reward of a step",
+        reverse=True,
+        loc="center left",
+        bbox_to_anchor=(1.01, 0.5),
+        ncols=2 if len(panel.curves) > 8 else 1,
+    )
+    legend.set_in_layout(False)
+
+
 def _honest_axes(axes: Axes, panel: Panel) -> None:
     """Begin at zero what cannot be negative, end percent at 100, and mark zero elsewhere."""
-    from matplotlib.ticker import EngFormatter, MaxNLocator
+    from matplotlib.ticker import MaxNLocator
 
-    axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], integer=True))
+    axes.xaxis.set_major_formatter(_number)
+    axes.yaxis.set_major_formatter(_number)
     axes.set_xlim(left=0)
     if panel.percent:
-        axes.set_ylim(0, 100)
-        axes.margins(y=0)
-    elif panel.at_least_zero:
+        axes.set_ylim(0, 100 if panel.metric == SHARES else 103)
+        axes.set_yticks(range(0, 101, 20))
+        return
+    axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+    if panel.at_least_zero:
         top = max(float(np.max(curve.high)) for curve in panel.curves)
         axes.set_ylim(0, top * 1.06 or 1.0)
     else:
         axes.axhline(0, color=_INK, linewidth=0.6)
-    if max(float(np.max(np.abs(curve.high))) for curve in panel.curves) >= 10_000:
-        axes.yaxis.set_major_formatter(EngFormatter(sep=""))
+
+
+def _number(value: float, _: object = None) -> str:
+    """Return a number as an axis shows it: `20,000`, `0.5`, `2.5M`."""
+    if abs(value) >= 1e6:
+        return f"{value / 1e6:g}M"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}".replace("-", "\N{MINUS SIGN}")
+
+
+def _has_legend(panel: Panel) -> bool:
+    return len(panel.lines) > 1 and panel.metric != SHARES
 
 
 def _legend(axes: Axes, panel: Panel, groups: int) -> None:
-    """Name the lines of a panel where it has several; the groups are named once for all panels."""
+    """Name the lines of a panel, above it, where it has several; groups are named once for all panels."""
     from matplotlib.lines import Line2D
 
-    if len(panel.lines) < 2:
+    if not _has_legend(panel):
         return
     handles = [
         Line2D(
@@ -202,7 +265,15 @@ def _legend(axes: Axes, panel: Panel, groups: int) -> None:
         )
         for number, line in enumerate(panel.lines)
     ]
-    axes.legend(handles=handles, loc="best", ncols=2 if len(handles) > 4 else 1, handlelength=2.2)
+    axes.legend(
+        handles=handles,
+        loc="lower left",
+        bbox_to_anchor=(-0.02, 0.985),
+        ncols=len(handles),
+        handlelength=2.2,
+        columnspacing=1.2,
+        borderaxespad=0.1,
+    )
 
 
 def _heading(figure: Figure, groups: Sequence[Group], height: float) -> None:
@@ -213,7 +284,9 @@ def _heading(figure: Figure, groups: Sequence[Group], height: float) -> None:
         Line2D([], [], color=COLOURS[i % len(COLOURS)], marker=_MARKERS[i % len(_MARKERS)], markersize=4)
         for i in range(len(groups))
     ]
-    figure.text(0.01, 1 - 0.1 / height, "Metrics over training episodes", fontsize=13, weight="bold", va="top")
+    figure.text(
+        0.01, 1 - 0.1 / height, "Metrics over training episodes", fontsize=13, weight="bold", va="top"
+    )
     figure.legend(
         handles,
         [group.described for group in groups],
@@ -231,5 +304,6 @@ def _for_page(svg: str, panel: Panel) -> str:
     element = element.replace(_INK, "currentColor")
     element = re.sub(r' width="[\d.]+pt" height="[\d.]+pt"', "", element, count=1)
     name = re.sub(r"\W+", "-", panel.metric)
-    element = re.sub(r'(id="|#)(?=[A-Za-z])', rf"\g<1>{name}-", element)
+    element = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", element)
+    element = re.sub(r"\s*\n\s*", " ", element)
     return element.replace("<svg ", f'<svg role="img" aria-label="{panel.title} over training episodes" ', 1)

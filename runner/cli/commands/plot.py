@@ -1,0 +1,54 @@
+"""`dualtaxi plot`: every metric over episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.options import RunName, recordings_option
+from runner.cli.output import say
+
+
+@click.command("plot")
+@click.argument("run_names", metavar="RUN...", type=RunName(), nargs=-1, required=True)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("plot.png"),
+    show_default=True,
+    metavar="FILE",
+    help="Where to: FILE.png, FILE.svg or FILE.pdf.",
+)
+@click.option("--force", is_flag=True, help="Replace the file if it exists.")
+@recordings_option
+def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: Path | None) -> None:
+    r"""Draw every metric of one or several runs over episodes, in one figure.
+
+    Runs that differ in nothing but the seed are drawn as one line, their median, with a band from the
+    lowest to the highest. The name of several runs stands for all of them.
+
+    \b
+    Examples:
+      dualtaxi plot @latest
+      dualtaxi plot cooperative competitive -o comparison.pdf
+    """
+    from runner.export.plots import groups_of, panels_of, read_series
+    from runner.export.plots_figure import check_suffix, matplotlib_of, save_figure
+    from runner.export.report_runs import find_runs, shortcomings, state_of, write_new
+    from runner.recording.reader import open_recording
+    from runner.runs import recordings_folder
+
+    check_suffix(output)
+    matplotlib_of("a plot")
+    series = []
+    for run in find_runs(run_names, recordings_folder(recordings)):
+        with open_recording(run.recording) as recording:
+            series.append(read_series(recording))
+            if state_of(recording) != "finished":
+                say(shortcomings(recording)[0])
+    groups = groups_of(series)
+    panels = panels_of(groups)
+    write_new(output, force, lambda path: save_figure(path, groups, panels))
+    click.echo(f"{output}: {len(panels)} metrics of {len(series)} run{'s' if len(series) > 1 else ''}")

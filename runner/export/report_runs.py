@@ -1,0 +1,89 @@
+"""What plot, report and film share: which runs are meant, and a file that is replaced only when asked."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from runner.errors import RecordingError, RunnerError
+from runner.recording import schema
+from runner.recording.reader import Recording
+from runner.runs import Run, find_run, list_runs
+
+
+def find_runs(names: Iterable[str], recordings: Path) -> list[Run]:
+    """Return the runs that answer to the names, each once; a name stands for all runs of that name.
+
+    Raises:
+        RunNotFound: none answers to one of the names.
+    """
+    known = list_runs(recordings)
+    found: dict[Path, Run] = {}
+    for name in names:
+        alike = [run for run in reversed(known) if run.name == name]
+        for run in alike or [find_run(name, recordings)]:
+            found.setdefault(run.recording.absolute(), run)
+    return list(found.values())
+
+
+def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
+    """Have a file written beside its place, and put there when it is whole.
+
+    Raises:
+        RunnerError: there is one already and `force` is not given, or it cannot be written.
+    """
+    if path.is_dir():
+        raise RunnerError(f"{path}: found a folder, expected a file to write.")
+    if path.exists() and not force:
+        raise RunnerError(f"{path}: exists already; --force replaces it, or choose another by -o.")
+    fresh = path.with_name(f".{secrets.token_hex(4)}.{path.name}")
+    try:
+        write(fresh)
+        fresh.replace(path)
+    except OSError as error:
+        raise RunnerError(f"{path}: cannot be written ({error.strerror}).") from error
+    finally:
+        if os.path.lexists(fresh):
+            fresh.unlink()
+
+
+def state_of(recording: Recording) -> str:
+    """Return `finished`, or what the run is instead."""
+    return str(recording.result.get("status", "interrupted"))
+
+
+def shortcomings(recording: Recording) -> list[str]:
+    """Return what a reader should know that is missing from a recording, a sentence each."""
+    said = []
+    run = recording.run["run_id"]
+    if state_of(recording) != "finished":
+        done, planned = recording.count(schema.TRAIN_EPISODE), recording.config["episodes"]
+        said.append(
+            f"Run {run} was interrupted: shown are the {done:,} of {planned:,} training episodes it recorded."
+        )
+    if not has_steps(recording):
+        said.append(
+            f"Run {run} was recorded without steps, so no episode of it can be replayed; "
+            "`dualtaxi rerecord` records them."
+        )
+    return said
+
+
+def has_steps(recording: Recording) -> bool:
+    """Return whether any step was recorded."""
+    return bool(recording.count(schema.TRAIN_STEP) or recording.count(schema.EVAL_STEP))
+
+
+def require_steps(recording: Recording) -> None:
+    """Refuse a recording without steps.
+
+    Raises:
+        RecordingError: it has none.
+    """
+    if not has_steps(recording):
+        raise RecordingError(
+            f"{recording.path}: found no steps (recording.steps: none), so there is no episode to show; "
+            "`dualtaxi rerecord` records them."
+        )
