@@ -7,6 +7,7 @@ completion are there at once. `COMMANDS` says where each one is and what it is f
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import os
 import sys
@@ -15,7 +16,7 @@ from typing import Any, Final
 import click
 
 from runner import __version__
-from runner.errors import RunnerError, nearest
+from runner.errors import RunnerError, StorageError, nearest
 
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Do": {
@@ -36,6 +37,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
 """Section -> command -> its module, which has it as `command`, and its short help."""
 
 INTERRUPTED: Final = 130
+_DISK_FULL: Final = tuple(getattr(errno, name) for name in ("ENOSPC", "EDQUOT") if hasattr(errno, name))
 
 _EPILOG = """\b
 First steps:
@@ -114,6 +116,10 @@ class LazyGroup(click.Group):
         except BrokenPipeError:
             _forget_stdout()
             raise click.exceptions.Exit(0) from None
+        except OSError as error:
+            if error.errno not in _DISK_FULL:
+                raise
+            raise Failure(StorageError(f"{error.filename or 'stdout'}: {error.strerror}.")) from error
         return result
 
 

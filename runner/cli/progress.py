@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from runner.execution import Progress
 
 REDRAWS_A_SECOND: Final = 5
-BAR_WIDTH: Final = 20
+BAR_WIDTH: Final = 12
 """Short of the edge, where the terminal's echo of Ctrl-C would break the line and leave it behind."""
 
 
@@ -70,5 +70,5 @@ def facts_in_words(progress: Progress, speed: float | None) -> str:
     if speed is not None:
         facts.append(f"{speed / 1e6:.1f}M steps/s" if speed >= 1e6 else f"{speed / 1e3:.0f}k steps/s")
     if progress.evaluations:
-        facts.append(f"{number(progress.evaluations[-1]['finish_percent'])} % finished")
+        facts.append(f"finish {number(progress.evaluations[-1]['finish_percent'], 0)} %")
     return "  ".join([*facts, size(progress.bytes_written)])

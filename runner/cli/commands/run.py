@@ -123,8 +123,13 @@ def _announce(config: ExperimentConfig, folder: Path) -> None:
     if free >= one.typical_bytes * seeds:
         return
     say(f"The disk of {folder} has {size(free)} left, which may be too little.")
-    if sys.stdin.isatty() and sys.stderr.isatty() and not click.confirm("Go on?", err=True):
+    if _someone_answers() and not click.confirm("Go on?", err=True):
         raise click.exceptions.Exit(1)
+
+
+def _someone_answers() -> bool:
+    """Return whether there is a terminal to ask on."""
+    return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def _as_json(run: Run) -> dict[str, Any]:
