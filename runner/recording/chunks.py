@@ -119,8 +119,11 @@ def decompress(data: bytes | memoryview, compression: str, size: int, where: str
     """Return the `size` bytes that a chunk's data hold; never allocates more than that.
 
     Raises:
-        RecordingError: the data do not give exactly that many bytes; `where` is named.
+        RecordingError: the data do not give exactly that many bytes, or it is more than any chunk has;
+            `where` is named.
     """
+    if size > MAX_CHUNK_BYTES:
+        raise RecordingError(f"{where}: declares {size:,} bytes, expected at most {MAX_CHUNK_BYTES:,}")
     try:
         if compression == "zstd":
             records, more = _unpack_zstd(data, size)

@@ -222,8 +222,15 @@ def metadata_of(body: bytes) -> tuple[str, dict[str, str]]:
 
 
 def asks_for_indexes(config: dict[str, str]) -> bool:
-    """Return whether a recording's configuration asks for message indexes."""
-    return bool(json.loads(config["json"])["recording"]["index"] == "message")
+    """Return whether a recording's configuration asks for message indexes.
+
+    Raises:
+        RecordingError: it does not say.
+    """
+    try:
+        return bool(json.loads(config["json"])["recording"]["index"] == "message")
+    except (KeyError, TypeError, ValueError) as error:
+        raise RecordingError("the configuration does not say what it was recorded with") from error
 
 
 def _name(body: bytes, at: int) -> str:

@@ -34,14 +34,12 @@ def check_integrity(path: Path) -> None:
     """
     with path.open("rb") as stream:
         _check_beginning(stream, path)
-        size = stream.seek(0, 2)
-        for opcode, offset, body in walk(stream, size):
-            if opcode == Opcode.DATA_END:
-                break
-            _check_record(stream, path, opcode, offset, body)
     contents = survey(path, keep_result=True)
     if contents.reason:
         raise RecordingError(f"{path}: {contents.reason}; `repair` or `resume` mends it.")
+    with path.open("rb") as stream:  # whose records can be read, as the survey found
+        for opcode, offset, body in walk(stream, contents.end):
+            _check_record(stream, path, opcode, offset, body)
     with RecordingFile.inspect(path, contents) as file:
         expected = file.tail()
     with path.open("rb") as stream:

@@ -30,7 +30,7 @@ from mcap.records import Metadata
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.mdp import Mdp, from_parts
+from runner.mdp import MAX_AGENTS, MAX_EVENTS, Mdp, from_parts
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES, decompress
 from runner.recording.index import ChunkEntry, read_index
@@ -40,6 +40,13 @@ from runner.recording.schema import BLOCK_TOPICS, Topic
 MAX_ARRAY_BYTES: Final = 256 << 20
 """The largest array of environment data that is unpacked."""
 _CHUNKS_KEPT: Final = 4
+_FACTS: Final = {
+    **dict.fromkeys(("run_id", "name", "job", "created", "agents")),
+    "seed": 2**64 - 1,
+    "learners": MAX_AGENTS,
+    "events": MAX_EVENTS,
+}
+"""What every recording says of its run; of a number, the largest it can be."""
 _MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 
 
@@ -109,7 +116,7 @@ class Recording:
     @cached_property
     def config(self) -> dict[str, Any]:
         """The resolved configuration, as `runner.config.from_mapping` takes it."""
-        return dict(_json(self.metadata("config"), "config", self.path))
+        return _json(self.metadata("config"), "config", self.path)
 
     @cached_property
     def provenance(self) -> dict[str, str]:
@@ -121,7 +128,7 @@ class Recording:
         """What the recorder said at the end: status, digest, counts; empty if it never came to that."""
         if "result" not in self._index.metadata:
             return {}
-        return dict(_json(self.metadata("result"), "result", self.path))
+        return _json(self.metadata("result"), "result", self.path)
 
     def run_facts(self) -> dict[str, Any]:
         """Return what `run.json` says, from the recording alone."""
@@ -295,6 +302,10 @@ class Recording:
                 f"{self.path}: found a recording of version {version}, expected {schema.FORMAT_VERSION}: "
                 "it takes another version of dualtaxi to read it."
             )
+        for name, most in _FACTS.items():
+            said = self.run.get(name, "")
+            if not said or (most and not (said.isdecimal() and len(said) <= 20 and int(said) <= most)):
+                raise RecordingError(f"{self.path}: is damaged: of its run it says that {name} is {said!r}.")
 
     @cached_property
     def _chunks_of(self) -> Mapping[int, list[ChunkEntry]]:
@@ -321,6 +332,9 @@ class Recording:
         """
         if topic not in self._known_numbers:
             size = self.dtypes[topic].itemsize
+            for entry in self._chunks_of[topic.channel]:
+                if entry.uncompressed_size % size:
+                    raise self._damaged(entry, f"{entry.uncompressed_size} bytes, not a multiple of {size}")
             counts = [entry.uncompressed_size // size for entry in self._chunks_of[topic.channel]]
             ends = np.cumsum(counts, dtype=np.int64)
             firsts = ends - np.array(counts, dtype=np.int64)
@@ -383,11 +397,11 @@ class Recording:
         return RecordingError(f"{self.path}: chunk at {entry.offset}: found {found}.")
 
 
-def _json(entries: Mapping[str, str], name: str, path: Path) -> Any:
+def _json(entries: Mapping[str, str], name: str, path: Path) -> dict[str, Any]:
     try:
-        return json.loads(entries["json"])
-    except (KeyError, ValueError, RecursionError) as error:
-        raise RecordingError(f"{path}: the metadata {name!r} holds no JSON.") from error
+        return dict(json.loads(entries["json"]))
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise RecordingError(f"{path}: the metadata {name!r} holds no JSON object.") from error
 
 
 def pack_array(array: NDArray[Any]) -> bytes:
