@@ -12,13 +12,13 @@ from runner.cli.output import print_json
 
 @click.group("config")
 def command() -> None:
-    r"""Check a configuration; print the schema of one.
+    """Check a configuration; print the schema of one.
 
     \b
     Examples:
       dualtaxi config check configs/quick.yaml
       dualtaxi config schema > schema.json
-    """
+    """  # noqa: D301 - Click wants the backspace itself
 
 
 @command.command("check")
@@ -26,7 +26,7 @@ def command() -> None:
 @set_option
 @json_option
 def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
-    r"""Check the file CONFIG and print what it means, with every value spelled out.
+    """Check the file CONFIG and print what it means, with every value spelled out.
 
     What is printed is a configuration again. Problems are told with file, line, column and key, all at
     once; the exit code is then 2.
@@ -35,7 +35,7 @@ def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     Examples:
       dualtaxi config check configs/quick.yaml
       dualtaxi config check configs/quick.yaml --set episodes=50 --json
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     from runner.config import load
 
     experiment = load(config, overrides)
@@ -49,14 +49,14 @@ def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
 @command.command("schema")
 @json_option
 def schema(as_json: bool) -> None:  # noqa: ARG001 - a schema is JSON anyway
-    r"""Print the JSON Schema of configuration files, with which editors check and complete them.
+    """Print the JSON Schema of configuration files, with which editors check and complete them.
 
     It is JSON with or without --json.
 
     \b
     Example:
       dualtaxi config schema > configs/schema.json
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     from runner.config import json_schema
 
     print_json(json_schema(), indent=2)

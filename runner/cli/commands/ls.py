@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @recordings_option
 @json_option
 def command(recordings: Path | None, as_json: bool) -> None:
-    r"""List the runs of the recordings folder, the newest first.
+    """List the runs of the recordings folder, the newest first.
 
     Shown are the training episodes done (of those to do, where some are missing), how many percent of the
     last evaluation's trials finished, the size of the recording, and how long ago the run began.
@@ -30,7 +30,7 @@ def command(recordings: Path | None, as_json: bool) -> None:
     Examples:
       dualtaxi ls
       dualtaxi ls --recordings /data/runs --json
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     folder = recordings_folder(recordings)
     runs = list_runs(folder)
     if as_json:

@@ -64,7 +64,7 @@ def command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    r"""Replay a recorded episode of RUN, frame by frame, with actions and rewards.
+    """Replay a recorded episode of RUN, frame by frame, with actions and rewards.
 
     Without a choice it is the first trial of the last evaluation. All is drawn from the recording: its
     environment need not be installed. Where stdout is no terminal, the frames come one after another,
@@ -75,7 +75,7 @@ def command(
       dualtaxi play @latest
       dualtaxi play k3v9m2xq --eval 3000:7 --speed 10
       dualtaxi play k3v9m2xq --episode 0 | less
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     if episode is not None and trial is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
     from runner.cli.episode import Episode

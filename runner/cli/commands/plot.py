@@ -24,7 +24,7 @@ from runner.cli.output import say
 @click.option("--force", is_flag=True, help="Replace the file if it exists.")
 @recordings_option
 def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: Path | None) -> None:
-    r"""Draw every metric of one or several runs over episodes, in one figure.
+    """Draw every metric of one or several runs over episodes, in one figure.
 
     Runs that differ in nothing but the seed are drawn as one line, their median, with a band from the
     lowest to the highest. The name of several runs stands for all of them.
@@ -33,7 +33,7 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     Examples:
       dualtaxi plot @latest
       dualtaxi plot cooperative competitive -o comparison.pdf
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     from runner.export.plots import groups_of, panels_of, read_series
     from runner.export.plots_figure import check_suffix, matplotlib_of, save_figure
     from runner.export.report_runs import find_runs, shortcomings, state_of, write_new

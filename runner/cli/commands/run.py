@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
 
 @click.command("run")
 @config_argument
-@click.option("--seed", type=click.IntRange(0, 2**64 - 1), metavar="N", help="The seed, or the only one.")
+@click.option("--seed", type=click.IntRange(0), metavar="N", help="The seed, instead of the configuration's.")
 @set_option
 @click.option("--name", help="What the run is called.  [default: the configuration's name]")
 @recordings_option
@@ -38,7 +38,7 @@ def command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    r"""Train, evaluate and record the experiment in the file CONFIG.
+    """Train, evaluate and record the experiment in the file CONFIG.
 
     Every step goes into a recording of its own folder. Several seeds make one run each, one after the
     other. Ctrl-C ends a run properly: what it recorded is kept; a second Ctrl-C kills it.
@@ -53,7 +53,7 @@ def command(
       dualtaxi run configs/quick.yaml
       dualtaxi run configs/cooperative.yaml --seed 7 --set discount=0.9 --name patient
       dualtaxi run configs/quick.yaml --set 'seeds={count: 3}' --json
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     from runner.api import checked_name, experiment_of
     from runner.job import jobs_of
     from runner.runs import recordings_folder

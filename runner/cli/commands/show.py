@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @recordings_option
 @json_option
 def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
-    r"""Tell all about a run: what it is, its evaluations, its tables, configuration and provenance.
+    """Tell all about a run: what it is, its evaluations, its tables, configuration and provenance.
 
     With --json also the whole series: under `eval` an object for each evaluation, with the training
     episodes before it, finish_percent, mean_length, mean_penalties and the count of every event; under
@@ -33,7 +33,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     Examples:
       dualtaxi show @latest
       dualtaxi show k3v9m2xq --json
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     run = find(run_name, recordings)
     if not run.recording.is_file():
         told = _without_recording(run)

@@ -19,11 +19,18 @@ ROWS_AT_ONCE = 50_000
 
 
 @click.command("table")
-@click.option("--env", "env_id", default="dualtaxi:DualTaxi-v1", show_default=True, metavar="ID")
+@click.option(
+    "--env",
+    "env_id",
+    default="dualtaxi:DualTaxi-v1",
+    show_default=True,
+    metavar="ID",
+    help="Gymnasium's id of the environment; before a colon, the module to import for it.",
+)
 @set_option
 @json_option
 def command(env_id: str, overrides: tuple[str, ...], as_json: bool) -> None:
-    r"""Print an environment's transition table in words, as CSV.
+    """Print an environment's transition table in words, as CSV.
 
     A row for each state, action and outcome that can happen: state, action, probability, next_state,
     reward, is_over. With --set mode=competitive also the reward of each agent. With --json: a line for
@@ -34,7 +41,7 @@ def command(env_id: str, overrides: tuple[str, ...], as_json: bool) -> None:
       dualtaxi table | head
       dualtaxi table --set env.kwargs.slip=0.1 > slippery.csv
       dualtaxi table --env FrozenLake-v1 --set env.kwargs.is_slippery=false
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     from runner.config import from_mapping
     from runner.frames import transition_columns
     from runner.mdp import load_mdp

@@ -1,0 +1,70 @@
+"""What the tests of the command line share: a way to call it, and a recordings folder with a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+import runner
+from runner.cli import cli
+from runner.runs import Run
+
+TINY = """\
+name: tiny
+mode: competitive
+env: {id: "dualtaxi:DualTaxi-v1", kwargs: {max_episode_steps: 40}}
+episodes: 30
+seed: 3
+evaluation: {every: 10, trials: 5}
+log: {every_steps: 200, window: 100}
+"""
+"""Done in a blink: 30 episodes of at most 40 steps, evaluations after 0, 10, 20 and 30."""
+
+
+class Command:
+    """The command line, called in this process; with the folder of runs that it is to use."""
+
+    def __init__(self, recordings: Path) -> None:
+        self.recordings = recordings
+
+    def __call__(self, *words: object, **kwargs: object) -> Result:
+        return CliRunner().invoke(
+            cli, [str(word) for word in words], env={"DUALTAXI_RECORDINGS": str(self.recordings)}, **kwargs
+        )
+
+    def json(self, *words: object) -> object:
+        """Return what a command prints with --json."""
+        result = self(*words, "--json")
+        assert result.exit_code == 0, result.output
+        return json.loads(result.stdout)
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    """The file of a tiny experiment."""
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY)
+    return path
+
+
+@pytest.fixture
+def command(tmp_path: Path) -> Command:
+    """The command line with an empty recordings folder."""
+    return Command(tmp_path / "recordings")
+
+
+@pytest.fixture(scope="session")
+def recorded_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A finished run of the tiny experiment, alone in its recordings folder; not to be changed."""
+    folder = tmp_path_factory.mktemp("recorded")
+    (folder / "tiny.yaml").write_text(TINY)
+    return runner.run(folder / "tiny.yaml", recordings=folder / "recordings")
+
+
+@pytest.fixture
+def recorded(recorded_run: Run) -> Command:
+    """The command line with the folder of the recorded run."""
+    return Command(recorded_run.folder.parent)

@@ -1,0 +1,135 @@
+"""Help is complete, true and quick."""
+
+import importlib
+import inspect
+import pkgutil
+import shlex
+import subprocess
+import sys
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from runner.cli import COMMANDS, cli, commands
+
+HEAVY = {"numpy", "numba", "gymnasium", "pydantic", "rich", "yaml", "mcap", "google", "blake3", "psutil"}
+
+
+def _walk(group, path=()):
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        yield (*path, name), command
+        if isinstance(command, click.Group):
+            yield from _walk(command, (*path, name))
+
+
+EVERY = list(_walk(cli))
+NAMES = [" ".join(path) for path, _ in EVERY]
+
+
+@pytest.mark.parametrize(("path", "command"), EVERY, ids=NAMES)
+def test_every_command_tells_what_it_does_with_an_example(path, command):
+    text = CliRunner().invoke(cli, [*path, "--help"]).stdout
+    assert "Example" in text
+    assert f"dualtaxi {' '.join(path)}" in text
+    assert command.name == path[-1]
+
+
+@pytest.mark.parametrize(("path", "command"), EVERY, ids=NAMES)
+def test_every_option_is_explained(path, command):
+    for parameter in command.params:
+        if isinstance(parameter, click.Option) and parameter.name != "help":
+            assert parameter.help, parameter.name
+
+
+def _examples():
+    for path, command in EVERY:
+        for line in inspect.cleandoc(command.help or "").splitlines():
+            words = (
+                shlex.split(line.split("|")[0].split(">")[0].strip().split("   ")[0])
+                if "dualtaxi" in line
+                else []
+            )
+            if words[:1] == ["dualtaxi"]:
+                yield pytest.param(words[1:], id=" ".join(path) + ": " + line.strip())
+
+
+@pytest.mark.parametrize("words", list(_examples()))
+def test_examples_can_be_typed(words):
+    command = cli
+    while isinstance(command, click.Group):
+        name, *words = words
+        command = command.get_command(click.Context(command), name)
+        assert command is not None, name
+    command.make_context(name, list(words))
+
+
+def test_the_table_of_commands_names_every_module():
+    modules = {f"{commands.__name__}.{found.name}" for found in pkgutil.iter_modules(commands.__path__)}
+    listed = {name: module for section in COMMANDS.values() for name, (module, _) in section.items()}
+    assert set(listed.values()) == modules
+    for name, module in listed.items():
+        assert importlib.import_module(module).command.name == name
+
+
+def test_the_table_of_commands_is_what_help_shows():
+    text = CliRunner().invoke(cli, ["--help"], terminal_width=100).stdout
+    for title, section in COMMANDS.items():
+        assert f"\n{title}:\n" in text
+        for name, (_, told) in section.items():
+            assert told.endswith(".")
+            assert any(line.split() == [name, *told.split()] for line in text.splitlines())
+
+
+def test_help_tells_the_exit_codes_and_the_folder():
+    text = CliRunner().invoke(cli, ["--help"]).stdout
+    for told in ("130", "interrupted", "wrong usage", "DUALTAXI_RECORDINGS", "@latest", "NO_COLOR"):
+        assert told in text
+
+
+def test_an_unknown_command_is_refused_with_the_nearest():
+    result = CliRunner().invoke(cli, ["shwo"])
+    assert result.exit_code == 2
+    assert "Did you mean 'show'?" in result.stderr
+
+
+def test_version():
+    result = CliRunner().invoke(cli, ["--version"])
+    assert result.stdout.startswith("dualtaxi ")
+
+
+def _imported(*words):
+    """Return the outermost packages that a command imports."""
+    program = (
+        "import sys\nfrom runner.cli import main\nsys.argv = ['dualtaxi', *sys.argv[1:]]\n"
+        "try:\n    main()\nfinally:\n"
+        "    print(*{name.partition('.')[0] for name in sys.modules}, file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *map(str, words)], capture_output=True, text=True, check=True
+    )
+    return set(done.stderr.splitlines()[-1].split())
+
+
+@pytest.mark.parametrize("word", ["--help", "--version"])
+def test_help_imports_nothing_heavy(word):
+    assert not _imported(word) & HEAVY
+
+
+@pytest.mark.parametrize("name", ["run", "ls", "show", "play", "table", "config", "completion"])
+def test_the_help_of_a_command_imports_nothing_heavy(name):
+    assert not _imported(name, "--help") & HEAVY
+
+
+def test_listing_runs_imports_little(recorded):
+    assert not _imported("ls", "--recordings", recorded.recordings) & (HEAVY - {"rich", "psutil"})
+    assert not _imported("ls", "--json", "--recordings", recorded.recordings) & HEAVY
+
+
+def test_the_module_can_be_run():
+    done = subprocess.run(
+        [sys.executable, "-m", "runner", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith("dualtaxi ")

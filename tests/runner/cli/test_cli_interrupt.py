@@ -1,0 +1,138 @@
+"""A run that is told to stop ends properly."""
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import runner
+from runner.api import interruptible, unless_empty
+from runner.runs import create_run, list_runs
+
+LONG = ("--set", "episodes=100000000", "--set", "evaluation=null")
+
+posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals to send")
+
+
+def _heeding():
+    """Undo what a shell does to the background: there SIGINT is ignored."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _while_it_trains(recordings: Path, process: subprocess.Popen[str]) -> None:
+    """Wait until the recording has grown."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and process.poll() is None:
+        if any(
+            run.recording.is_file() and run.recording.stat().st_size > 1_000_000
+            for run in list_runs(recordings)
+        ):
+            return
+        time.sleep(0.02)
+    pytest.fail(f"it never trained: {process.communicate()}")
+
+
+@posix
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_run_properly(tiny, tmp_path, number):
+    recordings = tmp_path / "recordings"
+    words = ["run", str(tiny), *LONG, "--recordings", str(recordings), "--json"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "runner", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=_heeding,  # noqa: PLW1509 - no threads here
+    )
+    _while_it_trains(recordings, process)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+
+    told = json.loads(out)
+    (run,) = list_runs(recordings)
+    assert process.returncode == 130, err
+    assert "Interrupted: " in err
+    assert str(run.recording) in err
+    assert "Traceback" not in err
+    assert run.status == told["status"] == "interrupted"
+    with runner.open_recording(run.recording) as recording:
+        assert recording.finished
+        assert recording.result["content_digest"] == told["content_digest"]
+        assert len(recording.episodes("train")) == told["episodes"] > 0
+
+
+class Interrupting:
+    """A report that sends its own process a signal, once."""
+
+    def __init__(self, number: int) -> None:
+        self.number: int | None = number
+
+    def __call__(self, _progress: object) -> None:
+        if self.number is not None:
+            number, self.number = self.number, None
+            signal.raise_signal(number)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_from_python_it_raises_when_the_file_is_closed(tiny, tmp_path, number):
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with pytest.raises(KeyboardInterrupt, match="was interrupted; what it recorded is in"):
+        runner.run(tiny, overrides=LONG[1::2], recordings=tmp_path / "runs", report=Interrupting(number))
+    (run,) = list_runs(tmp_path / "runs")
+    assert run.status == "interrupted"
+    assert run.summary["content_digest"]
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_beside_the_main_thread_signals_are_left_alone(tiny, tmp_path):
+    found = []
+    before = signal.getsignal(signal.SIGINT)
+
+    def work():
+        report = lambda _: found.append(signal.getsignal(signal.SIGINT))  # noqa: E731
+        found.append(runner.run(tiny, recordings=tmp_path / "runs", report=report).status)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found[-1] == "finished"
+    assert set(found[:-1]) == {before}
+
+
+def test_the_second_signal_is_not_caught():
+    came = []
+    with interruptible(second=lambda number, _: came.append(number)) as interrupt:
+        assert not interrupt()
+        signal.raise_signal(signal.SIGINT)
+        assert interrupt()
+        assert came == []
+        signal.raise_signal(signal.SIGTERM)
+    assert came == [signal.SIGTERM]
+
+
+def test_the_second_signal_is_what_it_was_unless_told():
+    with interruptible():
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_only_an_empty_run_is_removed(tiny, tmp_path, recorded):
+    run = create_run(tmp_path / "runs", runner.api.experiment_of(tiny), 3)
+    if recorded:
+        run.recording.write_bytes(b"something")
+
+    def fail():
+        with unless_empty(run):
+            raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError) as caught:
+        fail()
+    assert run.folder.exists() == recorded
+    assert bool(getattr(caught.value, "__notes__", [])) != recorded

@@ -1,0 +1,167 @@
+"""`dualtaxi run`."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from runner.cli import estimate
+from runner.cli.commands import run as run_command
+from runner.runs import list_runs
+
+BESIDES = {"name", "seed", "status", "episodes"}
+PROMISED = {
+    "run_id",
+    "path",
+    "content_digest",
+    "train_steps",
+    "eval_steps",
+    "seconds",
+    "bytes",
+    "last_evaluation",
+}
+
+
+def test_json_is_a_line_for_each_run(command, tiny):
+    result = command("run", tiny, "--set", "seeds=[1, 2]", "--json")
+    assert result.exit_code == 0
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [line["seed"] for line in lines] == [1, 2]
+    for line in lines:
+        assert line.keys() == PROMISED | BESIDES
+        assert line["last_evaluation"].keys() == {
+            "episode",
+            "finish_percent",
+            "mean_length",
+            "mean_penalties",
+        }
+        assert line["status"] == "finished"
+        assert line["bytes"] > 1000
+        assert line["path"].endswith("recording.mcap")
+    assert lines[0]["content_digest"] != lines[1]["content_digest"]
+
+
+def test_the_same_seed_gives_the_same_digest_and_another_id(command, tiny):
+    first, second = (command.json("run", tiny, "--seed", 5) for _ in range(2))
+    assert first["content_digest"] == second["content_digest"]
+    assert first["run_id"] != second["run_id"]
+    assert [run.name for run in list_runs(command.recordings)] == ["tiny", "tiny"]
+
+
+def test_the_summary_says_what_came_of_it_and_what_to_type_next(command, tiny):
+    result = command("run", tiny, "--name", "mine")
+    (run,) = list_runs(command.recordings)
+    assert result.exit_code == 0
+    assert run.name == "mine"
+    assert run.summary["content_digest"] in result.stdout
+    assert f"dualtaxi show {run.run_id}" in result.stdout
+    assert f"dualtaxi play {run.run_id} --eval 30:0" in result.stdout
+    assert "drop-off" in result.stdout
+    assert "\x1b" not in result.output
+    assert all(line == line.rstrip() for line in result.stdout.splitlines())
+
+
+def test_what_it_tells_to_type_next_works(command, tiny):
+    result = command("run", tiny)
+    for line in result.stdout.splitlines():
+        if "dualtaxi " in line:
+            assert command(*line.partition("dualtaxi ")[2].split()).exit_code == 0
+
+
+def test_the_estimate_comes_first_and_on_stderr(command, tiny):
+    result = command("run", tiny, "--json")
+    assert result.stderr.startswith("30 episodes: about ")
+    assert "at most 2,000," in result.stderr  # (30 episodes + 4 * 5 trials) * 40 steps
+    assert len(result.stdout.splitlines()) == 1
+
+
+def test_a_small_disk_is_warned_of_where_nobody_answers(command, tiny, monkeypatch):
+    monkeypatch.setattr(estimate, "free_bytes", lambda _: 1000)
+    result = command("run", tiny, "--json")
+    assert result.exit_code == 0
+    assert "1.0 kB left" in result.stderr
+
+
+@pytest.mark.parametrize(("answer", "code", "runs"), [("n\n", 1, 0), ("y\n", 0, 1)])
+def test_a_small_disk_is_asked_about_on_a_terminal(command, tiny, monkeypatch, answer, code, runs):
+    monkeypatch.setattr(estimate, "free_bytes", lambda _: 1000)
+    monkeypatch.setattr(run_command, "_someone_answers", lambda: True)
+    result = command("run", tiny, "--json", input=answer)
+    assert result.exit_code == code
+    assert len(list_runs(command.recordings)) == runs
+    assert "Go on?" in result.stderr
+
+
+def test_a_bad_configuration_is_told_line_by_line(command, tiny):
+    result = command("run", tiny, "--set", "episodez=3", "--set", "epsilon=2")
+    assert result.exit_code == 2
+    assert "--set epsilon=2: epsilon: found 2" in result.stderr
+    assert "Did you mean 'episodes'?" in result.stderr
+    assert not command.recordings.exists()
+
+
+@pytest.mark.parametrize(
+    ("env", "told"),
+    [
+        ("Nothing-v1", "Gymnasium knows no such id"),
+        ("CartPole-v1", "no transition table"),
+        ("nowhere:Nothing-v1", "no module"),
+    ],
+)
+def test_an_unusable_environment_leaves_no_half_run(command, tiny, env, told):
+    result = command("run", tiny, "--set", f"env={{id: '{env}'}}", "--set", "mode=cooperative")
+    assert result.exit_code == 2
+    assert told in result.stderr
+    assert "Nothing was recorded; the empty run" in result.stderr
+    assert list(command.recordings.iterdir()) == []
+
+
+def test_a_name_that_cannot_be_one_is_refused(command, tiny):
+    result = command("run", tiny, "--name", "a b")
+    assert result.exit_code == 2
+    assert "name: found 'a b'" in result.stderr
+    assert not command.recordings.exists()
+
+
+def test_a_folder_that_cannot_be_written(command, tiny, tmp_path):
+    command.recordings = tmp_path / "tiny.yaml"
+    result = command("run", tiny)
+    assert result.exit_code == 1
+    assert "cannot be written" in result.stderr
+    assert "--recordings" in result.stderr
+
+
+@pytest.mark.parametrize("seed", ["-1", "x", 2**64])
+def test_a_seed_that_is_none(command, tiny, seed):
+    assert command("run", tiny, "--seed", seed).exit_code == 2
+
+
+def test_without_evaluation(command, tiny):
+    told = command.json("run", tiny, "--set", "evaluation=null")
+    assert told["last_evaluation"] is None
+    assert told["eval_steps"] == 0
+    result = command("run", tiny, "--set", "evaluation=null")
+    assert "--episode 0" in result.stdout
+
+
+def test_where_success_is_unknown_it_is_null(command, tiny):
+    words = ("run", tiny, "--set", "env={id: FrozenLake-v1}", "--set", "mode=cooperative")
+    assert command.json(*words)["last_evaluation"]["finish_percent"] is None
+    assert "–" in command(*words).stdout
+
+
+def test_a_run_stands_on_disk_before_anything_heavy_is_imported(tiny, tmp_path):
+    program = (
+        "import sys\nimport runner.runs as runs\nmake = runs.create_run\n"
+        "def spy(*args):\n    run = make(*args)\n    assert (run.folder / 'run.json').is_file()\n"
+        "    print(*sys.modules, file=sys.stderr)\n    sys.exit(5)\n"
+        "runs.create_run = spy\nfrom runner.cli import main\n"
+        "sys.argv = ['dualtaxi', *sys.argv[1:]]\nmain()"
+    )
+    words = ["run", str(tiny), "--recordings", str(tmp_path / "recordings")]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 5, done.stderr
+    assert not {"numpy", "numba", "gymnasium", "rich"} & set(done.stderr.split())
