@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.config.values import plain
 from runner.errors import EnvironmentNotUsable, nearest
 
 MAX_EVENTS = 31
@@ -158,7 +159,7 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
     joint = transitions["next_state"].shape[1]
     mdp = Mdp(
         env_id=env_id,
-        kwargs=dict(kwargs),
+        kwargs=plain(kwargs),
         **transitions,
         start=np.ascontiguousarray(base.initial_state_distrib, dtype=np.float64),
         step_limit=int(limit or 0),

@@ -69,6 +69,11 @@ class TableReplay:
             kernel.replay(*self._state, block.view(np.recarray), _NO_ROWS)
         self.step = step
 
+    def rewind(self, step: int, tables: list[NDArray[np.float64]]) -> None:
+        """Go back to a step at which the tables were these."""
+        self._learner.set_tables(tables)
+        self.step = step
+
     def rows(self, stop: int) -> NDArray[np.float64]:
         """Replay up to a step, and return what the learners saw on the way.
 

@@ -38,7 +38,7 @@ class Learner:
         self.rules = rules_of(config)
         _check_fit(config, mdp, self.model)
         self.tables = _tables(self.model, mdp.states)
-        self._fill_tables(initial)
+        self.set_tables(initial)
         log = config.log
         self._tally = _tally(self.model, log.window if log else 1, log.episodes if log else 50)
         self._eval_tally = _tally(self.model, 1, 1)
@@ -149,7 +149,8 @@ class Learner:
         if self._success.any():
             episodes["success"] = episodes["events"][:, self._success].any(axis=1)
 
-    def _fill_tables(self, initial: list[NDArray[np.float64]] | None) -> None:
+    def set_tables(self, initial: list[NDArray[np.float64]] | None) -> None:
+        """Set the tables, one [S, width] a learner; None for those that the configuration begins with."""
         start = self.config.initial_q
         if initial is not None:
             self.tables.q[:] = np.concatenate([table.reshape(-1) for table in initial])

@@ -1,0 +1,155 @@
+"""What differs between two runs: one object, which text, JSON, Markdown and HTML are made of.
+
+with open_recording(path_a) as a, open_recording(path_b) as b:
+difference = diff(a, b)
+print(difference.parting, difference.cause)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from runner.analysis.diff.causes import Cause, Update, cause_of
+from runner.analysis.diff.metrics import MetricDiff, metric_diffs
+from runner.analysis.diff.settings import (
+    Change,
+    EnvironmentDiff,
+    TransitionChange,
+    changes_in,
+    environment_diff,
+)
+from runner.analysis.diff.tables import Cell, TableDiff, table_diffs
+from runner.analysis.diff.trajectory import (
+    Overlap,
+    Parting,
+    evaluation_partings,
+    training_overlap,
+    training_parting,
+    visits,
+)
+from runner.recording import schema
+from runner.recording.reader import Recording
+
+__all__ = [
+    "Cause",
+    "Cell",
+    "Change",
+    "EnvironmentDiff",
+    "MetricDiff",
+    "Overlap",
+    "Parting",
+    "RunDiff",
+    "TableDiff",
+    "TransitionChange",
+    "Update",
+    "diff",
+]
+
+NOT_CONTENT = ("name", "recording")
+"""Keys of the configuration whose difference alone leaves the content the same."""
+
+
+@dataclass(frozen=True)
+class RunDiff:
+    """Everything in which two runs differ; `a` and `b` say who they are."""
+
+    a: dict[str, Any]
+    b: dict[str, Any]
+    same_content: bool
+    """Whether both are finished and have the same content digest."""
+    config: list[Change]
+    provenance: list[Change]
+    environment: EnvironmentDiff
+    parting: Parting | None = None
+    cause: Cause | None = None
+    overlap: Overlap | None = None
+    evaluations: list[tuple[Parting, Cause]] = field(default_factory=list)
+    """For each evaluation that parts: where, and why."""
+    tables: list[TableDiff] = field(default_factory=list)
+    metrics: list[MetricDiff] = field(default_factory=list)
+    costs: list[Change] = field(default_factory=list)
+    """Steps, time and size."""
+    notes: list[str] = field(default_factory=list)
+    """What could not be compared, and why."""
+
+
+def diff(
+    a: Recording, b: Recording, targets: Mapping[str, float] | None = None, first: bool = False
+) -> RunDiff:
+    """Return in what two runs differ.
+
+    Args:
+        a: one run, finished or not.
+        b: another.
+        targets: metric to a level, whose first crossing is to be told.
+        first: only settings, and the first step of training at which they part.
+    """
+    digests = [recording.result.get("content_digest") for recording in (a, b)]
+    same = digests[0] is not None and digests[0] == digests[1]
+    notes = _notes(a, b)
+    facts: dict[str, Any] = {
+        "a": _who(a),
+        "b": _who(b),
+        "same_content": same,
+        "config": changes_in(_settings(a), _settings(b)),
+        "provenance": changes_in(a.provenance, b.provenance),
+        "environment": environment_diff(a.mdp, b.mdp),
+        "costs": changes_in(_costs(a), _costs(b)),
+        "notes": notes,
+    }
+    if same:
+        return RunDiff(**facts)
+    with_steps = all(recording.count(schema.TRAIN_STEP) for recording in (a, b))
+    comparable = a.mdp.next_state.shape[:2] == b.mdp.next_state.shape[:2]
+    if with_steps and comparable:
+        parting = training_parting(a, b)
+        facts["parting"] = parting
+        facts["cause"] = parting and cause_of(parting, a, b)
+        if first:
+            return RunDiff(**facts)
+        facts["overlap"] = training_overlap(a, b)
+        facts["evaluations"] = [(part, cause_of(part, a, b)) for part in evaluation_partings(a, b)[:1]]
+    if first:
+        return RunDiff(**facts)
+    seen = visits(a) + visits(b) if with_steps and comparable else None
+    facts["tables"] = list(table_diffs(a, b, seen)) if comparable else []
+    facts["metrics"] = metric_diffs(a, b, targets or {})
+    return RunDiff(**facts)
+
+
+def _who(recording: Recording) -> dict[str, Any]:
+    run = recording.run
+    status = recording.result.get("status", "interrupted")
+    return {"run_id": run["run_id"], "name": run["name"], "seed": int(run["seed"]), "status": status}
+
+
+def _settings(recording: Recording) -> dict[str, Any]:
+    """Return the configuration with the run's own seed instead of the list."""
+    settings = {key: value for key, value in recording.config.items() if key != "seeds"}
+    return settings | {"seed": int(recording.run["seed"])}
+
+
+def _costs(recording: Recording) -> dict[str, Any]:
+    return {
+        "train_steps": recording.count(schema.TRAIN_STEP),
+        "eval_steps": recording.count(schema.EVAL_STEP),
+        "episodes": recording.count(schema.TRAIN_EPISODE),
+        "bytes": recording.size,
+    }
+
+
+def _notes(a: Recording, b: Recording) -> list[str]:
+    notes = []
+    for name, recording in (("A", a), ("B", b)):
+        if recording.result.get("status") != "finished":
+            notes.append(f"{name} is not finished: compared as far as it got")
+        if not recording.count(schema.TRAIN_STEP):
+            again = f"`dualtaxi rerecord {recording.run['run_id']}` records them"
+            notes.append(f"{name} holds no steps, so no trajectory is compared; {again}")
+    if a.mdp.next_state.shape[:2] != b.mdp.next_state.shape[:2]:
+        notes.append("the environments have other states or actions: neither steps nor tables are compared")
+    elif a.run["learners"] != b.run["learners"]:
+        notes.append("other modes: rewards are compared summed, and Q-tables not at all")
+    return notes

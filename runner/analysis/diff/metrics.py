@@ -1,0 +1,92 @@
+"""How two runs' curves differ: at the end, in area, and when each first reaches a level."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from runner.recording.reader import Recording
+
+SERIES = {
+    "finish_percent": "finish_percent",
+    "mean_length": "eval_mean_length",
+    "mean_penalties": "mean_penalties",
+    "training_length": "mean_length",
+}
+"""A metric's name to the field of an evaluation."""
+
+
+@dataclass(frozen=True)
+class MetricDiff:
+    """One metric of two runs, over training episodes."""
+
+    name: str
+    episodes: list[int]
+    """Episodes at which both have a value."""
+    a: list[float]
+    b: list[float]
+    end_a: float
+    """The last value of all, also where the other has none."""
+    end_b: float
+    area: float
+    """Area between the curves by the trapezoid rule, over the episodes both have, by their span: a mean
+    difference b - a."""
+    crossings: dict[str, tuple[int | None, int | None]] = field(default_factory=dict)
+    """Level asked for, as text, to the episodes at which a and b first reach it."""
+
+    @property
+    def same(self) -> bool:
+        """Whether both curves are the same."""
+        return self.a == self.b and self.end_a == self.end_b
+
+
+def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> list[MetricDiff]:
+    """Return how each metric of the evaluations differs.
+
+    Args:
+        a: one run.
+        b: another.
+        targets: metric to a level, whose first crossing is to be told.
+    """
+    left, right = a.metrics("eval"), b.metrics("eval")
+    if not left or not right:
+        return []
+    values = [_values(left), _values(right)]
+    names = [name for name in values[0] if name in values[1]]
+    return [_metric_diff(name, values[0][name], values[1][name], targets.get(name)) for name in names]
+
+
+def _values(evaluations: list[dict[str, Any]]) -> dict[str, dict[int, float]]:
+    """Return metric to episode to value; what is unknown (nan) is left out."""
+    table: dict[str, dict[int, float]] = {}
+    for metrics in evaluations:
+        plain = {name: metrics[key] for name, key in SERIES.items()}
+        several = {f"percent_filled[{i}]": value for i, value in enumerate(metrics["percent_filled"])} | {
+            f"mean_return[{i}]": value for i, value in enumerate(metrics["mean_returns"])
+        }
+        for name, value in (plain | several).items():
+            if not math.isnan(value):
+                table.setdefault(name, {})[int(metrics["episode"])] = float(value)
+    return table
+
+
+def _metric_diff(name: str, a: dict[int, float], b: dict[int, float], level: float | None) -> MetricDiff:
+    episodes = sorted(a.keys() & b.keys())
+    left, right = [a[e] for e in episodes], [b[e] for e in episodes]
+    span = episodes[-1] - episodes[0] if len(episodes) > 1 else 0
+    area = float(np.trapezoid(np.subtract(right, left), episodes)) / span if span else math.nan
+    crossings = {} if level is None else {f"{level:g}": (_crossing(a, level), _crossing(b, level))}
+    return MetricDiff(name, episodes, left, right, a[max(a)], b[max(b)], area, crossings)
+
+
+def _crossing(values: dict[int, float], level: float) -> int | None:
+    """Return the first episode at which a curve is on the other side of a level than at its beginning."""
+    first = values[min(values)]
+    for episode in sorted(values):
+        if values[episode] >= level if first < level else values[episode] <= level:
+            return episode
+    return None

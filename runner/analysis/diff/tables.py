@@ -1,0 +1,101 @@
+"""How far apart two runs' Q-tables are, at the moments of which both have a snapshot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.mdp import Mdp
+from runner.recording.messages import QTable
+from runner.recording.reader import Recording
+from runner.words import action_names, actions_in_words, states_in_words
+
+LARGEST = 5
+"""How many cells with the largest differences are named."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a table, in words, and its value in both runs."""
+
+    state: str
+    action: str
+    a: float
+    b: float
+
+
+@dataclass(frozen=True)
+class TableDiff:
+    """Two runs' tables of one agent after the same number of training episodes."""
+
+    episode: int
+    agent: str
+    largest: float
+    mean: float
+    """Mean of the absolute difference over all cells."""
+    greedy_share: float
+    """Share of the states in which the greedy action differs."""
+    greedy_share_visited: float
+    """The same, each state weighted by its visits in both runs' training; nan without steps."""
+    cells: list[Cell]
+    """Where the difference is largest."""
+
+
+def table_diffs(a: Recording, b: Recording, visits: NDArray[np.int64] | None) -> Iterator[TableDiff]:
+    """Yield the differences of the tables that both runs have snapshots of.
+
+    Args:
+        a: one run.
+        b: another, whose tables have the same shape.
+        visits: how often each state was acted in, [S], both runs together.
+    """
+    theirs = _by_moment(b)
+    for left in a.snapshots():
+        right = next((table for table in theirs if _moment(table) >= _moment(left)), None)
+        if right is not None and _moment(right) == _moment(left) and right.values.shape == left.values.shape:
+            yield _table_diff(a.mdp, left, right, visits)
+
+
+def _moment(table: QTable) -> tuple[int, int]:
+    return table.episode, table.table
+
+
+def _by_moment(recording: Recording) -> Iterator[QTable]:
+    return recording.snapshots()
+
+
+def _table_diff(mdp: Mdp, a: QTable, b: QTable, visits: NDArray[np.int64] | None) -> TableDiff:
+    apart = np.abs(a.values - b.values)
+    other = a.values.argmax(axis=1) != b.values.argmax(axis=1)
+    weights = visits if visits is not None and visits.sum() else None
+    return TableDiff(
+        episode=a.episode,
+        agent=a.agent,
+        largest=float(apart.max()),
+        mean=float(apart.mean()),
+        greedy_share=float(other.mean()),
+        greedy_share_visited=float("nan") if weights is None else float(other @ weights / weights.sum()),
+        cells=_largest_cells(mdp, a, b, apart),
+    )
+
+
+def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: NDArray[np.float64]) -> list[Cell]:
+    order = np.argsort(-apart, axis=None, kind="stable")[:LARGEST]
+    states, actions = states_in_words(mdp), _own_actions(mdp, a)
+    cells = []
+    for flat in order.tolist():
+        s, j = divmod(flat, apart.shape[1])
+        if apart[s, j] > 0:
+            cells.append(Cell(str(states[s]), actions[j], float(a.values[s, j]), float(b.values[s, j])))
+    return cells
+
+
+def _own_actions(mdp: Mdp, table: QTable) -> list[str]:
+    """Return the words of a table's columns: joint actions, or one agent's."""
+    if table.values.shape[1] == mdp.joint_actions:
+        return [str(words) for words in actions_in_words(mdp)]
+    names = action_names(mdp)
+    return names[table.table] if names else [f"action {j}" for j in range(table.values.shape[1])]
