@@ -36,6 +36,13 @@ _HEAD: Final = struct.Struct("<BQ")
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
 _OFFSET_ENTRY: Final = struct.Struct("<HQ")
+_EXPECTED: Final = frozenset(
+    {
+        *(Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK),
+        *(Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT),
+    }
+)
+"""What the data section has: behind anything else nothing can be believed."""
 _FOOTER_BYTES: Final = 9 + 20
 _TAIL_BYTES: Final = _FOOTER_BYTES + len(MCAP0_MAGIC)
 
@@ -158,7 +165,8 @@ def _from_records(stream: BinaryIO, path: str, size: int) -> Index:
     while offset + 9 <= size:
         stream.seek(offset)
         opcode, length = _HEAD.unpack(stream.read(9))
-        if offset + 9 + length > size or opcode in (Opcode.DATA_END, 0) or opcode > Opcode.DATA_END:
+        torn = offset + 9 + length > size
+        if torn or opcode not in _EXPECTED or (opcode == Opcode.MESSAGE_INDEX and not index.chunks):
             break
         _note(index, stream, path, opcode, offset, length)
         offset += 9 + length
@@ -173,7 +181,7 @@ def _note(index: Index, stream: BinaryIO, path: str, opcode: int, offset: int, l
             stream.read(_CHUNK_HEAD.size).ljust(_CHUNK_HEAD.size, b"\0")
         )
         index.chunks.append(ChunkEntry(offset, 9 + length, start, end, uncompressed, ()))
-    elif opcode == Opcode.MESSAGE_INDEX and index.chunks:
+    elif opcode == Opcode.MESSAGE_INDEX:
         (channel,) = struct.unpack("<H", stream.read(2).ljust(2, b"\0"))
         last = index.chunks[-1]
         index.chunks[-1] = ChunkEntry(
