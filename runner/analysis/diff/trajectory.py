@@ -109,8 +109,8 @@ def _differs(a: Block, b: Block, name: str) -> NDArray[np.bool_]:
         left, right = left != 0, right != 0
     if name == "rewards":
         left, right = (left.sum(1), right.sum(1)) if other_learners else (left, right)
-    differs: NDArray[np.bool_] = np.not_equal(left, right)
-    return differs.any(axis=1) if differs.ndim > 1 else differs
+    differs: NDArray[np.bool_] = np.not_equal(left, right).reshape(len(a), -1)
+    return np.asarray(differs.any(axis=1))
 
 
 def training_parting(a: Recording, b: Recording) -> Parting | None:
