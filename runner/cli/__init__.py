@@ -27,6 +27,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "show": ("runner.cli.commands.show", "Tell all about a run: evaluations, tables, configuration."),
         "play": ("runner.cli.commands.play", "Replay a recorded episode in the terminal."),
         "plot": ("runner.cli.commands.plot", "Draw every metric of one or several runs over episodes."),
+        "report": ("runner.cli.commands.report", "Write one self-contained page about one or several runs."),
         "table": ("runner.cli.commands.table", "Print an environment's transition table in words."),
     },
     "Set up": {

@@ -69,6 +69,7 @@ def matplotlib_of(purpose: str) -> Any:
     try:
         import matplotlib as mpl
         import matplotlib.figure
+        import matplotlib.layout_engine
     except ImportError as error:
         raise MissingExtra("matplotlib", "plots", purpose) from error
     return mpl
@@ -107,9 +108,10 @@ def draw_figure(groups: Sequence[Group], panels: Sequence[Panel]) -> Figure:
     head, foot = 0.55 + 0.19 * len(groups), 0.22
     height = head + 2.2 * rows + foot
     with mpl.rc_context(_STYLE):
-        figure: Figure = mpl.figure.Figure(figsize=(max(3.4 * columns, 6.8), height), layout="constrained")
-        figure.get_layout_engine().set(  # type: ignore[union-attr]
-            rect=(0, foot / height, 1, 1 - (head + foot) / height), h_pad=0.08, w_pad=0.08
+        room = (0, foot / height, 1, 1 - (head + foot) / height)
+        figure: Figure = mpl.figure.Figure(
+            figsize=(max(3.4 * columns, 6.8), height),
+            layout=mpl.layout_engine.ConstrainedLayoutEngine(rect=room, h_pad=0.08, w_pad=0.08),
         )
         grid = figure.add_gridspec(rows, columns)
         for number, panel in enumerate(narrow):
@@ -222,7 +224,7 @@ def _honest_axes(axes: Axes, panel: Panel) -> None:
 
     axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], integer=True))
     axes.xaxis.set_major_formatter(_number)
-    axes.yaxis.set_major_formatter(_number)
+    axes.yaxis.set_major_formatter(_brief_number)
     axes.set_xlim(left=0)
     if panel.percent:
         axes.set_ylim(0, 100 if panel.metric == SHARES else 103)
@@ -241,6 +243,11 @@ def _number(value: float, _: object = None) -> str:
     if abs(value) >= 1e6:
         return f"{value / 1e6:g}M"
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}".replace("-", "\N{MINUS SIGN}")
+
+
+def _brief_number(value: float, _: object = None) -> str:
+    """Return a number where there is little room: `20k`."""
+    return f"{value / 1e3:g}k" if 1e4 <= abs(value) < 1e6 else _number(value)
 
 
 def _has_legend(panel: Panel) -> bool:

@@ -1,0 +1,73 @@
+"""`dualtaxi report`: one self-contained page about runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.options import RunName, recordings_option
+from runner.cli.output import say, size
+
+
+@click.command("report")
+@click.argument("run_names", metavar="RUN...", type=RunName(), nargs=-1, required=True)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("report.html"),
+    show_default=True,
+    metavar="FILE",
+    help="Where to.",
+)
+@click.option(
+    "--episode",
+    "episodes",
+    type=click.IntRange(0),
+    multiple=True,
+    metavar="N",
+    help="Show this training episode too, counted from 0. May be repeated.",
+)
+@click.option(
+    "--eval",
+    "trials",
+    multiple=True,
+    metavar="N:TRIAL",
+    help="Show this trial of the evaluation after N training episodes too. May be repeated.",
+)
+@click.option("--force", is_flag=True, help="Replace the file if it exists.")
+@recordings_option
+def command(
+    run_names: tuple[str, ...],
+    output: Path,
+    episodes: tuple[int, ...],
+    trials: tuple[str, ...],
+    force: bool,
+    recordings: Path | None,
+) -> None:
+    r"""Write one self-contained page about one or several runs.
+
+    It has the plots, what was learned before, in the middle of and after training, all evaluations, the
+    configuration and provenance, and a replay of the best and the worst trial of the last evaluation and
+    of the first and the last training episode. It needs no network.
+
+    \b
+    Examples:
+      dualtaxi report @latest
+      dualtaxi report cooperative competitive -o comparison.html
+      dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
+    """
+    from runner.export.report import require_packages, write_report
+    from runner.export.report_runs import find_runs, parse_trial, write_new
+    from runner.runs import recordings_folder
+
+    require_packages()
+    chosen = [("train", number, 0) for number in episodes]
+    chosen += [("eval", *parse_trial(text)) for text in trials]
+    paths = [run.recording for run in find_runs(run_names, recordings_folder(recordings))]
+    said: list[str] = []
+    write_new(output, force, lambda path: said.extend(write_report(path, paths, chosen)))
+    for sentence in said:
+        say(sentence)
+    click.echo(f"{output}: {size(output.stat().st_size)}, {len(paths)} run{'s' if len(paths) > 1 else ''}")

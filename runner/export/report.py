@@ -1,0 +1,267 @@
+"""One self-contained page about one or several runs: what they were, how they learned, how they drive.
+
+The page needs no network: styles, script, plots and data are in it. All of it is read from the recordings.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from runner.errors import MissingExtra, RecordingError
+from runner.export import svg, svg_maps
+from runner.export.plots import Panel, RunSeries, groups_of, panels_of, read_series
+from runner.export.plots_figure import footnote, is_wide, matplotlib_of, panel_svg
+from runner.export.report_maps import MapRow, maps_of, stages_of
+from runner.export.report_replay import Episode, payload, ranked_trials, training_episode, trial
+from runner.export.report_runs import has_steps, shortcomings, state_of
+from runner.frames import agents_of, environment_of, evaluation_records
+from runner.recording import schema
+from runner.recording.reader import Recording, open_recording
+from runner.words import event_in_words, spoken
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+Choice = tuple[str, int, int]
+"""An episode to show: ("train", number, 0), or ("eval", training episodes before it, trial)."""
+
+TEMPLATES: Final = files("runner.export") / "templates"
+
+
+def write_report(path: Path, recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> list[str]:
+    """Write the page about these recordings, and return what is missing from it, a sentence each.
+
+    Args:
+        path: where to.
+        recordings: the MCAP files.
+        chosen: episodes to show beside those that are always there.
+
+    Raises:
+        MissingExtra: Jinja2 or Matplotlib is not installed.
+        RecordingError: a recording cannot be read, or has no such episode.
+        OSError: the page cannot be written.
+    """
+    page, said = render_report(recordings, chosen)
+    path.write_text(page, encoding="utf-8")
+    return said
+
+
+def require_packages() -> None:
+    """Refuse to begin where a package is missing that a report needs.
+
+    Raises:
+        MissingExtra: it is.
+    """
+    matplotlib_of("a report")
+    _templates()
+
+
+def render_report(recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> tuple[str, list[str]]:
+    """Return the page about these recordings, and what is missing from it; see `write_report`."""
+    require_packages()
+    series: list[RunSeries] = []
+    runs: list[dict[str, Any]] = []
+    for path in recordings:
+        with open_recording(path) as recording:
+            series.append(read_series(recording))
+            runs.append(_run(recording, len(runs), chosen))
+    page = (
+        _templates()
+        .get_template("report.html")
+        .render(
+            title=_title(runs),
+            runs=runs,
+            plots=_plots(series),
+            ramp=", ".join(svg_maps.RAMP),
+            style=(TEMPLATES / "report.css").read_text("utf-8") + svg.STYLE + svg_maps.STYLE,
+            dark=(TEMPLATES / "report_dark.css").read_text("utf-8"),
+            script=(TEMPLATES / "replay.js").read_text("utf-8"),
+        )
+    )
+    return page, [sentence for run in runs for sentence in run["notes"]]
+
+
+# --- one run ------------------------------------------------------------------------------------------
+
+
+def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[str, Any]:
+    """Return all that the page says of a run."""
+    evaluations = evaluation_records(recording)
+    environment = environment_of(recording)
+    episodes = _episodes(recording, evaluations, chosen)
+    drawing = None if environment["scene"] is None else svg.Drawing(environment["scene"])
+    return {
+        "number": number,
+        "id": recording.run["run_id"],
+        "name": recording.run["name"],
+        "seed": recording.run["seed"],
+        "state": state_of(recording),
+        "agents": [agent.replace("_", " ") for agent in environment["agents"]],
+        "learners": agents_of(recording),
+        "environment": environment,
+        "facts": _facts(recording),
+        "last": evaluations[-1] if evaluations else None,
+        "evaluations": evaluations,
+        "event_names": [_heading(name) for name in environment["event_names"]],
+        "config": _flat(recording.config),
+        "provenance": recording.provenance,
+        "notes": shortcomings(recording),
+        "maps": _maps(recording, episodes),
+        "replay": _replay(recording, episodes, drawing),
+    }
+
+
+def _facts(recording: Recording) -> dict[str, str]:
+    """Return what identifies a run and how much of it there is."""
+    digest = recording.result.get("content_digest")
+    counts = {
+        topic: recording.count(topic) for topic in (schema.TRAIN_EPISODE, schema.TRAIN_STEP, schema.EVAL_STEP)
+    }
+    config = recording.config
+    told = {
+        "Environment": config["env"]["id"],
+        "Algorithm": spoken(config["algorithm"]),
+        "Tables": f"{spoken(config['tables'])}, reward: {config['rewards']}",
+        "Training": f"{counts[schema.TRAIN_EPISODE]:,} of {config['episodes']:,} episodes, "
+        f"{counts[schema.TRAIN_STEP]:,} steps recorded",
+        "Evaluation": f"{counts[schema.EVAL_STEP]:,} steps recorded",
+        "Begun": recording.run["created"],
+        "Job": recording.run["job"],
+        "Content digest": digest or "none: it was interrupted",
+    }
+    return {key: str(value) for key, value in told.items()}
+
+
+def _episodes(
+    recording: Recording, evaluations: Sequence[dict[str, Any]], chosen: Sequence[Choice]
+) -> list[Episode]:
+    """Return the episodes that are shown: of the last evaluation, and the first and last of training."""
+    if not has_steps(recording):
+        return []
+    found: dict[str, Episode] = {}
+
+    def add(told: str, episode: Episode) -> None:
+        known = found.setdefault(episode.title, episode)
+        found[episode.title] = known.called(told)
+
+    for phase, number, of in chosen:
+        add(
+            "chosen",
+            training_episode(recording, number) if phase == "train" else trial(recording, number, of),
+        )
+    if evaluations and recording.count(schema.EVAL_STEP):
+        after = evaluations[-1]["episode"]
+        worst, typical, best = ranked_trials(recording, after)
+        add("typical trial", trial(recording, after, typical))
+        add("best trial", trial(recording, after, best))
+        add("worst trial", trial(recording, after, worst))
+    ended = recording.count(schema.TRAIN_EPISODE)
+    if recording.count(schema.TRAIN_STEP):
+        add("first of training", training_episode(recording, 0))
+        if ended > 1:
+            add("last of training", training_episode(recording, ended - 1))
+    return list(found.values())
+
+
+def _maps(recording: Recording, episodes: Sequence[Episode]) -> list[MapRow]:
+    """Return the maps, for the situation in which the first episode shown begins."""
+    mdp = recording.mdp
+    start = int(episodes[0].states[0]) if episodes else int(mdp.start.argmax())
+    try:
+        return maps_of(mdp, agents_of(recording), stages_of(recording), start)
+    except RecordingError:
+        return []
+
+
+def _replay(recording: Recording, episodes: list[Episode], drawing: svg.Drawing | None) -> dict[str, Any]:
+    """Return the replay's picture at the first frame, and its data."""
+    if not episodes:
+        return {}
+    mdp = recording.mdp
+    places = None if drawing is None else lambda states: drawing.places(mdp, states)
+    data = payload(recording, episodes, places)
+    picture = ""
+    if drawing is not None:
+        first = drawing.places(mdp, episodes[0].states[:1])
+        picture = drawing.frame(first[0], "The grid at the step shown below it", first, style="")
+    return {"data": _embedded(data | {"trail": svg.TRAIL}), "picture": picture, "episodes": data["episodes"]}
+
+
+# --- the page -----------------------------------------------------------------------------------------
+
+
+def _title(runs: Sequence[dict[str, Any]]) -> str:
+    if len(runs) == 1:
+        return f"{runs[0]['name']}, run {runs[0]['id']}"
+    names = list(dict.fromkeys(run["name"] for run in runs))
+    return f"{', '.join(names[:4])}{' and others' if len(names) > 4 else ''}: {len(runs)} runs"
+
+
+def _plots(series: Sequence[RunSeries]) -> dict[str, Any]:
+    """Return the panels as SVG, what their colours mean, and what lines and bands are."""
+    from runner.export.plots_figure import COLOURS
+
+    groups = groups_of(series)
+    try:
+        panels = panels_of(groups)
+    except RecordingError:
+        return {}
+    return {
+        "panels": [_panel(panel, len(groups)) for panel in panels],
+        "groups": [(COLOURS[i % len(COLOURS)], group.described) for i, group in enumerate(groups)],
+        "footnote": footnote(groups),
+    }
+
+
+def _panel(panel: Panel, groups: int) -> dict[str, Any]:
+    return {"svg": panel_svg(panel, groups), "wide": is_wide(panel), "title": panel.title}
+
+
+def _templates() -> Environment:
+    try:
+        import jinja2
+    except ImportError as error:
+        raise MissingExtra("jinja2", "plots", "a report") from error
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(lambda name: (TEMPLATES / name).read_text("utf-8")),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters["number"] = _number
+    return environment
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    """Return a number with digits after the point; a dash for what is unknown."""
+    return "–" if value is None or math.isnan(value) else f"{value:,.{digits}f}"
+
+
+def _heading(event: str) -> str:
+    """Return an event as the heading of a column, the agent on a line of its own."""
+    agent, dot, _ = event.rpartition(".")
+    words = event_in_words(event)
+    return f"{words[: len(agent)]}\n{words[len(agent) + 1 :]}" if dot else words
+
+
+def _embedded(data: Any) -> str:
+    """Return data as JSON that can stand inside a script element."""
+    text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, str]:
+    """Return a configuration as dotted keys and JSON values."""
+    flat: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, dict) and value:
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value if isinstance(value, str) else json.dumps(value)
+    return flat

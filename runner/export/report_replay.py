@@ -1,0 +1,277 @@
+"""One recorded episode as arrays: what replay, film and notebook show of it.
+
+Frame k is the state after k steps; with it go the step that led there and the Q-values of what is chosen
+there next. So an episode of T steps has T + 1 frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.analysis.tables import TableReplay, tables_at
+from runner.errors import RecordingError
+from runner.export.report_runs import require_steps
+from runner.frames import agents_of
+from runner.mdp import Mdp
+from runner.recording.reader import Recording
+from runner.words import action_names, actions_in_words, agent_actions, event_in_words, states_in_words
+
+MOST_STEPS: Final = 1000
+"""Steps of an episode that a page shows; the page says so where an episode has more."""
+MOST_VALUES: Final = 6
+"""Q-values of a state that a page shows: the highest, and that of the action taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """A recorded episode; arrays of its T shown steps, and of T + 1 states."""
+
+    title: str
+    phase: str
+    number: int
+    length: int
+    """Steps it has, of which T are here."""
+    ended: str
+    """How it ended: `success`, `terminated`, `truncated`, or `cut off` with the recording."""
+    states: NDArray[np.int64]
+    actions: NDArray[np.int64]
+    rewards: NDArray[np.float64]
+    """[T, learners]."""
+    events: NDArray[np.int64]
+    explored: NDArray[np.int64]
+    values: tuple[NDArray[np.float64], ...]
+    """For each learner the Q-values in the first T states, [T, actions]; none where they cannot be had."""
+    names: tuple[str, ...] = ()
+    """Why it is shown."""
+
+    @property
+    def steps(self) -> int:
+        """The steps that are here."""
+        return len(self.actions)
+
+    def called(self, name: str) -> Episode:
+        """Return it with one more name before its title: `best trial`."""
+        return replace(self, names=(*self.names, name))
+
+    @property
+    def heading(self) -> str:
+        """Its names and its title: `best trial: trial 3 of ...`."""
+        names = " and ".join(self.names)
+        text = f"{names}: {self.title}" if names else self.title
+        return text[0].upper() + text[1:]
+
+    @property
+    def description(self) -> str:
+        """Length, end and return in words."""
+        shown = "" if self.steps == self.length else f"; shown are the first {self.steps:,}"
+        words = {"success": "ended in success", "terminated": "ended", "truncated": "ended by the step limit"}
+        ended = words.get(self.ended, "cut off with the recording")
+        total = float(self.rewards.sum())
+        return f"{self.length:,} steps, {ended}{shown}. Rewards{' so far' if shown else ''} sum to {total:g}."
+
+
+def training_episode(recording: Recording, number: int, most: int = MOST_STEPS) -> Episode:
+    """Return a training episode, counted from 0, also one that never ended.
+
+    Raises:
+        RecordingError: there is no such episode, or no steps.
+    """
+    require_steps(recording)
+    title = f"training episode {number:,}"
+    return _episode(recording, "train", number, title, most)
+
+
+def trial(recording: Recording, after: int, number: int, most: int = MOST_STEPS) -> Episode:
+    """Return a trial, counted from 0, of the evaluation after so many training episodes.
+
+    Raises:
+        RecordingError: there is no such evaluation or trial, or no steps.
+    """
+    require_steps(recording)
+    evaluation = evaluation_after(recording, after)
+    trials = int(evaluation["trials"])
+    if not 0 <= number < trials:
+        raise RecordingError(
+            f"{recording.path}: the evaluation after {after:,} episodes has no trial {number}; "
+            f"it has {trials}, from 0."
+        )
+    title = f"trial {number} of the evaluation after {after:,} episodes"
+    index = first_trial(recording, evaluation) + number
+    return _episode(recording, "eval", index, title, most, int(evaluation["step"]))
+
+
+def evaluation_after(recording: Recording, after: int) -> dict[str, Any]:
+    """Return the metrics of the evaluation after so many training episodes.
+
+    Raises:
+        RecordingError: there is none.
+    """
+    evaluations = recording.metrics("eval")
+    for metrics in evaluations:
+        if metrics["episode"] == after:
+            return metrics
+    known = [metrics["episode"] for metrics in evaluations]
+    near = min(known, key=lambda episode: abs(episode - after)) if known else None
+    raise RecordingError(
+        f"{recording.path}: has no evaluation after {after} episodes; "
+        + ("it has none at all." if near is None else f"it has {len(known)}, the nearest after {near}.")
+    )
+
+
+def first_trial(recording: Recording, evaluation: dict[str, Any]) -> int:
+    """Return the number, among all evaluation episodes, of an evaluation's first trial."""
+    before = [m["trials"] for m in recording.metrics("eval") if m["evaluation"] < evaluation["evaluation"]]
+    return int(sum(before))
+
+
+def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
+    """Return the worst, the median and the best trial of an evaluation: by success, return and length."""
+    evaluation = evaluation_after(recording, after)
+    first = first_trial(recording, evaluation)
+    records = recording.episodes("eval", first, first + int(evaluation["trials"]))
+    order = np.lexsort(
+        (-records["length"].astype(np.int64), records["returns"].sum(axis=1), records["success"])
+    )
+    return int(order[0]), int(order[len(order) // 2]), int(order[-1])
+
+
+def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[str, Any]:
+    """Return what a page needs to show episodes, as JSON can hold it: lists of numbers, words once.
+
+    Args:
+        recording: the run.
+        episodes: which.
+        places: from states to places as `svg.Drawing.places` gives them; None without a scene.
+    """
+    mdp, agents = recording.mdp, agents_of(recording)
+    own = action_names(mdp) or [[f"action {i}" for i in range(n)] for n in mdp.action_counts]
+    joint = actions_in_words(mdp).tolist()
+    return {
+        "actions": joint,
+        "choices": [joint] if len(agents) == 1 else own,
+        "learners": [agent.replace("_", " ") for agent in agents],
+        "events": [event_in_words(name) for name in mdp.event_names],
+        "episodes": [_packed(mdp, episode, places) for episode in episodes],
+    }
+
+
+# --- inside -------------------------------------------------------------------------------------------
+
+
+def _episode(
+    recording: Recording, phase: str, number: int, title: str, most: int, table_step: int = -1
+) -> Episode:
+    steps = recording.episode_steps(phase, number)
+    shown, last = steps[:most], steps[-1]
+    mdp = recording.mdp
+    return Episode(
+        title=title,
+        phase=phase,
+        number=number,
+        length=len(steps),
+        ended=_end(recording, phase, number, last),
+        states=np.append(shown["state"], shown["next_state"][-1]).astype(np.int64),
+        actions=shown["action"].astype(np.int64),
+        rewards=shown["rewards"].astype(np.float64),
+        events=events_of(mdp, shown),
+        explored=shown["explored"].astype(np.int64),
+        values=_values(recording, shown, table_step),
+    )
+
+
+def _end(recording: Recording, phase: str, number: int, last: np.void) -> str:
+    if not (last["terminated"] or last["truncated"]):
+        return "cut off"
+    record = recording.episodes(phase, number, number + 1)
+    if len(record) and record[0]["success"]:
+        return "success"
+    return "terminated" if last["terminated"] else "truncated"
+
+
+def events_of(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return the events of recorded steps, a bit mask each: those of the outcome that was recorded."""
+    state, action = steps["state"], steps["action"]
+    alike = mdp.next_state[state, action] == steps["next_state"][:, np.newaxis]
+    alike &= mdp.terminated[state, action] == steps["terminated"][:, np.newaxis]
+    alike &= mdp.probability[state, action] > 0
+    rewards = mdp.rewards[state, action].sum(axis=-1)
+    recorded = steps["rewards"].sum(axis=-1)[:, np.newaxis]
+    learners = steps["rewards"].shape[1]
+    if mdp.rewards.shape[-1] == 1 and learners > 1:  # every learner was paid the shared reward
+        rewards = rewards * learners
+    alike &= np.isclose(rewards, recorded)
+    outcome = alike.argmax(axis=1)
+    return np.asarray(mdp.events[state, action, outcome].astype(np.int64))
+
+
+def _values(
+    recording: Recording, steps: NDArray[np.void], table_step: int
+) -> tuple[NDArray[np.float64], ...]:
+    """Return each learner's Q-values in the states of steps; none where the tables cannot be had."""
+    try:
+        if table_step >= 0:
+            tables = tables_at(recording, table_step)
+            return tuple(table[steps["state"]] for table in tables)
+        first = int(steps["step"][0])
+        replay = TableReplay(recording, first)
+        widths = [table.shape[1] for table in replay.tables]
+        rows = replay.rows(first + len(steps))
+    except RecordingError:
+        return ()
+    return tuple(rows[:, i, :width] for i, width in enumerate(widths))
+
+
+def _packed(mdp: Mdp, episode: Episode, places: Any) -> dict[str, Any]:
+    """Return an episode's arrays; what belongs to a state is there once."""
+    distinct, which = np.unique(episode.states, return_inverse=True)
+    chosen = [agent_actions(mdp, action) for action in episode.actions.tolist()]
+    return {
+        "title": episode.heading,
+        "description": episode.description,
+        "states": [str(word) for word in states_in_words(mdp)[distinct]],
+        "places": [] if places is None else places(distinct).reshape(len(distinct), -1).tolist(),
+        "state": which.tolist(),
+        "action": episode.actions.tolist(),
+        "reward": [[_short(reward) for reward in row] for row in episode.rewards.tolist()],
+        "event": episode.events.tolist(),
+        "explored": episode.explored.tolist(),
+        "values": [
+            _rows(
+                values,
+                [
+                    own[i] if len(episode.values) > 1 else joint
+                    for own, joint in zip(chosen, episode.actions.tolist(), strict=True)
+                ],
+            )
+            for i, values in enumerate(episode.values)
+        ],
+    }
+
+
+def _rows(values: NDArray[np.float64], taken: list[int]) -> dict[str, Any]:
+    """Return the highest Q-values of each step, [action, value] pairs, and the action taken."""
+    rows: dict[str, int] = {}
+    which: list[int] = []
+    packed: list[list[list[Any]]] = []
+    for row, action in zip(values, taken, strict=True):
+        best = np.argsort(-row, kind="stable")[:MOST_VALUES].tolist()
+        shown = best if action in best else [*best[:-1], action]
+        if len(row) <= MOST_VALUES:
+            shown = sorted(shown)
+        pairs = [[int(choice), _short(float(row[choice]))] for choice in shown]
+        key = str(pairs)
+        if key not in rows:
+            rows[key] = len(packed)
+            packed.append(pairs)
+        which.append(rows[key])
+    return {"rows": packed, "row": which, "taken": [int(action) for action in taken], "of": values.shape[1]}
+
+
+def _short(value: float) -> float | int:
+    """Return a value rounded to five significant digits, as the page says."""
+    rounded = float(f"{value:.5g}")
+    return int(rounded) if rounded == int(rounded) else rounded
