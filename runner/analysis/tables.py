@@ -6,6 +6,7 @@ with runner.recording.open(path) as recording:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +22,7 @@ from runner.recording.messages import QTable
 from runner.recording.reader import Recording
 
 _NO_ROWS = np.empty((0, 0, 0))
+_STEPS_AT_ONCE = 65_536
 
 
 class TableReplay:
@@ -39,7 +41,9 @@ class TableReplay:
         self._recorded = recording.count(schema.TRAIN_STEP)
         config = from_mapping(recording.config)
         nearest = _snapshot_before(recording, step)
-        self._learner = Learner(config, recording.mdp, 0, [table.values for table in nearest])
+        self._learner = Learner(config, recording.mdp, 0)
+        _check_shapes(recording, nearest, self.tables)
+        self._learner.set_tables([table.values for table in nearest])
         self.step = nearest[0].step
         """Training steps taken."""
         self.advance(step)
@@ -55,6 +59,11 @@ class TableReplay:
         return [self._learner.table(i) for i in range(len(self.agents))]
 
     @property
+    def own_actions(self) -> NDArray[np.int32]:
+        """Each learner's part of a joint action, [joint actions, learners]."""
+        return self._learner.model.own_action
+
+    @property
     def greedy(self) -> NDArray[np.int32]:
         """The greedy action of each learner in each state now, [learners, states]; ties to the lowest."""
         return self._learner.tables.greedy
@@ -67,7 +76,6 @@ class TableReplay:
         """
         for block in self._blocks(step):
             kernel.replay(*self._state, block.view(np.recarray), _NO_ROWS)
-        self.step = step
 
     def rewind(self, step: int, tables: list[NDArray[np.float64]]) -> None:
         """Go back to a step at which the tables were these."""
@@ -81,31 +89,51 @@ class TableReplay:
             float64 [steps, learners, widest]: the values of each step's state before its update; nan
             beyond a learner's own actions.
         """
-        model = self._learner.model
-        seen = np.full((stop - self.step, len(model.width), max(model.width)), np.nan)
-        at = 0
+        width, first = self._learner.model.width, self.step
+        seen = np.full((max(stop - first, 0), len(width), max(width)), np.nan)
         for block in self._blocks(stop):
+            at = self.step - first
             kernel.replay(*self._state, block.view(np.recarray), seen[at : at + len(block)])
-            at += len(block)
-        self.step = stop
         return seen
 
     @property
     def _state(self) -> tuple[Any, ...]:
         return self._learner.model, self._learner.tables, self._learner.rules
 
-    def _blocks(self, stop: int) -> Any:
-        """Return the recorded steps from here up to `stop`."""
-        if stop == self.step:
-            return iter(())
+    def _blocks(self, stop: int) -> Iterator[NDArray[np.void]]:
+        """Yield the recorded steps from here up to `stop`, all of them; each block moves `step` on."""
         if stop < self.step:
             raise RecordingError(f"a replay at step {self.step} cannot go back to {stop}; begin another.")
-        if stop > self._recorded:
+        if stop > max(self._recorded, self.step):
             raise RecordingError(
                 f"{self._recording.path}: found {self._recorded} training steps, expected at least {stop}"
                 + ("." if self._recorded else "; `dualtaxi rerecord` records them.")
             )
-        return self._recording.blocks(schema.TRAIN_STEP, self.step, stop)
+        for block in self._recording.blocks(schema.TRAIN_STEP, self.step, stop) if stop > self.step else ():
+            self._check(block)
+            yield block
+            self.step += len(block)
+        if self.step < stop:
+            raise self._lost(stop)
+
+    def _check(self, block: NDArray[np.void]) -> None:
+        """Refuse steps that do not follow, or that the environment cannot have: the kernel believes them."""
+        if int(block["step"][0]) != self.step:
+            raise self._lost(int(block["step"][0]))
+        mdp = self._recording.mdp
+        bounds = {"state": mdp.states, "next_state": mdp.states, "action": mdp.joint_actions}
+        for name, bound in bounds.items():
+            if (found := int(block[name].max())) >= bound:
+                raise RecordingError(
+                    f"{self._recording.path}: found {name} {found} in training step {self.step} or the "
+                    f"{len(block)} after it, expected less than {bound}; `dualtaxi verify` names the step."
+                )
+
+    def _lost(self, found: int) -> RecordingError:
+        return RecordingError(
+            f"{self._recording.path}: training steps {self.step} to {found - 1} were lost, so the tables "
+            "behind them cannot be had; `dualtaxi resume` does the run anew."
+        )
 
 
 def tables_at(recording: Recording, step: int) -> list[NDArray[np.float64]]:
@@ -128,28 +156,91 @@ def step_of_episode(recording: Recording, episode: int) -> int:
         raise RecordingError(
             f"{recording.path}: found {ended} training episodes, expected at least {episode}."
         )
-    return int(recording.episodes("train", episode - 1, episode)[0]["last_step"]) + 1 if episode else 0
+    if episode == 0:
+        return 0
+    record = recording.episodes("train", episode - 1, episode)
+    if not len(record):
+        raise RecordingError(f"{recording.path}: training episode {episode - 1} was lost.")
+    return int(record[0]["last_step"]) + 1
+
+
+def last_step(recording: Recording) -> int:
+    """Return the last training step at which the tables can be had."""
+    snapshots = max((snapshot.step for snapshot in recording.snapshots()), default=0)
+    return max(snapshots, recording.count(schema.TRAIN_STEP))
 
 
 @dataclass(frozen=True, eq=False)
-class Changes:
-    """When the values of one state were last changed, up to some step."""
+class StateHistory:
+    """How often a state was visited, and when its values last changed; arrays [learners, widest].
+
+    An entry beyond a learner's own actions has no meaning.
+    """
 
     visits: NDArray[np.int64]
-    """[J]: how often each joint action was taken there."""
-    last_step: NDArray[np.int64]
-    """[J]: the step that last took it; -1 for never."""
+    """How often the learner took the action there."""
+    changed_step: NDArray[np.int64]
+    """The step that last changed the value; -1 for never. An update by nothing changes nothing."""
+    changed_episode: NDArray[np.int64]
+    """The episode of that step."""
 
 
-def changes_of(recording: Recording, state: int, step: int) -> Changes:
-    """Return how often, and when last, each joint action was taken in a state within `step` steps."""
-    joint = recording.mdp.joint_actions
-    visits, last = np.zeros(joint, np.int64), np.full(joint, -1, np.int64)
-    for block in recording.blocks(schema.TRAIN_STEP, 0, step):
-        here = block[block["state"] == state]
-        visits += np.bincount(here["action"], minlength=joint)
-        last[here["action"]] = here["step"]  # later steps overwrite earlier ones
-    return Changes(visits, last)
+def history_of(recording: Recording, state: int, step: int) -> StateHistory:
+    """Return what happened to a state's values within the first `step` training steps, by replaying them.
+
+    Raises:
+        RecordingError: the steps are not recorded.
+    """
+    replay = TableReplay(recording)
+    shape = (len(replay.tables), max(table.shape[1] for table in replay.tables))
+    history = StateHistory(np.zeros(shape, np.int64), np.full(shape, -1), np.full(shape, -1))
+    pending = np.empty(0, recording.dtypes[schema.TRAIN_STEP]), np.empty((0, *shape))
+    while replay.step < step:
+        first, stop = replay.step, min(replay.step + _STEPS_AT_ONCE, step)
+        rows = replay.rows(stop)
+        steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP, first, stop)))
+        here = steps["state"] == state
+        _count(history.visits, replay.own_actions[steps["action"][here]])
+        pending = _note_changes(
+            history, np.concatenate([pending[0], steps[here]]), np.concatenate([pending[1], rows[here]])
+        )
+    last = np.full((1, *shape), np.nan)
+    for i, table in enumerate(replay.tables):
+        last[0, i, : table.shape[1]] = table[state]
+    _note_changes(history, np.repeat(pending[0], 2), np.concatenate([pending[1], last[: len(pending[1])]]))
+    return history
+
+
+def _count(visits: NDArray[np.int64], own: NDArray[np.int32]) -> None:
+    """Count own actions, [visits, learners]."""
+    for i in range(len(visits)):
+        visits[i] += np.bincount(own[:, i], minlength=visits.shape[1])
+
+
+def _note_changes(
+    history: StateHistory, steps: NDArray[np.void], rows: NDArray[np.float64]
+) -> tuple[NDArray[np.void], NDArray[np.float64]]:
+    """Note which visit last changed each value; return the last visit, of which only the next one tells.
+
+    Args:
+        history: where to note it.
+        steps: the visits to the state, in order.
+        rows: the state's values before each of them, [visits, learners, widest].
+    """
+    if len(rows) > 1:
+        bits = rows.view(np.int64)
+        changed = bits[1:] != bits[:-1]
+        last = len(changed) - 1 - changed[::-1].argmax(axis=0)
+        ever = changed.any(axis=0)
+        history.changed_step[ever] = steps["step"][last[ever]]
+        history.changed_episode[ever] = steps["episode"][last[ever]]
+    return steps[-1:], rows[-1:]
+
+
+def _check_shapes(recording: Recording, found: list[QTable], expected: list[NDArray[np.float64]]) -> None:
+    shapes = [table.values.shape for table in found], [table.shape for table in expected]
+    if shapes[0] != shapes[1]:
+        raise RecordingError(f"{recording.path}: found Q-tables of shape {shapes[0]}, expected {shapes[1]}.")
 
 
 def _snapshot_before(recording: Recording, step: int) -> list[QTable]:
