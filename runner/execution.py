@@ -64,15 +64,13 @@ def run_job(job: Job, run: Run, report: Report = lambda _: None, stop: Stop = la
         RunnerError: the environment cannot be used, or the disk is full; the run is then marked failed.
     """
     started = time.monotonic()
-    try:
+    with _failing(run):
         mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
         learner = Learner(job.config, mdp, job.seed, configured_tables(job, run, mdp))
         file = _create(run.folder / runs.RECORDING_FILE)
-    except RunnerError as error:
-        run.update(status="failed", summary={"error": str(error)})
-        raise
     with file:
-        describe(file, job, run, learner)
+        with _failing(run):
+            describe(file, job, run, learner)
         recorder = recorder_for(job, learner, file, beat=run.beat)
         return execute(Session(job, learner, recorder, report, stop), file, run, started)
 
@@ -88,10 +86,22 @@ def execute(session: Session, file: RecordingFile, run: Run, started: float) -> 
         status = "interrupted" if isinstance(error, KeyboardInterrupt | Diverged) else "failed"
         with contextlib.suppress(StorageError):  # a full disk may still have room for the index
             write_result(file, {"status": status, "error": str(error)})
-        run.update(status=status, summary={"error": str(error), "bytes": file.size})
+        with contextlib.suppress(StorageError):  # nor need there be room for this
+            run.update(status=status, summary={"error": str(error), "bytes": file.size})
         raise
     summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": file.size}
     return run.update(status=status, summary=summary)
+
+
+@contextlib.contextmanager
+def _failing(run: Run) -> Iterator[None]:
+    """Mark the run failed if what is done here is refused."""
+    try:
+        yield
+    except RunnerError as error:
+        with contextlib.suppress(StorageError):
+            run.update(status="failed", summary={"error": str(error)})
+        raise
 
 
 def _create(path: Path) -> RecordingFile:
@@ -104,12 +114,10 @@ def _create(path: Path) -> RecordingFile:
 
 
 def write_result(file: RecordingFile, result: dict[str, Any]) -> None:
-    """Write the result, the index and the summary."""
+    """Write the result, the index and the summary; all of it, or nothing."""
     try:
-        file.add_metadata("result", {"json": json.dumps(result, sort_keys=True)})
-        file.finish()
+        file.finish("result", {"json": json.dumps(result, sort_keys=True)})
     except OSError as error:
-        file.cut_back()
         raise storage_error(file, error) from error
 
 
@@ -304,7 +312,18 @@ def recorder_for(
 def describe(
     file: RecordingFile, job: Job, run: Run, learner: Learner, made_by: Mapping[str, str] | None = None
 ) -> None:
-    """Write what makes the recording self-contained; `made_by` is its provenance if not this process's."""
+    """Write what makes the recording self-contained; `made_by` is its provenance if not this process's.
+
+    Raises:
+        StorageError: the disk is full or failing.
+    """
+    try:
+        _describe(file, job, run, learner, made_by or provenance())
+    except OSError as error:
+        raise storage_error(file, error) from error
+
+
+def _describe(file: RecordingFile, job: Job, run: Run, learner: Learner, made_by: Mapping[str, str]) -> None:
     mdp = learner.mdp
     file.add_metadata(
         "run",
@@ -321,7 +340,7 @@ def describe(
         },
     )
     file.add_metadata("config", {"json": json.dumps(job.config.to_mapping(), sort_keys=True)})
-    file.add_metadata("provenance", made_by or provenance())
+    file.add_metadata("provenance", made_by)
     description = json.loads(description_bytes(mdp)) | {"arrays": sorted(mdp.arrays())}
     file.add_attachment("environment.json", "application/json", json.dumps(description, indent=1).encode())
     for name, array in sorted(mdp.arrays().items()):

@@ -95,9 +95,18 @@ class Run:
             os.utime(self.folder / RUN_FILE)
 
     def update(self, **facts: Any) -> Run:
-        """Return the run with these facts, written to its file."""
+        """Return the run with these facts, written to its file.
+
+        Raises:
+            StorageError: the file cannot be written; it is as before.
+        """
         changed = Run(self.folder, self.facts | facts)
-        _write_whole(self.folder / RUN_FILE, changed.facts)
+        try:
+            _write_whole(self.folder / RUN_FILE, changed.facts)
+        except OSError as error:
+            raise StorageError(
+                f"{self.folder / RUN_FILE}: cannot be written ({error.strerror}); free some disk."
+            ) from error
         return changed
 
 
@@ -279,5 +288,9 @@ def process_start(pid: int) -> float | None:
 def _write_whole(path: Path, facts: dict[str, Any]) -> None:
     """Replace a file whole: a reader sees the old one or the new one."""
     fresh = path.with_suffix(f".{secrets.token_hex(4)}.tmp")
-    fresh.write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    fresh.replace(path)
+    try:
+        fresh.write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        fresh.replace(path)
+    except OSError:
+        fresh.unlink(missing_ok=True)
+        raise

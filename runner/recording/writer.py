@@ -51,8 +51,12 @@ class RecordingFile:
             OSError: it exists, or cannot be created.
         """
         self._reset(path, path.open("xb", buffering=0))
-        self._append(MCAP0_MAGIC)
-        self._append(_bytes_of(Header(PROFILE, LIBRARY)) + schema_and_channel_bytes())
+        try:
+            self._append(MCAP0_MAGIC + _bytes_of(Header(PROFILE, LIBRARY)) + schema_and_channel_bytes())
+        except OSError:
+            self._stream.close()
+            path.unlink(missing_ok=True)
+            raise
 
     def _reset(self, path: Path, stream: BinaryIO) -> None:
         self.path = path
@@ -117,24 +121,24 @@ class RecordingFile:
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Append a metadata record."""
         data = _bytes_of(Metadata(name=name, metadata=dict(entries)))
-        self._metadata.append(MetadataIndex(offset=self._offset, length=len(data), name=name))
+        index = MetadataIndex(offset=self._offset, length=len(data), name=name)
         self._append(data)
+        self._metadata.append(index)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Append an attachment; its times are 0, as wall clock is provenance."""
         record = _bytes_of(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
-        self._attachments.append(
-            AttachmentIndex(
-                offset=self._offset,
-                length=len(record),
-                log_time=0,
-                create_time=0,
-                data_size=len(data),
-                name=name,
-                media_type=media_type,
-            )
+        index = AttachmentIndex(
+            offset=self._offset,
+            length=len(record),
+            log_time=0,
+            create_time=0,
+            data_size=len(data),
+            name=name,
+            media_type=media_type,
         )
         self._append(record)
+        self._attachments.append(index)
 
     def add_chunk(self, topic: Topic, chunk: Chunk) -> None:
         """Append a chunk of one topic and its message index."""
@@ -170,10 +174,23 @@ class RecordingFile:
         self._stream.truncate(self._offset)
         self._stream.seek(self._offset)
 
-    def finish(self) -> None:
-        """Write the end of the data section, the summary and the footer, and put all on disk."""
-        self._append(self.tail())
-        self.sync()
+    def finish(self, name: str = "", entries: Mapping[str, str] | None = None) -> None:
+        """Write a last metadata record, if one is named, summary and footer, and put all on disk.
+
+        Raises:
+            OSError: it could not all be written; the file is then as it was before.
+        """
+        crc, offset, metadata = self._crc, self._offset, len(self._metadata)
+        try:
+            if name:
+                self.add_metadata(name, entries or {})
+            self._append(self.tail())
+            self.sync()
+        except OSError:
+            self._crc, self._offset = crc, offset
+            del self._metadata[metadata:]
+            self.cut_back()
+            raise
 
     def tail(self) -> bytes:
         """Return what a finished recording has behind its data: data end, summary, footer, magic."""
