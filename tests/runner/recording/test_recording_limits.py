@@ -1,0 +1,177 @@
+"""Long runs and full disks: memory stays what it was, what was written before the disk was full is read."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from runner.errors import StorageError
+from runner.execution import run_job
+from runner.job import Job
+from runner.recording import open as open_recording
+from runner.recording import pipeline, schema
+from runner.recording.integrity import check_integrity
+from runner.recording.writer import RecordingFile
+from runner.runs import create_run, find_run
+from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
+
+LONG_RUN = """
+import resource, sys
+from pathlib import Path
+from runner.recording import open as open_recording, schema
+from tests.runner.recording.making import make_run
+
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+def record_and_read(episodes):
+    run = make_run(
+        Path(sys.argv[1]), episodes=episodes, algorithm="random", evaluation=None, log=None,
+        env={"id": "FrozenLake-v1"}, recording={"level": -7},
+    )
+    with open_recording(run.recording) as recording:
+        steps = sum(len(block) for block in recording.blocks(schema.TRAIN_STEP))
+        messages = sum(1 for _, _ in zip(recording.messages(schema.TRAIN_STEP), range(100_000)))
+    assert steps == run.summary["train_steps"]
+    return steps
+
+record_and_read(60_000)
+before = peak()
+steps = record_and_read(600_000)
+print(steps, peak() - before)
+"""
+
+
+def test_memory_does_not_grow_with_the_number_of_steps(tmp_path):
+    """In a process of its own: a peak, once reached, hides what comes below it."""
+    root = Path(__file__).parents[3]
+    command = [sys.executable, "-c", LONG_RUN, str(tmp_path)]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    steps, growth = map(int, done.stdout.split())
+    record_bytes = schema.record_dtype(schema.STEP, (1,)).itemsize
+    assert steps > 4_000_000
+    assert growth < steps * record_bytes / 10, "a tenth of the steps would not fit in what it grew by"
+
+
+@contextlib.contextmanager
+def disk_of(size: int):
+    """Let no file grow beyond a size: as a full disk does, writing stops in the middle of a record."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def run_on_small_disk(folder: Path, size: int, *parts, **values):
+    """Return the run that a full disk ended, and what was said of it."""
+    config = experiment(*parts, **values)
+    run = create_run(folder, config, 0)
+    with disk_of(size), pytest.raises(StorageError) as caught:
+        run_job(Job(config, 0), run)
+    return find_run(run.run_id, folder), caught.value
+
+
+def train_steps(path: Path) -> bytes:
+    """Return the training steps of a recording, as bytes."""
+    with open_recording(path) as recording:
+        return b"".join(block.tobytes() for block in recording.blocks(schema.TRAIN_STEP))
+
+
+@pytest.mark.parametrize("size", [30_000, 50_001, 77_777])
+def test_a_full_disk_ends_the_run_and_keeps_what_was_written(size, taxis, tmp_path):
+    run, error = run_on_small_disk(
+        tmp_path, size, TAXIS, recording={"chunk_steps": 256, "compression": "none"}
+    )
+    assert error.exit_code == 1
+    assert str(run.recording) in str(error)
+    assert "free some disk" in str(error)
+    assert run.status == "failed"
+    assert run.summary["error"] == str(error)
+    assert run.recording.stat().st_size <= size
+    kept, whole = train_steps(run.recording), train_steps(taxis.recording)
+    assert len(kept) > 10_000
+    assert whole.startswith(kept)
+    check_integrity(run.recording)
+
+
+@pytest.mark.parametrize("missing", [1, 200, 3_000])
+def test_a_disk_that_is_full_at_the_very_end_loses_only_the_index(missing, tmp_path):
+    whole = make_run(tmp_path, LAKE)
+    run, _ = run_on_small_disk(tmp_path, whole.recording.stat().st_size - missing, LAKE)
+    assert run.status == "failed"
+    assert train_steps(run.recording) == train_steps(whole.recording)
+
+
+@pytest.mark.parametrize("size", [700, 2_600, 3_000, 5_000])
+def test_no_room_even_to_describe_the_run(size, tmp_path):
+    """700 bytes do not even hold what `run.json` would say of it."""
+    run, error = run_on_small_disk(tmp_path, size, LAKE)
+    assert error.exit_code == 1
+    assert run.status == ("failed" if size > 1_500 else "running")
+    assert [path.name for path in run.folder.iterdir() if path.suffix == ".tmp"] == []
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root may mount a disk")
+@pytest.mark.parametrize("kilobytes", [40, 64, 100])
+def test_a_disk_that_is_really_full(kilobytes, taxis, tmp_path):
+    """Where the recording's blocks are gone, those of run.json are gone too."""
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(tmp_path)]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("mounting is not allowed here")
+    try:
+        config = experiment(TAXIS, recording={"chunk_steps": 256, "compression": "none"})
+        run = create_run(tmp_path, config, 0)
+        with pytest.raises(StorageError, match="No space left"):
+            run_job(Job(config, 0), run)
+        kept = train_steps(run.recording)
+        assert train_steps(taxis.recording).startswith(kept)
+        assert len(kept) > 0
+    finally:
+        subprocess.run(["umount", str(tmp_path)], check=True)
+
+
+def test_a_system_that_cannot_keep_what_it_took_ends_the_run(tmp_path, monkeypatch):
+    """Some disks say that they are full only when asked to have written."""
+
+    def full(self):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(RecordingFile, "sync", full)
+    monkeypatch.setattr(pipeline, "SYNC_SECONDS", 0)
+    config = experiment(TAXIS, episodes=10**6)
+    run = create_run(tmp_path, config, 0)
+    with pytest.raises(StorageError, match="No space left on device"):
+        run_job(Job(config, 0), run)
+    assert find_run(run.run_id, tmp_path).status == "failed"
+
+
+def test_an_error_while_packing_ends_the_run(tmp_path, monkeypatch):
+    def broken(*_):
+        raise MemoryError("no memory")
+
+    monkeypatch.setattr(pipeline, "encode_chunk", broken)
+    config = experiment(TAXIS, episodes=10**6)
+    run = create_run(tmp_path, config, 0)
+    with pytest.raises(MemoryError):
+        run_job(Job(config, 0), run)
+    assert json.loads((run.folder / "run.json").read_text())["status"] == "failed"
+
+
+def test_a_recording_is_never_overwritten(tmp_path):
+    config = experiment(LAKE)
+    run = create_run(tmp_path, config, 0)
+    run.recording.write_bytes(b"precious")
+    with pytest.raises(StorageError, match="cannot be created"):
+        run_job(Job(config, 0), run)
+    assert run.recording.read_bytes() == b"precious"
