@@ -146,7 +146,7 @@ def test_without_evaluation(command, tiny):
 
 
 def test_where_success_is_unknown_it_is_null(command, tiny):
-    words = ("run", tiny, "--set", "env={id: FrozenLake-v1}", "--set", "mode=cooperative")
+    words = ("run", tiny, "--set", "env={id: Corridor-v0}", "--set", "mode=cooperative")
     assert command.json(*words)["last_evaluation"]["finish_percent"] is None
     assert "–" in command(*words).stdout
 

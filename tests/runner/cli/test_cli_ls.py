@@ -1,0 +1,94 @@
+"""`dualtaxi ls`."""
+
+import json
+import os
+
+import pytest
+
+from runner.api import experiment_of
+from runner.runs import RUN_FILE, create_run
+
+
+def test_json_lists_the_runs(recorded, recorded_run):
+    (told,) = recorded.json("ls")
+    assert told["run_id"] == recorded_run.run_id
+    assert (told["name"], told["config"], told["seed"]) == ("tiny", "tiny", 3)
+    assert (told["status"], told["episodes"], told["episodes_to_do"]) == ("finished", 30, 30)
+    assert told["bytes"] == recorded_run.recording.stat().st_size
+    assert told["finish_percent"] == recorded_run.summary["last_evaluation"]["finish_percent"]
+
+
+def test_text_lists_the_runs(recorded, recorded_run):
+    heading, line = recorded("ls").stdout.splitlines()
+    assert heading.split() == ["id", "name", "seed", "status", "episodes", "finished", "%", "size", "age"]
+    assert line.split()[:5] == [recorded_run.run_id, "tiny", "3", "finished", "30"]
+
+
+def test_a_run_of_another_name_shows_its_configuration(command, tiny):
+    command("run", tiny, "--name", "mine")
+    heading, line = command("ls").stdout.splitlines()
+    assert heading.split()[:3] == ["id", "name", "config"]
+    assert line.split()[1:3] == ["mine", "tiny"]
+
+
+def test_the_newest_comes_first(command, tiny):
+    ids = [command.json("run", tiny, "--seed", seed)["run_id"] for seed in (1, 2)]
+    assert [run["run_id"] for run in command.json("ls")] == ids[::-1]
+
+
+@pytest.mark.parametrize("made", [False, True])
+def test_no_runs_yet(command, made):
+    if made:
+        command.recordings.mkdir()
+    result = command("ls")
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert "No runs" in result.stderr
+    assert command.json("ls") == []
+
+
+def test_a_run_that_never_recorded_and_one_that_runs(command, tiny):
+    running = create_run(command.recordings, experiment_of(tiny), 3)
+    died = create_run(command.recordings, experiment_of(tiny), 4)
+    died.update(owner=died.facts["owner"] | {"process_started": 1.0})
+    told = {run["run_id"]: run["status"] for run in command.json("ls")}
+    assert told == {running.run_id: "running", died.run_id: "interrupted"}
+    assert command("ls").exit_code == 0
+    assert "– of 30" in command("ls").stdout
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[1]", '{"run_id": 3}', "\xff", '{"created": "yesterday"}'])
+def test_what_is_no_run_is_left_alone(command, tiny, content):
+    (command.recordings / "stray").mkdir(parents=True)
+    (command.recordings / "stray" / RUN_FILE).write_text(content, encoding="latin-1")
+    (command.recordings / "note.txt").write_text("mine")
+    assert command.json("ls") == []
+
+
+def test_values_of_the_wrong_kind_make_no_run(command, tiny):
+    run = create_run(command.recordings, experiment_of(tiny), 3)
+    for key, wrong in (("created", "soon"), ("seed", "x"), ("summary", []), ("config", 3), ("owner", "me")):
+        (run.folder / RUN_FILE).write_text(json.dumps(run.facts | {key: wrong}))
+        assert command.json("ls") == []
+
+
+def test_the_folder_may_be_given(recorded, recorded_run, command):
+    assert command.json("ls", "--recordings", recorded.recordings)[0]["run_id"] == recorded_run.run_id
+
+
+def test_a_folder_that_is_none(command, tmp_path):
+    command.recordings = tmp_path / "file"
+    command.recordings.write_text("")
+    result = command("ls")
+    assert result.exit_code == 1
+    assert "cannot be read" in result.stderr
+
+
+def test_the_folder_is_the_working_directorys_by_default(recorded_run, tmp_path, monkeypatch):
+    from click.testing import CliRunner
+
+    from runner.cli import cli
+
+    monkeypatch.chdir(recorded_run.folder.parent.parent)
+    monkeypatch.delenv("DUALTAXI_RECORDINGS", raising=False)
+    assert recorded_run.run_id in CliRunner().invoke(cli, ["ls"]).stdout
+    assert os.environ.get("DUALTAXI_RECORDINGS") is None

@@ -1,0 +1,112 @@
+"""`dualtaxi play`."""
+
+import json
+import shutil
+import sys
+
+import pytest
+
+import runner
+
+
+def _frames(text):
+    return text.rstrip().split("\n\ntiny, seed 3: ")
+
+
+def test_json_is_a_line_for_each_step(recorded, recorded_run):
+    result = recorded("play", "tiny", "--episode", 7, "--json")
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    with runner.open_recording(recorded_run.recording) as recording:
+        steps = recording.episode_steps("train", 7)
+    assert [line["state"] for line in lines] == steps["state"].tolist()
+    assert [list(line["rewards"].values()) for line in lines] == steps["rewards"].tolist()
+    assert [line["t"] for line in lines] == list(range(len(steps)))
+    assert lines[0]["state_in_words"].startswith("taxi 1 (")
+    assert " + " in lines[0]["action_in_words"]
+    assert lines[0]["explored"] == ["taxi_1", "taxi_2"]
+
+
+def test_events_are_those_that_the_episode_counts(recorded, recorded_run):
+    lines = [
+        json.loads(line) for line in recorded("play", "tiny", "--episode", 7, "--json").stdout.splitlines()
+    ]
+    counted = runner.frames.episodes(recorded_run).loc[7]
+    names = [name for name in counted.index if "taxi_" in name and not name.startswith("return.")]
+    assert len(names) == 10
+    for name in [*names, "collision"]:
+        assert sum(name in line["events"] for line in lines) == counted[name]
+
+
+def test_frames_come_one_after_another_without_waiting(recorded):
+    result = recorded("play", "tiny", "--episode", 0)
+    frames = _frames(result.stdout)
+    assert result.exit_code == 0
+    assert frames[0].startswith("tiny, seed 3: training episode 0\nstep 0 of ")
+    assert len(frames) == int(frames[0].splitlines()[1].split()[-1]) + 1
+    assert "\x1b" not in result.stdout
+    for frame in frames:
+        assert frame.count("+-----+-----+-----+-----+") == 2
+        assert all(sign in frame for sign in ("R", "G", "Y", "B", "1", "2", "*"))
+        assert "taxi 1 (" in frame
+    assert "reward " in frames[1]
+
+
+def test_the_last_evaluation_is_played_unless_told(recorded):
+    assert "evaluation after 30 training episodes, trial 0" in recorded("play", "tiny").stdout
+
+
+@pytest.mark.parametrize(("trial", "number"), [("20:3", 3), ("20", 0)])
+def test_a_trial_of_an_evaluation(recorded, recorded_run, trial, number):
+    result = recorded("play", "tiny", "--eval", trial, "--json")
+    states = [json.loads(line)["state"] for line in result.stdout.splitlines()]
+    with runner.open_recording(recorded_run.recording) as recording:
+        assert states == recording.episode_steps("eval", 2 * 5 + number)["state"].tolist()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--eval", "21:0"], "the nearest is after 20"),
+        (["--eval", "20:5"], "expected one from 0 to 4"),
+        (["--eval", "x"], "expected N:TRIAL"),
+        (["--eval", "3:x"], "expected N:TRIAL"),
+        (["--episode", "30"], "no train episode 30"),
+        (["--episode", "-1"], "--episode"),
+        (["--speed", "0"], "--speed"),
+        (["--episode", "1", "--eval", "20:0"], "exclude each other"),
+    ],
+)
+def test_what_is_not_there_is_refused(recorded, words, told):
+    result = recorded("play", "tiny", *words)
+    assert result.exit_code == 2
+    assert told in result.stderr
+
+
+def test_without_evaluations_the_last_episode_is_played(command, tiny):
+    command("run", tiny, "--set", "evaluation=null")
+    assert "training episode 29" in command("play", "@latest").stdout
+    result = command("play", "@latest", "--eval", "0:0")
+    assert "there are no evaluations" in result.stderr
+
+
+def test_without_a_scene_states_are_numbers(command, tiny):
+    command("run", tiny, "--set", "env={id: Corridor-v0}", "--set", "mode=cooperative")
+    frames = command("play", "@latest", "--episode", 0).stdout
+    assert "\nstate 0\n" in frames
+    assert "\naction " in frames
+
+
+def test_without_steps_there_is_nothing_to_play(command, tiny):
+    command("run", tiny, "--set", "recording.steps=none")
+    result = command("play", "@latest")
+    assert result.exit_code == 2
+    assert "recording.steps=all" in result.stderr
+
+
+def test_the_environment_need_not_be_installed(recorded_run, command, tmp_path, monkeypatch):
+    alone = shutil.copy(recorded_run.recording, tmp_path / "alone.mcap")
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("dualtaxi", "gymnasium")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "dualtaxi", None)
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    assert "taxi 1 (" in command("play", alone).stdout

@@ -1,0 +1,100 @@
+"""The Python side of the same: `runner.run`, `runner.run_all`, and the package's names."""
+
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+import runner
+from runner.api import experiment_of
+from runner.errors import ConfigError, EnvironmentNotUsable
+from runner.runs import list_runs
+
+
+def test_the_public_names():
+    assert runner.__all__ == [
+        "ExperimentConfig",
+        "Recording",
+        "Run",
+        "RunnerError",
+        "find_run",
+        "frames",
+        "list_runs",
+        "open_recording",
+        "run",
+        "run_all",
+    ]
+    for name in runner.__all__:
+        assert getattr(runner, name) is not None
+        assert name in dir(runner)
+    with pytest.raises(AttributeError, match="has no attribute 'walk'"):
+        runner.walk  # noqa: B018
+
+
+def test_importing_it_imports_nothing_heavy():
+    program = "import sys, runner; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert not {"numpy", "numba", "gymnasium", "pydantic", "click"} & set(done.stdout.split())
+
+
+@pytest.mark.parametrize("kind", ["path", "text", "mapping", "config"])
+def test_a_configuration_may_be_anything_that_means_one(tiny, tmp_path, recorded_run, kind):
+    config = {
+        "path": tiny,
+        "text": str(tiny),
+        "mapping": yaml.safe_load(tiny.read_text()),
+        "config": experiment_of(tiny),
+    }[kind]
+    run = runner.run(config, recordings=tmp_path / "runs")
+    assert run.summary["content_digest"] == recorded_run.summary["content_digest"]
+    assert (run.status, run.seed, run.name) == ("finished", 3, "tiny")
+
+
+def test_seed_name_and_overrides(tiny, tmp_path):
+    run = runner.run(tiny, seed=9, name="mine", overrides=["episodes=5"], recordings=tmp_path / "runs")
+    assert (run.seed, run.name, run.summary["episodes"]) == (9, "mine", 5)
+    assert run.facts["config"]["seeds"] == [9]
+    assert runner.find_run("mine", tmp_path / "runs").run_id == run.run_id
+    with runner.open_recording(run.recording) as recording:
+        assert recording.run["name"] == "mine"
+
+
+def test_the_seed_of_an_object_may_be_changed(tiny, tmp_path):
+    config = experiment_of(tiny)
+    assert runner.run(config, seed=4, recordings=tmp_path / "runs").seed == 4
+    assert config.seeds == (3,)
+
+
+def test_several_seeds_are_for_run_all(tiny, tmp_path):
+    several = ["seeds=[1, 2]"]
+    with pytest.raises(ConfigError, match="found 2 seeds"):
+        runner.run(tiny, overrides=several, recordings=tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
+    runs = runner.run_all(tiny, overrides=several, recordings=tmp_path / "runs")
+    assert next(runs).seed == 1
+    assert len(list_runs(tmp_path / "runs")) == 1
+    assert [run.seed for run in runs] == [2]
+
+
+def test_progress_is_reported(tiny, tmp_path):
+    seen = []
+    run = runner.run(
+        tiny, recordings=tmp_path / "runs", report=lambda progress: seen.append(progress.episode)
+    )
+    assert seen == sorted(seen)
+    assert seen[-1] == run.summary["episodes"]
+
+
+def test_recordings_go_where_the_variable_says(tiny, tmp_path, monkeypatch):
+    monkeypatch.setenv("DUALTAXI_RECORDINGS", str(tmp_path / "there"))
+    assert runner.run(tiny).folder.parent == tmp_path / "there"
+
+
+def test_errors_are_the_projects_own(tiny, tmp_path):
+    with pytest.raises(ConfigError, match="name: found"):
+        runner.run(tiny, name="/", recordings=tmp_path / "runs")
+    with pytest.raises(EnvironmentNotUsable) as caught:
+        runner.run(tiny, overrides=["env={id: Nothing-v1}"], recordings=tmp_path / "runs")
+    assert "was removed" in caught.value.__notes__[0]
+    assert list_runs(tmp_path / "runs") == []

@@ -1,0 +1,143 @@
+"""`dualtaxi show`."""
+
+import json
+import math
+import shutil
+
+import pytest
+
+from runner.runs import RUN_FILE, create_run
+
+
+def _numbers(value):
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        for item in value:
+            yield from _numbers(item)
+    elif isinstance(value, float):
+        yield value
+
+
+def test_json_has_it_all(recorded, recorded_run):
+    told = recorded.json("show", "tiny")
+    summary = recorded_run.summary
+    for key in ("content_digest", "train_steps", "eval_steps", "bytes", "seconds", "episodes"):
+        assert told[key] == summary[key]
+    assert told["status"] == "finished"
+    assert told["run_id"] == recorded_run.run_id
+    assert told["config"] == recorded_run.facts["config"]
+    assert next(iter(told["config"])) == "name"
+    assert told["provenance"]["python"]
+    assert [table["agent"] for table in told["tables"]] == ["taxi_1", "taxi_2"]
+    assert all(math.isfinite(number) for number in _numbers(told))
+
+
+def test_json_has_the_whole_series(recorded):
+    told = recorded.json("show", "@latest")
+    assert [evaluation["episode"] for evaluation in told["eval"]] == [0, 10, 20, 30]
+    for evaluation in told["eval"]:
+        assert evaluation["trials"] == 5
+        assert 0 <= evaluation["finish_percent"] <= 100
+        assert 1 <= evaluation["mean_length"] <= 40
+        assert evaluation["mean_returns"].keys() == {"taxi_1", "taxi_2"}
+        assert {
+            "collision",
+            "taxi_1.drop_off",
+            "taxi_2.drop_off",
+            "taxi_1.wrong_stop",
+            "taxi_2.illegal_pickup",
+            "taxi_1.illegal_drop_off",
+        } <= evaluation["events"].keys()
+    assert told["eval"][0]["training"]["mean_length"] is None  # no episode yet
+    steps = [report["step"] for report in told["train"]]
+    assert steps == list(range(200, told["train_steps"] + 1, 200))
+    assert told["train"][0]["percent_filled"].keys() == {"taxi_1", "taxi_2"}
+
+
+def test_text_tells_the_same(recorded, recorded_run):
+    result = recorded("show", recorded_run.run_id)
+    assert result.exit_code == 0
+    for told in (
+        recorded_run.summary["content_digest"],
+        "Evaluations",
+        "Tables",
+        "Configuration",
+        "Provenance",
+    ):
+        assert told in result.stdout
+    assert "name         tiny" in result.stdout
+    assert "taxi_2  " in result.stdout
+    assert all(line == line.rstrip() for line in result.stdout.splitlines())
+
+
+@pytest.mark.parametrize("how", ["id", "prefix", "name", "latest", "named latest", "folder", "file"])
+def test_a_run_is_named_in_many_ways(recorded, recorded_run, how):
+    name = {
+        "id": recorded_run.run_id,
+        "prefix": recorded_run.run_id[:3],
+        "name": "tiny",
+        "latest": "@latest",
+        "named latest": "tiny@latest",
+        "folder": recorded_run.folder,
+        "file": recorded_run.recording,
+    }[how]
+    assert recorded.json("show", name)["run_id"] == recorded_run.run_id
+
+
+def test_an_unknown_run_is_refused_with_the_nearest(recorded):
+    result = recorded("show", "tinny")
+    assert result.exit_code == 2
+    assert "no run 'tinny'" in result.stderr
+    assert "Did you mean 'tiny'?" in result.stderr
+
+
+def test_an_ambiguous_name_is_refused_with_all_it_could_be(command, tiny):
+    ids = [command.json("run", tiny)["run_id"] for _ in range(2)]
+    result = command("show", "tiny")
+    assert result.exit_code == 2
+    assert all(run_id in result.stderr for run_id in ids)
+
+
+def test_a_recording_alone_tells_all_but_the_duration(recorded_run, command, tmp_path):
+    alone = tmp_path / "alone.mcap"
+    shutil.copy(recorded_run.recording, alone)
+    told = command.json("show", alone)
+    assert told["run_id"] == recorded_run.run_id
+    assert told["content_digest"] == recorded_run.summary["content_digest"]
+    assert command("show", alone).exit_code == 0
+
+
+def test_a_run_that_was_cut_off(recorded_run, command):
+    folder = command.recordings / recorded_run.run_id
+    shutil.copytree(recorded_run.folder, folder)
+    content = (folder / "recording.mcap").read_bytes()
+    (folder / "recording.mcap").write_bytes(content[: len(content) * 9 // 10])
+    facts = json.loads((folder / RUN_FILE).read_text())
+    facts |= {"status": "running", "owner": {"host": "elsewhere"}, "summary": {}}
+    (folder / RUN_FILE).write_text(json.dumps(facts))
+    told = command.json("show", "@latest")
+    assert told["content_digest"] is None
+    assert told["train_steps"] > 0
+    assert command("show", "@latest").exit_code == 0
+
+
+def test_a_run_without_a_recording(command, tiny):
+    from runner.api import experiment_of
+
+    run = create_run(command.recordings, experiment_of(tiny), 3).update(
+        status="failed", summary={"error": "why"}
+    )
+    told = command.json("show", run.run_id)
+    assert (told["status"], told["eval"], told["content_digest"]) == ("failed", [], None)
+    result = command("show", run.run_id)
+    assert "why" in result.stdout
+    assert "no recording" in result.stdout
+
+
+def test_a_damaged_recording_is_told_without_a_traceback(command, tmp_path):
+    (tmp_path / "noise.mcap").write_bytes(b"noise" * 100)
+    result = command("show", tmp_path / "noise.mcap")
+    assert result.exit_code == 2
+    assert "noise.mcap" in result.stderr
+    assert "Traceback" not in result.output

@@ -1,0 +1,93 @@
+"""On a terminal: colours, a progress line, and neither with NO_COLOR or a pipe."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from runner.learning.compilation import announced
+
+pty = pytest.importorskip("pty", reason="a POSIX terminal", exc_type=ImportError)
+
+
+def _typed(words, recordings, **environment):
+    """Return what a command shows on a terminal of 80 columns."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "runner", *map(str, words)],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        env=os.environ
+        | {"DUALTAXI_RECORDINGS": str(recordings), "TERM": "xterm-256color", "COLUMNS": "80"}
+        | environment,
+    )
+    os.close(theirs)
+    shown = b""
+    while True:
+        try:
+            part = os.read(ours, 4096)
+        except OSError:  # Linux says so when the other end is closed
+            break
+        if not part:
+            break
+        shown += part
+    os.close(ours)
+    assert process.wait(timeout=60) == 0, shown
+    return shown.decode()
+
+
+def test_a_run_shows_its_progress(command, tiny):
+    shown = _typed(["run", tiny, "--set", "episodes=3000"], command.recordings)
+    assert "/3,000" in shown
+    assert "steps/s" in shown
+
+
+def test_colours_only_repeat_what_letters_say(recorded):
+    words = ["play", "tiny", "--episode", 0, "--speed", 1000]
+    coloured = _typed(words, recorded.recordings)
+    plain = _typed(words, recorded.recordings, NO_COLOR="1")
+    assert "\x1b[1;38;5" in coloured or "\x1b[1;30;48" in coloured
+    assert "[1;38;5" not in plain
+    assert "48;5" not in plain
+    assert "step 1 of " in plain
+
+
+@pytest.mark.parametrize("words", [["ls"], ["show", "tiny"]])
+def test_without_colours_nothing_is_lost(recorded, words):
+    assert "38;5" not in _typed(words, recorded.recordings, NO_COLOR="1")
+
+
+def test_a_compilation_is_announced_once_when_it_happens():
+    import numba
+
+    @numba.njit
+    def first(x):
+        return x + 1
+
+    @numba.njit
+    def second(x):
+        return first(x) + 1
+
+    told = []
+    with announced(lambda: told.append("now")):
+        assert told == []
+        assert second(1) == 3
+        assert told == ["now"]
+        assert second(1) == 3
+    with announced(lambda: told.append("again")):
+        assert second(2) == 4
+    assert told == ["now"]
+
+
+def test_what_is_cached_is_not_announced(command, tiny):
+    command("run", tiny)
+    done = subprocess.run(
+        [sys.executable, "-m", "runner", "run", str(tiny), "--recordings", str(command.recordings)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "ompil" not in done.stderr
+    assert len(done.stderr.splitlines()) == 1
