@@ -8,24 +8,32 @@ steps make them); by the installed environment, whether the run can be reproduce
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from runner.config import from_mapping
-from runner.errors import Diverged, RecordingError
-from runner.execution import Session, recorder_for
+from runner.config.model import RunTable
+from runner.errors import ConfigError, Diverged, RecordingError
+from runner.execution import Report, Session, recorder_for
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import Mdp, load_mdp
 from runner.provenance import provenance
-from runner.recording.digest import combine
+from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
+
+CIRCUMSTANCES: Final = ("command", "directory", "host", "user")
+"""Provenance that cannot explain a difference."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +46,11 @@ class Verification:
     difference: Diverged | None = None
     """The same by its parts, if a message differs."""
     train_steps: int = 0
+    """Training steps that were compared."""
     eval_steps: int = 0
+    """Evaluation steps that were compared."""
     content_digest: str = ""
+    """Of the whole job; empty if the recording is not whole."""
     notes: tuple[str, ...] = field(default=())
     """What a reader should know though it is not wrong."""
     provenance: dict[str, tuple[str, str]] = field(default_factory=dict)
@@ -51,58 +62,144 @@ class Verification:
         return not self.finding
 
 
-def verify(path: Path, rerun: bool = False) -> Verification:
+def verify(path: Path, rerun: bool = False, report: Report = lambda _: None) -> Verification:
     """Verify a recording.
 
     Args:
         path: the recording.
         rerun: compare with the installed environment's job instead of the recorded environment's.
+        report: called with the progress a few times a second.
+
+    Raises:
+        RecordingError: there is no such file, or it is no recording of ours.
+        EnvironmentNotUsable: the environment is not installed, for a rerun.
     """
+    refuse_foreign(path)
+    damage = ""
     try:
         check_integrity(path)
-        with open_recording(path) as recording:
-            return _compare(recording, rerun)
     except RecordingError as error:
-        return Verification(path, finding=str(error))
+        damage = str(error)
+    try:
+        with open_recording(path) as recording:
+            found = _lost(recording) or _compare(recording, rerun, report)
+            damage = damage and damage + _first_unreadable(recording)
+    except (RecordingError, ConfigError) as error:
+        return Verification(path, finding=_with_place(path, damage or str(error)))
+    if not damage:
+        return found
+    if found.sound:
+        return replace(found, finding=damage, content_digest="")
+    return replace(found, notes=(*found.notes, damage))
 
 
-def _compare(recording: Recording, rerun: bool) -> Verification:
+def refuse_foreign(path: Path) -> None:
+    """Refuse a file that another program's MCAP writer wrote, or that is no MCAP file.
+
+    Raises:
+        RecordingError: it is one, or it cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(4096)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+    if not start.startswith(MCAP0_MAGIC[: max(len(start), 1)]):
+        raise RecordingError(
+            f"{path}: found {start[:8]!r} at its start, expected an MCAP file: not a dualtaxi recording."
+        )
+    head = start[len(MCAP0_MAGIC) :]
+    if len(head) < 13 or head[0] != Opcode.HEADER:
+        return
+    (length,) = struct.unpack_from("<I", head, 9)
+    profile = head[13 : 13 + length]
+    if length < len(head) and profile != schema.PROFILE.encode():
+        raise RecordingError(
+            f"{path}: found an MCAP file of profile {profile.decode(errors='replace')!r}, expected "
+            f"{schema.PROFILE!r}: not a dualtaxi recording."
+        )
+
+
+def _lost(recording: Recording) -> Verification | None:
+    """Return the finding on a recording of which a repair could not save all."""
+    if not recording.lost:
+        return None
+    holes = "; ".join(
+        f"{topic}: found none of number {first} to {behind - 1}, expected {behind - first}"
+        for topic, places in recording.lost.items()
+        for first, behind in places
+    )
+    return Verification(
+        recording.path, f"{recording.path}: {holes}: lost in a repair. `dualtaxi resume` does the run anew."
+    )
+
+
+def _compare(recording: Recording, rerun: bool, report: Report) -> Verification:
     config = from_mapping(recording.config)
     job = Job(config, int(recording.run["seed"]))
+    if recording.run["job"] != job.identity:
+        return _other_job(recording, job.identity)
     mdp = load_mdp(config.env.id, config.env.kwargs, config.rewards) if rerun else recording.mdp
     complete = recording.result.get("status") == "finished"
     past = Past(recording, complete, without_steps=config.recording.steps == "none")
-    session = rerun_session(job, mdp, recording, past)
-    facts: dict[str, Any] = {
-        "provenance": differing_provenance(recording) if rerun else {},
-        "notes": () if complete else ("the run was interrupted; verified as far as it got",),
-    }
+    session = rerun_session(job, mdp, recording, past, report)
+    found = Verification(
+        recording.path,
+        notes=() if complete else ("the run did not end; verified as far as it got",),
+        provenance=_explanations(recording, mdp) if rerun else {},
+    )
     try:
-        session.run()
+        ended = session.run()
         topics = session.recorder.drain()
-        if complete:
+        if complete or ended:
             past.check_over()
     except Diverged as error:
+        return replace(found, finding=str(error), difference=error)
+    finally:
         session.recorder.abandon()
-        return Verification(recording.path, str(error), error, **facts)
     steps = session.recorder.steps
-    facts |= {"train_steps": steps["train"], "eval_steps": steps["eval"]}
-    if not complete:
-        return Verification(recording.path, **facts)
-    found, expected = recording.result.get("content_digest"), combine(topics)
-    finding = "" if found == expected else f"content digest: found {found}, expected {expected}"
-    return Verification(recording.path, finding, content_digest=expected, **facts)
+    found = replace(found, train_steps=steps["train"], eval_steps=steps["eval"])
+    return _compare_result(found, recording, session.summary(topics)) if complete else found
 
 
-def rerun_session(job: Job, mdp: Mdp, recording: Recording, past: Past) -> Session:
+def _compare_result(found: Verification, recording: Recording, summary: dict[str, Any]) -> Verification:
+    """Return the finding on what the recording says of itself at its end."""
+    for key, expected in summary.items():
+        if recording.result.get(key) != expected:
+            difference = Diverged("metadata result", key, recording.result.get(key), expected)
+            return replace(found, finding=str(difference), difference=difference)
+    return replace(found, content_digest=summary["content_digest"])
+
+
+def _other_job(recording: Recording, expected: str) -> Verification:
+    error = Diverged("metadata run", "job", recording.run["job"], expected)
+    return Verification(recording.path, str(error), error)
+
+
+def rerun_session(
+    job: Job, mdp: Mdp, recording: Recording, past: Past, report: Report = lambda _: None
+) -> Session:
     """Return a session that does a recorded job again, in memory, against its past."""
     learner = Learner(job.config, mdp, job.seed, initial_tables(recording))
     recorder = recorder_for(job, learner, None, past)
-    return Session(job, learner, recorder, stop=lambda: past.exhausted and not past.complete)
+    caught_up = _catching_up(recording, past, recorder.counts)
+    return Session(job, learner, recorder, report, stop=lambda: not past.complete and caught_up())
+
+
+def _catching_up(recording: Recording, past: Past, counts: dict[str, int]) -> Callable[[], bool]:
+    """Return what says whether everything recorded was compared; `counts` are the messages so far."""
+    variable = set(schema.TOPICS) - set(schema.BLOCK_TOPICS) - {schema.LOG_TOPIC}
+    recorded = {topic.name: recording.count(topic) for topic in variable}
+    return lambda: past.exhausted and all(counts[name] >= count for name, count in recorded.items())
 
 
 def initial_tables(recording: Recording) -> list[NDArray[np.float64]] | None:
-    """Return the tables that a run began with, from its first snapshots; None if it was cut off before."""
+    """Return the tables that a run took over from another one, from its own first snapshots.
+
+    None if it took over none, or was cut off before them: its configuration says what it begins with.
+    """
+    if not isinstance(from_mapping(recording.config).initial_q, RunTable):
+        return None
     tables: list[NDArray[np.float64]] = []
     for snapshot in recording.snapshots():
         if snapshot.step or snapshot.table != len(tables):
@@ -119,3 +216,41 @@ def differing_provenance(recording: Recording) -> dict[str, tuple[str, str]]:
         for key in sorted({*recording.provenance, *here})
         if recording.provenance.get(key) != here.get(key)
     }
+
+
+def differing_environment(recording: Recording, mdp: Mdp) -> dict[str, tuple[str, str]]:
+    """Return which arrays of an environment are not the recorded ones, in the same form."""
+    then, now = recording.mdp.arrays(), mdp.arrays()
+    return {
+        f"environment.{name}": ("as recorded", "another")
+        for name in sorted({*then, *now})
+        if name not in then or name not in now or not np.array_equal(then[name], now[name])
+    }
+
+
+def _explanations(recording: Recording, mdp: Mdp) -> dict[str, tuple[str, str]]:
+    """Return what may explain that a rerun differs."""
+    differing = differing_provenance(recording) | differing_environment(recording, mdp)
+    return {key: values for key, values in differing.items() if key not in CIRCUMSTANCES}
+
+
+def _with_place(path: Path, damage: str) -> str:
+    """Return what is damaged, with the first message that cannot be read for it, if that can be told."""
+    try:
+        with open_recording(path) as recording:
+            return damage + _first_unreadable(recording)
+    except RecordingError:
+        return damage
+
+
+def _first_unreadable(recording: Recording) -> str:
+    """Return in words which message is the first that cannot be read; empty if all can."""
+    for topic in schema.BLOCK_TOPICS:
+        name = schema.NUMBERED_BY[topic.message]
+        number = 0
+        try:
+            for block in recording.blocks(topic):
+                number = int(block[name][-1]) + 1
+        except RecordingError:
+            return f" {topic.name}: {name} {number} is the first that cannot be read."
+    return ""
