@@ -3,7 +3,8 @@
 An environment offers its arrays as documented attributes of `env.unwrapped` (`transitions`, `agents`,
 `agent_action_counts`, `event_names`, `success_events`, `penalty_below`, `scene`, `scene_cells`,
 `scene_carriers`), or only Gymnasium's customary `P` and `initial_state_distrib`; what it does not offer
-is left out, not invented. From here on nothing knows which environment it was.
+is left out, not invented; for Gymnasium's own grid worlds `runner.toy_text` says it. From here on nothing
+knows which environment it was.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from runner.config.values import plain
 from runner.errors import EnvironmentNotUsable, nearest
+from runner.toy_text import grid_world
 
 MAX_EVENTS = 31
 MAX_AGENTS = 31
@@ -157,20 +159,24 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
     limit = env.spec.max_episode_steps if env.spec is not None else None
     transitions = _transitions(env_id, base)
     joint = transitions["next_state"].shape[1]
+    described = grid_world(env_id, base, transitions)
+    said: Any = described or base
+    if described is not None:
+        transitions["events"] = described.events
     mdp = Mdp(
         env_id=env_id,
         kwargs=plain(kwargs),
         **transitions,
         start=np.ascontiguousarray(base.initial_state_distrib, dtype=np.float64),
         step_limit=int(limit or 0),
-        agents=tuple(getattr(base, "agents", ("agent",))),
+        agents=tuple(getattr(said, "agents", ("agent",))),
         action_counts=tuple(int(n) for n in getattr(base, "agent_action_counts", (joint,))),
-        event_names=tuple(getattr(base, "event_names", ())),
-        success_events=tuple(getattr(base, "success_events", ())),
-        penalty_below=float(getattr(base, "penalty_below", -np.inf)),
-        scene=getattr(base, "scene", None),
-        scene_cells=getattr(base, "scene_cells", None),
-        scene_carriers=getattr(base, "scene_carriers", None),
+        event_names=tuple(getattr(said, "event_names", ())),
+        success_events=tuple(getattr(said, "success_events", ())),
+        penalty_below=float(getattr(said, "penalty_below", -np.inf)),
+        scene=getattr(said, "scene", None),
+        scene_cells=getattr(said, "scene_cells", None),
+        scene_carriers=getattr(said, "scene_carriers", None),
     )
     env.close()
     _check(mdp)

@@ -30,7 +30,7 @@ GAMES = {
     "slipping": {"env": {"kwargs": {"slip": 0.2}}} | COMPETITIVE,
     "frozen lake": {"env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": True}}},
     "taxi": {"env": {"id": "Taxi-v4"}},
-    "taxi in the rain": {"env": {"id": "Taxi-v4", "kwargs": {"is_rainy": True, "fickle_passenger": True}}},
+    "taxi in the rain": {"env": {"id": "Taxi-v4", "kwargs": {"is_rainy": True}}},
     "cliff": {"env": {"id": "CliffWalking-v1", "kwargs": {"max_episode_steps": 70}}},
 }
 RULES = {
