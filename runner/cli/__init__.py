@@ -26,8 +26,10 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "ls": ("runner.cli.commands.ls", "List the recorded runs."),
         "show": ("runner.cli.commands.show", "Tell all about a run: evaluations, tables, configuration."),
         "play": ("runner.cli.commands.play", "Replay a recorded episode in the terminal."),
+        "view": ("runner.cli.commands.view", "Look at runs in the Rerun viewer."),
         "plot": ("runner.cli.commands.plot", "Draw every metric of one or several runs over episodes."),
         "report": ("runner.cli.commands.report", "Write one self-contained page about one or several runs."),
+        "export": ("runner.cli.commands.export", "Write a run in a form that other programs read."),
         "table": ("runner.cli.commands.table", "Print an environment's transition table in words."),
     },
     "Set up": {

@@ -1,0 +1,42 @@
+"""`dualtaxi export`: a run in another form; each form is imported when it is asked for."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Final
+
+import click
+
+from runner.errors import nearest
+
+FORMS: Final[dict[str, tuple[str, str]]] = {
+    "rerun": ("runner.cli.commands.export_rerun", "For the Rerun viewer: every view of chosen episodes."),
+}
+"""Form -> its module, which has the command as `command`, and its short help."""
+
+
+class _Forms(click.Group):
+    """The commands of `FORMS`, imported one by one."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Return the forms."""
+        return list(FORMS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a form's command."""
+        if cmd_name not in FORMS:
+            if not ctx.resilient_parsing:
+                ctx.fail(f"there is no export {cmd_name!r}.{nearest(cmd_name, FORMS)}")
+            return None
+        command: click.Command = importlib.import_module(FORMS[cmd_name][0]).command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """Write the forms, from their short help alone."""
+        with formatter.section("Forms"):
+            formatter.write_dl([(name, text) for name, (_, text) in FORMS.items()])
+
+
+@click.group("export", cls=_Forms)
+def command() -> None:
+    """Write a run in a form that other programs read."""

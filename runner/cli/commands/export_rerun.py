@@ -1,0 +1,157 @@
+"""`dualtaxi export rerun`: an `.rrd` file for the Rerun viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.output import duration, say, size
+
+if TYPE_CHECKING:
+    from runner.export.rerun.selection import Request, Selection
+
+
+class EpisodeRanges(click.ParamType):  # type: ignore[type-arg,unused-ignore]
+    """`0:20,49980:50000`: ranges of episodes; a single number is that episode."""
+
+    name = "ranges"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[tuple[int, int | None], ...]:
+        """Return (start, stop) of each range; an open end is None."""
+        if isinstance(value, tuple):
+            return value
+        return tuple(self._range(part.strip(), param, ctx) for part in value.split(","))
+
+    def _range(
+        self, text: str, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int | None]:
+        start, colon, stop = text.partition(":")
+        known = all(number == "" or number.isdecimal() for number in (start, stop))
+        if not known or not (start or colon):
+            self.fail(f"found {text!r}, expected START:STOP or N, such as 0:20,49980:50000", param, ctx)
+        first = int(start or 0)
+        return first, (int(stop) if stop else None) if colon else first + 1
+
+
+class Numbers(click.ParamType):  # type: ignore[type-arg,unused-ignore]
+    """Numbers parted by commas."""
+
+    name = "numbers"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, ...]:
+        """Return the numbers."""
+        if isinstance(value, tuple):
+            return value
+        parts = [part.strip() for part in value.split(",")]
+        if not all(part.isdecimal() for part in parts):
+            self.fail(f"found {value!r}, expected numbers such as 1000,49000", param, ctx)
+        return tuple(int(part) for part in parts)
+
+
+def choice_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that choose steps."""
+    for option in (
+        click.option("--all", "everything", is_flag=True, help="Every step of the run."),
+        click.option("--every", type=click.IntRange(1), metavar="N", help="Each Nth training episode."),
+        click.option(
+            "--eval",
+            "evaluations",
+            type=Numbers(),
+            metavar="N[,N]",
+            help="The trials of the evaluation after N training episodes.",
+        ),
+        click.option(
+            "--episodes",
+            type=EpisodeRanges(),
+            metavar="RANGES",
+            help="Training episodes, such as 0:20,49980:50000.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def request_of(
+    episodes: tuple[tuple[int, int | None], ...] | None,
+    evaluations: tuple[int, ...] | None,
+    every: int | None,
+    everything: bool,
+) -> Request:
+    """Return what the options ask for."""
+    from runner.export.rerun.selection import Request
+
+    return Request(episodes or (), evaluations or (), every or 0, everything)
+
+
+def tell(selection: Selection) -> None:
+    """Say what is exported and what is not."""
+    for warning in selection.warnings:
+        say(warning)
+    if selection.chosen:
+        say("Exported: all metrics; " + "; ".join(selection.chosen) + ".")
+    for left in selection.left_out:
+        say(f"Left out: {left}.")
+
+
+@click.command("rerun")
+@run_argument
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE.rrd",
+    help="The file to write.  [default: NAME-RUN.rrd]",
+)
+@choice_options
+@click.option("--force", is_flag=True, help="Replace the file if it exists.")
+@recordings_option
+def command(
+    run_name: str,
+    output: Path | None,
+    episodes: tuple[tuple[int, int | None], ...] | None,
+    evaluations: tuple[int, ...] | None,
+    every: int | None,
+    everything: bool,
+    force: bool,
+    recordings: Path | None,
+) -> None:
+    r"""Export RUN for the Rerun viewer, arranged and ready to look at.
+
+    All metrics are exported. Of the steps, unless told otherwise, those of 20 training episodes spread
+    from the first to the last, and the trials of the last evaluation: what is left out is said.
+
+    \b
+    Examples:
+      dualtaxi export rerun @latest
+      dualtaxi export rerun k3v9m2xq -o look.rrd --episodes 0:20,49980: --eval 49000
+      dualtaxi export rerun k3v9m2xq --all --force
+    """
+    import time
+
+    from runner.errors import StorageError
+    from runner.export.rerun.viewer import require_rerun
+    from runner.recording.reader import open_recording
+
+    require_rerun("export rerun")
+    from runner.export.rerun.writing import Source, export
+
+    started = time.monotonic()
+    run = find(run_name, recordings)
+    path = output or Path(f"{run.name}-{run.run_id}.rrd")
+    if path.exists() and not force:
+        raise StorageError(f"{path}: exists already; choose another file by -o, or replace it by --force.")
+    request = request_of(episodes, evaluations, every, everything)
+    with open_recording(run.recording) as recording:
+        source = Source(recording, f"{run.name}, seed {run.seed} ({run.run_id})")
+        (selection,) = export([source], request, path)
+    tell(selection)
+    took = duration(time.monotonic() - started)
+    click.echo(f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}")

@@ -1,0 +1,119 @@
+"""`dualtaxi view`: runs in the Rerun viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli.commands.export_rerun import choice_options, request_of, tell
+from runner.cli.options import RunName, find, recordings_option
+from runner.cli.output import say
+
+if TYPE_CHECKING:
+    from runner.export.rerun.spots import Spot
+
+
+class _Spot(click.ParamType):  # type: ignore[type-arg,unused-ignore]
+    """`EPISODE:T`, or `eval:N:TRIAL:T`."""
+
+    name = "spot"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, ...]:
+        """Return (episode, t) or (N, trial, t)."""
+        if isinstance(value, tuple):
+            return value
+        parts = value.removeprefix("eval:").split(":")
+        wanted = 3 if value.startswith("eval:") else 2
+        if not 1 <= len(parts) <= wanted or not all(part.isdecimal() for part in parts):
+            self.fail(f"found {value!r}, expected EPISODE:T such as 120:5, or eval:N:TRIAL:T", param, ctx)
+        return tuple(int(part) for part in parts) + (0,) * (wanted - len(parts))
+
+
+@click.command("view")
+@click.argument("run_names", metavar="RUN [RUN]", nargs=-1, required=True, type=RunName())
+@click.option(
+    "--at",
+    "spot",
+    type=_Spot(),
+    metavar="EPISODE:T",
+    help="Where to look: a step of a training episode; eval:N:TRIAL:T for a step of an evaluation.",
+)
+@click.option("--web", is_flag=True, help="Serve the web viewer on 127.0.0.1 instead of opening a window.")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    metavar="PORT",
+    help="Of the viewer.  [default: any free]",
+)
+@click.option(
+    "--screenshot",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE.png",
+    help="Draw one frame into a file; needs no screen.",
+)
+@click.option(
+    "--size", "picture_size", default="1600x900", show_default=True, metavar="WxH", help="Of the screenshot."
+)
+@choice_options
+@recordings_option
+def command(
+    run_names: tuple[str, ...],
+    spot: tuple[int, ...] | None,
+    web: bool,
+    port: int,
+    screenshot: Path | None,
+    picture_size: str,
+    episodes: tuple[tuple[int, int | None], ...] | None,
+    evaluations: tuple[int, ...] | None,
+    every: int | None,
+    everything: bool,
+    recordings: Path | None,
+) -> None:
+    r"""Look at RUN in the Rerun viewer, at the right spot; at two runs side by side.
+
+    The run is exported first, unless it was before; which steps, is chosen as for `export rerun`, and the
+    episode of --at is among them. It ends when the viewer is closed, or by Ctrl-C.
+
+    \b
+    Examples:
+      dualtaxi view @latest
+      dualtaxi view @latest --at 2999:3
+      dualtaxi view first second --web
+      dualtaxi view @latest --at eval:3000:0:4 --screenshot step.png
+    """
+    if len(run_names) > 2:
+        raise click.UsageError(f"found {len(run_names)} runs, expected one or two.")
+    from runner.export.rerun.viewer import require_rerun
+
+    require_rerun("view")
+    from runner.export.rerun.cache import exported
+    from runner.export.rerun.spots import with_spot
+
+    runs = [find(name, recordings) for name in run_names]
+    request = request_of(episodes, evaluations, every, everything)
+    place = with_spot(runs[0], request, spot)
+    path, selections = exported(runs, place.request)
+    for selection in selections:
+        tell(selection)
+    _show(path, place, web, port, screenshot, picture_size)
+
+
+def _show(path: Path, place: Spot, web: bool, port: int, screenshot: Path | None, picture_size: str) -> None:
+    """Show an exported file, in the way that is asked for."""
+    from runner.export.rerun import viewer
+
+    if screenshot is not None:
+        viewer.screenshot(path, place.time, screenshot, picture_size)
+        click.echo(screenshot)
+    elif web:
+        with viewer.web_viewer(path, viewer.check_port(port)) as (process, address):
+            click.echo(address)
+            say(f"Step {place.time:,} is the spot. Ctrl-C ends it.")
+            process.wait()
+    else:
+        viewer.open_window(path, place.time, viewer.check_port(port))

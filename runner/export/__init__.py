@@ -1,0 +1,1 @@
+"""Recordings in other forms: pictures, plots, and what other viewers read."""

@@ -1,0 +1,267 @@
+"""How the viewer arranges a run: the blueprint, and the parts of the picture that never change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from runner.export.rerun.scene import INK, Scene, action_labels, agent_label
+from runner.export.rerun.steps import BAR_LEFT, BAR_LENGTH, CHOSEN_X, GREEDY_X, LABEL_RISE, NUMBER_X, bar_rows
+from runner.mdp import Mdp
+
+FRAMES_A_SECOND: Final = 10.0
+_PLOTS: Final = (
+    ("Trials finished (%)", ("eval/metrics/finish_percent",)),
+    ("Episode length (mean)", ("train/metrics/episode_length", "eval/metrics/episode_length")),
+    ("Return of an episode (mean)", ("train/metrics/returns", "eval/metrics/returns")),
+    ("Penalties an episode", ("train/metrics/penalties", "eval/metrics/penalties")),
+    ("Collisions an episode", ("train/metrics/collisions", "eval/metrics/collisions")),
+    ("Q-table filled (%)", ("train/metrics/filled_percent",)),
+    ("Epsilon, step size", ("train/metrics/epsilon", "train/metrics/step_size")),
+    ("Rewards (% of the last steps)", ("train/metrics/reward_percent",)),
+)
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What the blueprint needs to know of a run."""
+
+    root: str
+    title: str
+    mdp: Mdp
+    scene: Scene | None
+    learners: tuple[str, ...]
+    steps: bool
+    """Whether any steps are exported."""
+    last: int
+    """Steps executed in the whole run."""
+    paths: frozenset[str]
+    """Metrics that there are."""
+
+
+def blueprint(runs: Sequence[Shown]) -> rrb.Blueprint:
+    """Return the arrangement for one run, or for several side by side."""
+    last = max(run.last for run in runs)
+    plots = _plots(runs, last)
+    with_steps = [run for run in runs if run.steps]
+    if len(runs) == 1:
+        parts = [*(_single(with_steps[0]) if with_steps else ()), plots]
+        shares = [4, 3, 4] if len(parts) == 3 else [1] * len(parts)
+        body: Any = rrb.Horizontal(*parts, column_shares=shares)
+    else:
+        columns = [rrb.Vertical(*_pair(run), row_shares=[3, 2], name=run.title) for run in with_steps]
+        body = rrb.Vertical(rrb.Horizontal(*columns), plots, row_shares=[3, 2]) if columns else plots
+    return rrb.Blueprint(
+        body,
+        rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_A_SECOND),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+    )
+
+
+def _single(run: Shown) -> list[Any]:
+    left = rrb.Vertical(_grid(run), _events(run), row_shares=[3, 1])
+    right = [_values(run), *_maps(run)]
+    return [left, rrb.Vertical(*right, row_shares=[4] + [4] * (len(right) - 1))]
+
+
+def _pair(run: Shown) -> list[Any]:
+    return [_grid(run), rrb.Tabs(_values(run), *_maps(run), _events(run))]
+
+
+def _grid(run: Shown) -> Any:
+    if run.scene is None:
+        contents = [
+            f"{run.root}/{phase}/{what}" for phase in ("train", "eval") for what in ("state", "action")
+        ]
+        return rrb.TimeSeriesView(
+            origin=f"{run.root}/", contents=contents, name=f"{run.title}: state and action"
+        )
+    margin = 0.8
+    bounds = rrb.VisualBounds2D(
+        x_range=(-margin, run.scene.columns + margin), y_range=(-margin - 0.1, run.scene.rows + 0.7)
+    )
+    contents = [
+        f"{run.root}/scene/**",
+        f"{run.root}/train/grid/**",
+        f"{run.root}/eval/grid/**",
+        f"{run.root}/notice/**",
+    ]
+    return rrb.Spatial2DView(origin=f"{run.root}/", contents=contents, visual_bounds=bounds, name=run.title)
+
+
+def _values(run: Shown) -> Any:
+    bottom = float(bar_rows(run.mdp)[-1][-1]) + 0.9
+    bounds = rrb.VisualBounds2D(x_range=(-0.2, CHOSEN_X + 1.6), y_range=(-1.4, bottom))
+    contents = [f"{run.root}/table/**", f"{run.root}/train/q/**", f"{run.root}/eval/q/**"]
+    return rrb.Spatial2DView(
+        origin=f"{run.root}/",
+        contents=contents,
+        visual_bounds=bounds,
+        name="Q-values of this state, before the move",
+    )
+
+
+def _maps(run: Shown) -> list[Any]:
+    if run.scene is None or run.scene.placements is None:
+        return []
+    pictures = run.scene.placements
+    bounds = rrb.VisualBounds2D(x_range=(-0.5, pictures.width + 0.5), y_range=(-2.2, pictures.height + 0.5))
+    views = []
+    for learner in run.learners:
+        contents = [
+            f"{run.root}/frame/**",
+            f"{run.root}/train/map/{learner}/**",
+            f"{run.root}/eval/map/{learner}/**",
+        ]
+        views.append(
+            rrb.Spatial2DView(
+                origin=f"{run.root}/",
+                contents=contents,
+                visual_bounds=bounds,
+                name=f"Max Q and greedy moves: {agent_label(learner)}",
+            )
+        )
+    return views
+
+
+def _events(run: Shown) -> Any:
+    contents = [f"{run.root}/train/events", f"{run.root}/eval/events"]
+    return rrb.TextLogView(origin=f"{run.root}/", contents=contents, name="Events")
+
+
+def _plots(runs: Sequence[Shown], last: int) -> Any:
+    axis = rrb.TimeAxis(
+        view_range=rr.TimeRange(
+            start=rr.TimeRangeBoundary.absolute(seq=0), end=rr.TimeRangeBoundary.absolute(seq=last)
+        )
+    )
+    views = []
+    for name, paths in _PLOTS:
+        contents = [f"{run.root}/{path}" for run in runs for path in paths if path in run.paths]
+        if contents:
+            views.append(
+                rrb.TimeSeriesView(
+                    origin="/",
+                    contents=contents,
+                    name=name,
+                    axis_x=axis,
+                    plot_legend=rrb.PlotLegend(visible=True),
+                )
+            )
+    return rrb.Grid(*views, grid_columns=2 if len(runs) == 1 else 4)
+
+
+def draw_background(stream: rr.RecordingStream, run: Shown) -> None:
+    """Log what never changes: cells, walls, landmarks, and the frame of the table of values."""
+    if run.steps:
+        _draw_table(stream, run)
+    if run.scene is not None and run.steps:
+        _draw_scene(stream, f"{run.root}/scene", run.scene)
+        _draw_frame(stream, f"{run.root}/frame", run.scene)
+
+
+def _draw_scene(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
+    rows, columns = scene.rows, scene.columns
+    across: list[Any] = [[(0, y), (columns, y)] for y in range(rows + 1)]
+    down = [[(x, 0), (x, rows)] for x in range(columns + 1)]
+    stream.log(
+        f"{path}/cells",
+        rr.LineStrips2D(across + down, colors=[(128, 128, 128, 90)], radii=0.008, draw_order=10),
+        static=True,
+    )
+    border: Any = [(0, 0), (columns, 0), (columns, rows), (0, rows), (0, 0)]
+    walls = [border, *(_wall(first, second) for first, second in scene.description["walls"])]
+    stream.log(
+        f"{path}/walls",
+        rr.LineStrips2D(walls, colors=[(128, 128, 128)], radii=0.05, draw_order=25),
+        static=True,
+    )
+    marks = scene.description["landmarks"]
+    tints = [(*_rgb(mark["colour"]), 110) for mark in marks]
+    if marks:
+        stream.log(
+            f"{path}/landmarks",
+            rr.LineStrips2D(
+                [_square(*mark["cell"]) for mark in marks], colors=tints, radii=0.23, draw_order=5
+            ),
+            static=True,
+        )
+        stream.log(
+            f"{path}/names",
+            rr.Points2D(
+                [(c + 0.14, r + 0.06) for r, c in (mark["cell"] for mark in marks)],
+                labels=[mark["name"] for mark in marks],
+                colors=[_rgb(mark["colour"]) for mark in marks],
+                radii=0.0,
+                show_labels=True,
+                draw_order=26,
+            ),
+            static=True,
+        )
+
+
+def _square(row: int, column: int) -> list[tuple[float, float]]:
+    """Return a line that fills a cell when it is drawn 0.46 wide."""
+    low, high = 0.25, 0.75
+    x, y = float(column), float(row)
+    return [
+        (x + low, y + low),
+        (x + high, y + low),
+        (x + high, y + high),
+        (x + low, y + high),
+        (x + low, y + low),
+        (x + high, y + high),
+    ]
+
+
+def _wall(first: Sequence[int], second: Sequence[int]) -> list[tuple[float, float]]:
+    (row, column), (other_row, other_column) = first, second
+    if row == other_row:
+        x = max(column, other_column)
+        return [(x, row), (x, row + 1)]
+    y = max(row, other_row)
+    return [(column, y), (column + 1, y)]
+
+
+def _draw_table(stream: rr.RecordingStream, run: Shown) -> None:
+    """Log the words around the table of values."""
+    places: list[tuple[float, float]] = []
+    labels: list[str] = []
+    for agent, rows, names in zip(run.mdp.agents, bar_rows(run.mdp), action_labels(run.mdp), strict=True):
+        labels.append(agent_label(agent).upper())
+        places.append((1.0, float(rows[0]) - 1.35))
+        labels += names
+        places += [(1.0, float(y) - LABEL_RISE) for y in rows]
+    top = -0.9
+    labels += ["worst to best", "Q-value", "greedy", "chosen"]
+    places += [(BAR_LEFT + BAR_LENGTH / 2, top), (NUMBER_X, top), (GREEDY_X, top), (CHOSEN_X, top)]
+    stream.log(
+        f"{run.root}/table/words",
+        rr.Points2D(places, labels=labels, colors=[_rgb(INK)], radii=0.0, show_labels=True),
+        static=True,
+    )
+
+
+def _draw_frame(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
+    """Log the lines between the blocks of the map."""
+    pictures = scene.placements
+    if pictures is None:
+        return
+    rows, columns = pictures.block
+    across = [[(0, y), (pictures.width, y)] for y in range(0, pictures.height + 1, rows)]
+    down = [[(x, 0), (x, pictures.height)] for x in range(0, pictures.width + 1, columns)]
+    stream.log(
+        f"{path}/blocks",
+        rr.LineStrips2D(across + down, colors=[(255, 255, 255)], radii=0.06, draw_order=30),
+        static=True,
+    )
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

@@ -1,0 +1,262 @@
+"""Which steps of a recording are exported: chosen by episode, or a spread of them when nothing is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.reader import Recording
+
+SPREAD: Final = 20
+"""Training episodes of the default choice."""
+SPREAD_STEPS: Final = 50_000
+"""Steps at which the default choice of training episodes stops growing, however long episodes are."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What was asked for; nothing of it means the default choice."""
+
+    episodes: tuple[tuple[int, int | None], ...] = ()
+    """Ranges of training episodes, the second number not included; None is the end."""
+    evaluations: tuple[int, ...] = ()
+    """Evaluations, named by the training episodes before them."""
+    every: int = 0
+    """Each so many training episodes; 0 for none."""
+    everything: bool = False
+    spread: bool = False
+    """The default choice beside the rest."""
+
+    @property
+    def is_default(self) -> bool:
+        """Whether the default choice is exported: nothing was asked for, or it was."""
+        return self.spread or not (self.episodes or self.evaluations or self.every or self.everything)
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """Where each episode of a phase lies; the last may be one that never ended."""
+
+    phase: str
+    first_step: NDArray[np.int64]
+    """[E + 1]: number of the first step within the phase; the last entry is the number of steps."""
+    ended: int
+
+    @property
+    def count(self) -> int:
+        """Episodes that have steps."""
+        return len(self.first_step) - 1
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """One evaluation's trials."""
+
+    after: int
+    """Training episodes before it."""
+    train_step: int
+    """Training steps before it."""
+    start: int
+    """First trial, counted over all evaluations."""
+    stop: int
+
+
+@dataclass(frozen=True)
+class Span:
+    """Steps `start` up to `stop` of a phase, of whole episodes that follow each other."""
+
+    start: int
+    stop: int
+    episode: int
+    """The first of them."""
+
+
+@dataclass
+class Selection:
+    """The chosen steps, and what to say about the choice."""
+
+    train: list[Span] = field(default_factory=list)
+    evaluations: list[tuple[Evaluation, Span]] = field(default_factory=list)
+    chosen: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def steps(self) -> int:
+        """How many steps are chosen."""
+        spans = [*self.train, *(span for _, span in self.evaluations)]
+        return sum(span.stop - span.start for span in spans)
+
+
+def select(recording: Recording, request: Request) -> Selection:
+    """Return the steps that a request means.
+
+    Raises:
+        RecordingError: an episode or evaluation does not exist, or steps are asked for and not recorded.
+    """
+    selection = Selection()
+    if not recording.finished or recording.result.get("status", "interrupted") != "finished":
+        selection.warnings.append(_interrupted(recording))
+    if _has_no_steps(recording):
+        _without_steps(recording, request, selection)
+        return selection
+    train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
+    evaluations = evaluations_of(recording, train, evals)
+    numbers = _training_episodes(recording, request, train)
+    selection.train = spans_of(train, numbers)
+    wanted = _evaluations(recording, request, evaluations)
+    selection.evaluations = [
+        (one, span) for one in wanted for span in spans_of(evals, np.arange(one.start, one.stop))
+    ]
+    _tell(selection, request, train, numbers, evaluations, wanted)
+    return selection
+
+
+def episodes_of(recording: Recording, phase: str) -> Episodes:
+    """Return where the episodes of a phase lie, one that never ended among them."""
+    steps, episodes = schema.PHASES[phase]
+    ends = [np.zeros(1, np.int64)]
+    ends += [block["last_step"].astype(np.int64) + 1 for block in recording.blocks(episodes)]
+    total = recording.count(steps)
+    first = np.concatenate(ends)
+    first = first[first <= total]
+    ended = len(first) - 1
+    return Episodes(phase, np.append(first, total) if total > first[-1] else first, ended)
+
+
+def evaluations_of(recording: Recording, train: Episodes, evals: Episodes) -> list[Evaluation]:
+    """Return the evaluations that have steps, one that was cut off among them."""
+    if not evals.count:
+        return []
+    trials = int(recording.config["evaluation"]["trials"])
+    found = []
+    for start in range(0, evals.count, trials):
+        step = int(evals.first_step[start])
+        record = next(recording.blocks(schema.EVAL_STEP, step, step + 1))[0]
+        trained = int(record["log_time"]) // schema.STEP_NANOSECONDS - (step + 1)
+        after = int(np.searchsorted(train.first_step[1 : train.ended + 1], trained, side="right"))
+        found.append(Evaluation(after, trained, start, min(start + trials, evals.count)))
+    return found
+
+
+def spans_of(episodes: Episodes, numbers: NDArray[np.int64]) -> list[Span]:
+    """Return the spans of these episodes, ascending; neighbours are one span."""
+    if not len(numbers):
+        return []
+    breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
+    runs = np.split(numbers, breaks)
+    first = episodes.first_step
+    return [Span(int(first[run[0]]), int(first[run[-1] + 1]), int(run[0])) for run in runs]
+
+
+def _training_episodes(recording: Recording, request: Request, train: Episodes) -> NDArray[np.int64]:
+    """Return the numbers of the training episodes that are meant, ascending."""
+    if request.everything:
+        return np.arange(train.count)
+    numbers = [_spread(train)] if request.is_default else []
+    if request.every:
+        numbers.append(np.arange(0, train.count, request.every))
+    for start, stop in request.episodes:
+        end = train.count if stop is None else stop
+        if start >= end or end > train.count:
+            raise RecordingError(
+                f"{recording.path}: found no training episodes {start}:{end}; "
+                f"there are {train.count:,}, from 0. Ranges are START:STOP, STOP not included."
+            )
+        numbers.append(np.arange(start, end))
+    return np.unique(np.concatenate(numbers)) if numbers else np.empty(0, np.int64)
+
+
+def _spread(train: Episodes) -> NDArray[np.int64]:
+    """Return episodes evenly spread from the first to the last, no more than are worth it."""
+    if not train.count:
+        return np.empty(0, np.int64)
+    lengths = np.diff(train.first_step)
+    for count in range(min(SPREAD, train.count), 1, -1):
+        numbers = np.unique(np.linspace(0, train.count - 1, count).round().astype(np.int64))
+        if int(lengths[numbers].sum()) <= SPREAD_STEPS:
+            return numbers
+    return np.unique([0, train.count - 1]).astype(np.int64)
+
+
+def _evaluations(
+    recording: Recording, request: Request, evaluations: Sequence[Evaluation]
+) -> list[Evaluation]:
+    """Return the evaluations that are meant."""
+    if request.everything:
+        return list(evaluations)
+    by_episode = {one.after: one for one in evaluations}
+    for after in request.evaluations:
+        if after not in by_episode:
+            known = ", ".join(str(number) for number in by_episode)
+            shown = known if len(by_episode) <= 12 else f"{known[:60].rpartition(',')[0]}, ..."
+            raise RecordingError(
+                f"{recording.path}: found no evaluation after {after} training episodes, "
+                f"expected one of {shown or 'none: this run has no evaluations'}."
+            )
+    last = {evaluations[-1].after} if request.is_default and evaluations else set()
+    return [by_episode[after] for after in sorted(last | set(request.evaluations))]
+
+
+def _has_no_steps(recording: Recording) -> bool:
+    return recording.config["recording"]["steps"] == "none" or not any(
+        recording.count(topic) for topic in (schema.TRAIN_STEP, schema.EVAL_STEP)
+    )
+
+
+def _without_steps(recording: Recording, request: Request, selection: Selection) -> None:
+    hint = "`dualtaxi rerecord` runs the job again and records them"
+    if not request.is_default:
+        raise RecordingError(f"{recording.path}: was recorded without steps; {hint}.")
+    selection.warnings.append(f"The run was recorded without steps: only metrics are exported; {hint}.")
+
+
+def _interrupted(recording: Recording) -> str:
+    status = recording.result.get("status", "interrupted")
+    return f"The run is {status}: exported is what there is, up to its last whole chunk."
+
+
+def _tell(
+    selection: Selection,
+    request: Request,
+    train: Episodes,
+    numbers: NDArray[np.int64],
+    evaluations: Sequence[Evaluation],
+    wanted: Sequence[Evaluation],
+) -> None:
+    """Say what is exported, what is not, and what would include it."""
+    spread = (
+        f", evenly spread from {numbers[0]} to {numbers[-1]:,}" if request.is_default and len(numbers) else ""
+    )
+    selection.chosen.append(
+        f"the {_steps(selection.train)} steps of {len(numbers):,} of {train.count:,} training episodes"
+        + spread
+    )
+    spans = [span for _, span in selection.evaluations]
+    named = (
+        f" (after {', '.join(f'{one.after:,}' for one in wanted)} episodes)" if 0 < len(wanted) <= 4 else ""
+    )
+    selection.chosen.append(
+        f"the {_steps(spans)} steps of {len(wanted):,} of {len(evaluations):,} evaluations{named}"
+    )
+    if len(numbers) < train.count:
+        selection.left_out.append(
+            f"the steps of {train.count - len(numbers):,} training episodes "
+            "(--episodes START:STOP or --every N includes them; --all: everything)"
+        )
+    if len(wanted) < len(evaluations):
+        rest = [one.after for one in evaluations if one not in wanted]
+        selection.left_out.append(
+            f"the trials of {len(rest):,} evaluations (--eval {rest[-1]} includes the one after {rest[-1]:,} "
+            "episodes; --all: everything)"
+        )
+
+
+def _steps(spans: Sequence[Any]) -> str:
+    return f"{sum(span.stop - span.start for span in spans):,}"

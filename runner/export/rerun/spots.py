@@ -1,0 +1,103 @@
+"""Where to look: a step of an episode as a point of the timeline."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from runner.errors import RecordingError
+from runner.export.rerun.selection import Evaluation, Request, episodes_of, evaluations_of, select
+from runner.recording import schema
+from runner.recording.reader import Recording, open_recording
+from runner.runs import Run
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A point of the timeline, and a request that its episode is part of."""
+
+    time: int
+    request: Request
+
+
+def with_spot(run: Run, request: Request, spot: tuple[int, ...] | None) -> Spot:
+    """Return where a spot is.
+
+    Args:
+        run: whose.
+        request: what is exported anyway.
+        spot: (episode, t) of training, (training episodes, trial, t) of an evaluation, or None for the
+            beginning of what is most worth looking at.
+
+    Raises:
+        RecordingError: there is no such step.
+    """
+    with open_recording(run.recording) as recording:
+        if spot is None:
+            return Spot(_beginning(recording, request), request)
+        phase, step, more = _train_step(recording, *spot) if len(spot) == 2 else _eval_step(recording, *spot)
+        topic = schema.PHASES[phase][0]
+        record = next(recording.blocks(topic, step, step + 1))[0]
+    return Spot(int(record["log_time"]) // schema.STEP_NANOSECONDS, _including(request, more))
+
+
+def _train_step(recording: Recording, episode: int, t: int) -> tuple[str, int, Request]:
+    train = episodes_of(recording, "train")
+    if episode >= train.count:
+        raise RecordingError(
+            f"{recording.path}: found no training episode {episode}; there are {train.count:,}, from 0."
+        )
+    step = _within(recording, train.first_step[episode], train.first_step[episode + 1], t)
+    return "train", step, Request(episodes=((episode, episode + 1),))
+
+
+def _eval_step(recording: Recording, after: int, trial: int, t: int) -> tuple[str, int, Request]:
+    train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
+    for one in evaluations_of(recording, train, evals):
+        if one.after == after:
+            number = _trial(recording, one, trial)
+            step = _within(recording, evals.first_step[number], evals.first_step[number + 1], t)
+            return "eval", step, Request(evaluations=(after,))
+    raise RecordingError(f"{recording.path}: found no evaluation after {after} training episodes.")
+
+
+def _trial(recording: Recording, one: Evaluation, trial: int) -> int:
+    if one.start + trial >= one.stop:
+        raise RecordingError(
+            f"{recording.path}: found no trial {trial} of the evaluation after {one.after} episodes; "
+            f"there are {one.stop - one.start}, from 0."
+        )
+    return one.start + trial
+
+
+def _within(recording: Recording, first: int, stop: int, t: int) -> int:
+    if first + t >= stop:
+        raise RecordingError(
+            f"{recording.path}: found no t = {t} there; the episode has {stop - first} steps, from 0."
+        )
+    return int(first + t)
+
+
+def _including(request: Request, more: Request) -> Request:
+    """Return a request with another's episodes in it; the default choice stays what it is beside them."""
+    if request.everything:
+        return request
+    return dataclasses.replace(
+        request,
+        episodes=request.episodes + more.episodes,
+        evaluations=request.evaluations + more.evaluations,
+        spread=request.spread or request.is_default,
+    )
+
+
+def _beginning(recording: Recording, request: Request) -> int:
+    """Return the first step of the last evaluation exported, or else of the last training episode."""
+    selection = select(recording, request)
+    topic, first = schema.EVAL_STEP, [span.start for _, span in selection.evaluations[-1:]]
+    if not first:
+        topic, first = schema.TRAIN_STEP, [span.start for span in selection.train[-1:]]
+    if not first:
+        return 0
+    return (
+        int(next(recording.blocks(topic, first[0], first[0] + 1))[0]["log_time"]) // schema.STEP_NANOSECONDS
+    )

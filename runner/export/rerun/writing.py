@@ -1,0 +1,288 @@
+"""Exporting runs to one `.rrd` file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from runner.errors import StorageError
+from runner.export.rerun.classes import Vocabulary, vocabulary
+from runner.export.rerun.events import EventWriter
+from runner.export.rerun.layout import Shown, blueprint, draw_background
+from runner.export.rerun.metrics import MetricWriter, send_metrics
+from runner.export.rerun.scene import TRAIL_STEPS, Marks, Scene, marks_of, scene_of
+from runner.export.rerun.selection import Request, Selection, select
+from runner.export.rerun.steps import Batch, StepWriter
+from runner.export.rerun.thoughts import Thinker, Thoughts
+from runner.frames import agents_of
+from runner.recording import schema
+from runner.recording.reader import Recording
+
+BATCH: Final = 8_192
+"""Rows sent at a time: larger columns are dropped by the web viewer."""
+APPLICATION: Final = "dualtaxi"
+
+
+@dataclass(frozen=True)
+class Source:
+    """A run to export."""
+
+    recording: Recording
+    title: str
+    root: str = ""
+    """Entity path that everything of the run is under; empty for the root."""
+    tint: str | None = None
+    """Colour of its metrics, where runs are compared."""
+
+
+def export(sources: Sequence[Source], request: Request, path: Path) -> list[Selection]:
+    """Write runs to an `.rrd` file; return what was chosen of each.
+
+    Raises:
+        RecordingError: a recording cannot be read, or has not what is asked for.
+        StorageError: the file cannot be written.
+    """
+    selections = [select(source.recording, request) for source in sources]
+    fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    stream = rr.RecordingStream(
+        APPLICATION,
+        recording_id="-".join(source.recording.run["run_id"] for source in sources),
+        send_properties=True,
+    )
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    exporters = [
+        RunExporter(stream, source, selection) for source, selection in zip(sources, selections, strict=True)
+    ]
+    try:
+        stream.save(fresh, default_blueprint=blueprint([exporter.shown for exporter in exporters]))
+        stream.send_recording_name(" and ".join(source.title for source in sources))
+        for exporter in exporters:
+            exporter.export()
+        stream.flush()
+        stream.disconnect()
+        fresh.replace(path)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
+    finally:
+        fresh.unlink(missing_ok=True)
+    return selections
+
+
+class RunExporter:
+    """Sends one run to a stream."""
+
+    def __init__(self, stream: rr.RecordingStream, source: Source, selection: Selection) -> None:
+        self._stream = stream
+        self._recording = source.recording
+        self._selection = selection
+        self._source = source
+        self._learners = tuple(agents_of(source.recording))
+        self._scene: Scene | None = scene_of(source.recording.mdp)
+        self._marks: Marks | None = marks_of(self._scene) if self._scene else None
+        steps = [source.recording.count(topic) for topic in (schema.TRAIN_STEP, schema.EVAL_STEP)]
+        self.shown = Shown(
+            source.root,
+            source.title,
+            source.recording.mdp,
+            self._scene,
+            self._learners,
+            bool(selection.steps),
+            max(sum(steps), _last_report(source.recording)),
+            frozenset(_metric_paths(source.recording)),
+        )
+
+    def export(self) -> None:
+        """Send everything that is chosen."""
+        source = self._source
+        writer = MetricWriter(
+            self._stream,
+            source.root,
+            self._learners,
+            source.recording.mdp.event_names,
+            source.tint,
+            source.title if source.tint else "",
+        )
+        send_metrics(writer, self._recording)
+        if not self._selection.steps:
+            return
+        words = self._vocabulary()
+        self._stream.log(f"{source.root}/", rr.AnnotationContext(words.classes.context()), static=True)
+        draw_background(self._stream, self.shown)
+        thinker = Thinker(self._recording, self._scene.placements if self._scene else None)
+        ends = {phase: self._send_phase(phase, words, thinker) for phase in ("train", "eval")}
+        self._send_notice(ends)
+
+    def _send_phase(self, phase: str, words: Vocabulary, thinker: Thinker) -> list[tuple[int, int]]:
+        """Send the steps of a phase; return the stretches of time that they cover."""
+        pieces = self._training(thinker) if phase == "train" else self._evaluating(thinker)
+        mdp = self._recording.mdp
+        writer = StepWriter(
+            self._stream, self._source.root, phase, mdp, self._scene, self._marks, words, self._learners
+        )
+        events = EventWriter(self._stream, writer.path, phase, mdp)
+        dressed = False
+        covered: list[tuple[int, int]] = []
+        for batch in _batches(pieces):
+            if not dressed:
+                writer.dress()
+                dressed = True
+            writer.send(batch)
+            events.send(batch)
+            _cover(covered, batch.time)
+        if covered:
+            writer.clear(stop for _, stop in covered)
+        return covered
+
+    def _training(self, thinker: Thinker) -> Iterator[Piece]:
+        for span in self._selection.train:
+            for block in self._recording.blocks(schema.TRAIN_STEP, span.start, span.stop):
+                for part in _parts(block):
+                    yield part, thinker.training(part), part["episode"].astype(np.int64)
+
+    def _evaluating(self, thinker: Thinker) -> Iterator[Piece]:
+        for evaluation, span in self._selection.evaluations:
+            thinker.at(evaluation.train_step)
+            for block in self._recording.blocks(schema.EVAL_STEP, span.start, span.stop):
+                for part in _parts(block):
+                    yield part, thinker.evaluating(part), np.full(len(part), evaluation.after, np.int64)
+
+    def _vocabulary(self) -> Vocabulary:
+        mdp, scene = self._recording.mdp, self._scene
+        described = scene.description["things"] if scene else []
+        learners = len(self._learners)
+        rewards = mdp.rewards_of(learners)
+        low = high = 0.0
+        for snapshot in self._recording.snapshots():
+            low, high = min(low, float(snapshot.values.min())), max(high, float(snapshot.values.max()))
+        return vocabulary(
+            self._marks,
+            [described[thing]["label"] for thing in scene.passengers] if scene else [],
+            mdp.step_limit,
+            self._learners,
+            [rewards[..., i] for i in range(learners)],
+            (low, high),
+        )
+
+    def _send_notice(self, ends: dict[str, list[tuple[int, int]]]) -> None:
+        """Say in the grid, wherever no steps were exported, that there are none."""
+        if self._scene is None:
+            return
+        covered = sorted(ends["train"] + ends["eval"])
+        gaps, at = [], 0
+        for start, stop in covered:
+            if start > at + 1:
+                gaps.append((at, start))
+            at = max(at, stop)
+        gaps.append((at, 0))
+        place = [self._scene.columns / 2, self._scene.rows / 2]
+        labels = ["no steps exported here: see --episodes, --eval and --all"] * len(gaps)
+        path = f"{self._source.root}/notice"
+        self._stream.send_columns(
+            path,
+            [rr.TimeColumn("step", sequence=[start for start, _ in gaps])],
+            [
+                *rr.Points2D.columns(
+                    positions=[place] * len(gaps),
+                    labels=labels,
+                    radii=[0.0] * len(gaps),
+                    colors=[0x808080FF] * len(gaps),
+                )
+            ],
+        )
+        ends_of_gaps = [stop for _, stop in gaps if stop]
+        if ends_of_gaps:
+            self._stream.send_columns(
+                path,
+                [rr.TimeColumn("step", sequence=ends_of_gaps)],
+                rr.Clear.columns(is_recursive=[True] * len(ends_of_gaps)),
+            )
+
+
+Piece = tuple[NDArray[np.void], Thoughts, NDArray[np.int64]]
+"""Steps, what the learners thought at them, and the training episode of each."""
+
+
+def _batches(pieces: Iterator[Piece]) -> Iterator[Batch]:
+    """Yield the pieces put together to batches that are worth sending."""
+    waiting: list[Piece] = []
+    before: NDArray[np.void] | None = None
+    for piece in pieces:
+        if waiting and sum(len(one[0]) for one in waiting) + len(piece[0]) > BATCH:
+            batch = _together(waiting, before)
+            yield batch
+            before, waiting = batch.records[-TRAIL_STEPS:], []
+        waiting.append(piece)
+    if waiting:
+        yield _together(waiting, before)
+
+
+def _together(pieces: list[Piece], before: NDArray[np.void] | None) -> Batch:
+    records = np.concatenate([piece[0] for piece in pieces]) if len(pieces) > 1 else pieces[0][0]
+    thoughts = _thoughts_together([piece[1] for piece in pieces])
+    episode = np.concatenate([piece[2] for piece in pieces])
+    time = records["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
+    return Batch(records, thoughts, episode, records[:0] if before is None else before, time)
+
+
+def _thoughts_together(parts: list[Thoughts]) -> Thoughts:
+    if len(parts) == 1:
+        return parts[0]
+    starts = np.cumsum([0] + [len(part.values) for part in parts])
+    renewed = [part.renewed + start for part, start in zip(parts, starts[:-1], strict=True)]
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("values", "greedy", "value_maps", "greedy_maps")
+    }
+    return Thoughts(renewed=np.concatenate(renewed), **joined)
+
+
+def _parts(block: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
+    for start in range(0, len(block), BATCH):
+        yield block[start : start + BATCH]
+
+
+def _cover(covered: list[tuple[int, int]], time: NDArray[np.int64]) -> None:
+    """Add the times of a batch to the stretches (first, one past the last) that are covered."""
+    breaks = np.flatnonzero(np.diff(time) != 1) + 1
+    for run in np.split(time, breaks):
+        first, stop = int(run[0]), int(run[-1]) + 1
+        if covered and covered[-1][1] == first:
+            covered[-1] = (covered[-1][0], stop)
+        else:
+            covered.append((first, stop))
+
+
+def _last_report(recording: Recording) -> int:
+    rows = [*recording.metrics("train")[-1:], *recording.metrics("eval")[-1:]]
+    return max((row["log_time"] // schema.STEP_NANOSECONDS for row in rows), default=0)
+
+
+def _metric_paths(recording: Recording) -> Iterator[str]:
+    """Yield the metrics that a recording has."""
+    evaluations = recording.metrics("eval")
+    events = recording.mdp.event_names
+    reports = recording.metrics("train") or evaluations
+    for name in ("episode_length", "penalties", "returns"):
+        if reports:
+            yield f"train/metrics/{name}"
+        if evaluations:
+            yield f"eval/metrics/{name}"
+    if reports:
+        yield from (
+            f"train/metrics/{name}" for name in ("filled_percent", "epsilon", "step_size", "reward_percent")
+        )
+    if any(row["successes"] >= 0 for row in evaluations):
+        yield "eval/metrics/finish_percent"
+    for name in (f"{event}s" for event in events if "." not in event):
+        if reports:
+            yield f"train/metrics/{name}"
+        if evaluations:
+            yield f"eval/metrics/{name}"
