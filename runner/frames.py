@@ -2,7 +2,7 @@
 
     import runner
 
-    run = runner.find_run("@latest", Path("recordings"))
+    run = runner.run("configs/quick.yaml")
     runner.frames.evaluations(run).plot("episode", "finish_percent")
 
 A run is a `Run`, an open `Recording`, or the path of a recording. pandas comes with the extra `frames`;

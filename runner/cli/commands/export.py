@@ -11,6 +11,7 @@ from runner.errors import nearest
 
 FORMS: Final[dict[str, tuple[str, str]]] = {
     "rerun": ("runner.cli.commands.export_rerun", "For the Rerun viewer: every view of chosen episodes."),
+    "gif": ("runner.cli.commands.export_gif", "A short film of an episode, for slides and READMEs."),
 }
 """Form -> its module, which has the command as `command`, and its short help."""
 
@@ -39,4 +40,9 @@ class _Forms(click.Group):
 
 @click.group("export", cls=_Forms)
 def command() -> None:
-    """Write a run in a form that other programs read."""
+    """Write a run in a form that other programs read.
+
+    \b
+    Example:
+      dualtaxi export rerun @latest --help
+    """  # noqa: D301 - Click wants the backspace itself

@@ -69,7 +69,9 @@ def test_examples_can_be_typed(words):
 def test_the_table_of_commands_names_every_module():
     modules = {f"{commands.__name__}.{found.name}" for found in pkgutil.iter_modules(commands.__path__)}
     listed = {name: module for section in COMMANDS.values() for name, (module, _) in section.items()}
-    assert set(listed.values()) == modules
+    assert set(listed.values()) <= modules
+    for module in modules - set(listed.values()):  # a part of a command is called after it: export_rerun
+        assert any(module.startswith(f"{whole}_") for whole in listed.values())
     for name, module in listed.items():
         assert importlib.import_module(module).command.name == name
 
@@ -118,7 +120,7 @@ def test_help_imports_nothing_heavy(word):
     assert not _imported(word) & HEAVY
 
 
-@pytest.mark.parametrize("name", ["run", "ls", "show", "play", "table", "config", "completion"])
+@pytest.mark.parametrize("name", cli.list_commands(click.Context(cli)))
 def test_the_help_of_a_command_imports_nothing_heavy(name):
     assert not _imported(name, "--help") & HEAVY
 
