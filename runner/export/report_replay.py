@@ -139,6 +139,19 @@ def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
     return int(order[0]), int(order[len(order) // 2]), int(order[-1])
 
 
+def typical_trial(recording: Recording) -> tuple[int, int]:
+    """Return the last evaluation (training episodes before it) and its median trial.
+
+    Raises:
+        RecordingError: there is no evaluation.
+    """
+    evaluations = recording.metrics("eval")
+    if not evaluations:
+        raise RecordingError(f"{recording.path}: has no evaluations; choose a training episode by --episode.")
+    after = int(evaluations[-1]["episode"])
+    return after, ranked_trials(recording, after)[1]
+
+
 def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[str, Any]:
     """Return what a page needs to show episodes, as JSON can hold it: lists of numbers, words once.
 

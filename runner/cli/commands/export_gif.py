@@ -1,0 +1,99 @@
+"""`dualtaxi export gif`: a short film of an episode."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.output import say, size
+
+
+@click.command("gif")
+@run_argument
+@click.option("--episode", type=click.IntRange(0), metavar="N", help="A training episode, counted from 0.")
+@click.option(
+    "--eval",
+    "chosen",
+    metavar="N:TRIAL",
+    help="A trial, counted from 0, of the evaluation after N training episodes.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("episode.gif"),
+    show_default=True,
+    metavar="FILE",
+    help="Where to.",
+)
+@click.option(
+    "--speed",
+    type=click.FloatRange(0.1, 50),
+    default=2.0,
+    show_default=True,
+    metavar="STEPS",
+    help="Steps a second.",
+)
+@click.option(
+    "--steps",
+    type=click.IntRange(1),
+    default=200,
+    show_default=True,
+    metavar="N",
+    help="Show so many steps at most.",
+)
+@click.option(
+    "--width",
+    type=click.IntRange(200, 2000),
+    default=480,
+    show_default=True,
+    metavar="PIXELS",
+    help="Width of the film.",
+)
+@click.option("--force", is_flag=True, help="Replace the file if it exists.")
+@recordings_option
+def command(
+    run_name: str,
+    episode: int | None,
+    chosen: str | None,
+    output: Path,
+    speed: float,
+    steps: int,
+    width: int,
+    force: bool,
+    recordings: Path | None,
+) -> None:
+    r"""Make a short film of a recorded episode of RUN, for slides and READMEs.
+
+    Each frame has step, actions, rewards and events written below it. Without a choice it is the typical
+    trial of the last evaluation: the median by success, return and length.
+
+    \b
+    Examples:
+      dualtaxi export gif @latest
+      dualtaxi export gif k3v9m2xq --eval 3000:7 -o trial.gif
+      dualtaxi export gif k3v9m2xq --episode 0 --speed 8 --force
+    """
+    if episode is not None and chosen is not None:
+        raise click.UsageError("--episode and --eval exclude each other: choose one.")
+    from runner.export.gif import require_packages, write_gif
+    from runner.export.report_replay import training_episode, trial, typical_trial
+    from runner.export.report_runs import parse_trial, shortcomings, state_of, write_new
+    from runner.recording.reader import open_recording
+
+    require_packages()
+    said: list[int] = []
+    with open_recording(find(run_name, recordings).recording) as recording:
+        if episode is not None:
+            shown = training_episode(recording, episode, steps)
+        else:
+            after, number = parse_trial(chosen) if chosen is not None else typical_trial(recording)
+            shown = trial(recording, after, number, steps)
+        write_new(output, force, lambda path: said.append(write_gif(path, recording, shown, speed, width)))
+        if state_of(recording) != "finished":
+            say(shortcomings(recording)[0])
+    if shown.steps < shown.length:
+        say(f"Shown are the first {shown.steps:,} of {shown.length:,} steps; --steps shows more.")
+    click.echo(f"{output}: {shown.title}, {said[0]} frames, {size(output.stat().st_size)}")
