@@ -21,10 +21,10 @@ from runner.learning.learner import Learner
 from runner.mdp import Mdp, description_bytes, load_mdp
 from runner.provenance import provenance
 from runner.recording import schema
+from runner.recording.arrays import pack_array
 from runner.recording.chunks import Packing
 from runner.recording.messages import QTable, encode, encode_log, encode_q_table
 from runner.recording.past import Past
-from runner.recording.reader import pack_array
 from runner.recording.recorder import Recorder, storage_error
 from runner.recording.writer import RecordingFile
 from runner.runs import Run

@@ -23,7 +23,11 @@ from runner.recording.schema import Topic
 
 MAX_CHUNK_BYTES: Final = 64 << 20
 """The largest chunk that is read, packed or unpacked; the recorder's are below 16 MiB."""
-_MAX_WINDOW: Final = 1 << 27
+CHUNK_HEAD: Final = struct.Struct("<QQQII")
+"""Start time, end time, size unpacked, its CRC, and the length of the name of the compression."""
+MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
+"""Opcode, length, channel, sequence, log time, publish time."""
+_NAME_BYTES: Final = 4
 
 
 @dataclass(frozen=True)
@@ -115,6 +119,76 @@ def _zstd_parameters(level: int) -> zstandard.ZstdCompressionParameters:
     return zstandard.ZstdCompressionParameters.from_level(level)
 
 
+@dataclass(frozen=True)
+class ChunkHead:
+    """What a chunk's record says before its data."""
+
+    start_time: int
+    end_time: int
+    uncompressed_size: int
+    crc: int
+    compression: str
+    data_at: int
+    """Where the data begin in the record's body."""
+
+
+def chunk_head(body: bytes | memoryview, length: int, where: str) -> ChunkHead:
+    """Return what a chunk says of itself.
+
+    Args:
+        body: the body of the record, or its first 60 bytes.
+        length: bytes of the whole body.
+        where: named in errors.
+
+    Raises:
+        RecordingError: it contradicts itself, or declares more than any chunk of ours has.
+    """
+    try:
+        start, end, size, crc, name_length = CHUNK_HEAD.unpack_from(body)
+        at = CHUNK_HEAD.size + min(name_length, _NAME_BYTES)
+        name = bytes(body[CHUNK_HEAD.size : at])
+        (packed,) = struct.unpack_from("<Q", body, at)
+    except struct.error as error:
+        raise RecordingError(f"{where}: the record cannot be read") from error
+    if name_length > _NAME_BYTES or name not in (b"zstd", b"lz4", b""):
+        raise RecordingError(f"{where}: found compression {name!r}, expected zstd, lz4 or none")
+    if packed != length - at - 8 or size > MAX_CHUNK_BYTES:
+        raise RecordingError(
+            f"{where}: declares {packed:,} bytes packed and {size:,} unpacked, "
+            f"expected {length - at - 8:,} and at most {MAX_CHUNK_BYTES:,}"
+        )
+    return ChunkHead(start, end, size, crc, name.decode(), at + 8)
+
+
+def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes]:
+    """Return what a chunk says of itself and its message records, after comparing their checksum.
+
+    Raises:
+        RecordingError: it is damaged, or larger than any chunk of ours.
+    """
+    view = memoryview(body)
+    head = chunk_head(view, len(view), where)
+    records = decompress(view[head.data_at :], head.compression, head.uncompressed_size, where)
+    if zlib.crc32(records) != head.crc:
+        raise RecordingError(f"{where}: its content does not match its checksum")
+    return head, records
+
+
+def first_channel(body: bytes | memoryview, where: str) -> int:
+    """Return the channel of a chunk's first message, unpacking no more than that.
+
+    Raises:
+        RecordingError: it is damaged, or holds no message.
+    """
+    view = memoryview(body)
+    head = chunk_head(view, len(view), where)
+    data = view[head.data_at :]
+    beginning = _unpack(data, head.compression, MESSAGE_HEAD.size, where)[0][: MESSAGE_HEAD.size]
+    if len(beginning) < MESSAGE_HEAD.size:
+        raise RecordingError(f"{where}: holds no whole message")
+    return int(MESSAGE_HEAD.unpack(beginning)[2])
+
+
 def decompress(data: bytes | memoryview, compression: str, size: int, where: str) -> bytes:
     """Return the `size` bytes that a chunk's data hold; never allocates more than that.
 
@@ -124,31 +198,32 @@ def decompress(data: bytes | memoryview, compression: str, size: int, where: str
     """
     if size > MAX_CHUNK_BYTES:
         raise RecordingError(f"{where}: declares {size:,} bytes, expected at most {MAX_CHUNK_BYTES:,}")
-    try:
-        if compression == "zstd":
-            records, more = _unpack_zstd(data, size)
-        elif compression == "lz4":
-            with lz4.frame.LZ4FrameDecompressor() as stream:
-                records = stream.decompress(bytes(data), max_length=size)
-                more = b"" if stream.eof else b"?"
-        elif compression == "":
-            records, more = bytes(data), b""
-        else:
-            raise RecordingError(f"{where}: found compression {compression!r}, expected zstd, lz4 or none")
-    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
-        raise RecordingError(f"{where}: the chunk cannot be decompressed ({error})") from error
+    records, more = _unpack(data, compression, size, where)
     if len(records) != size or more:
         raise RecordingError(f"{where}: found a chunk of another size than the {size} bytes it declares")
     return records
 
 
-def _unpack_zstd(data: bytes | memoryview, size: int) -> tuple[bytes, bytes]:
-    """Return at most `size` unpacked bytes, and a byte if there are more.
+def _unpack(data: bytes | memoryview, compression: str, size: int, where: str) -> tuple[bytes, bool]:
+    """Return the first `size` bytes, and whether there are more; fewer if there are not so many."""
+    try:
+        if compression == "zstd":
+            return _unpack_zstd(data, size)
+        if compression == "lz4":
+            with lz4.frame.LZ4FrameDecompressor() as stream:
+                return stream.decompress(bytes(data), max_length=size), not stream.eof
+        return bytes(data[:size]), len(data) > size
+    except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
+        raise RecordingError(f"{where}: the chunk cannot be decompressed ({error})") from error
 
-    A frame that declares its size is unpacked in one go: the size was compared first.
+
+def _unpack_zstd(data: bytes | memoryview, size: int) -> tuple[bytes, bool]:
+    """Unpack a zstd frame.
+
+    One that declares its size is unpacked in one go: the size was compared first.
     """
-    declared = zstandard.frame_content_size(data)
-    if declared == size:
-        return zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).decompress(data), b""
-    with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
-        return stream.read(size), stream.read(1)
+    decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
+    if zstandard.frame_content_size(data) == size:
+        return decompressor.decompress(data), False
+    with decompressor.stream_reader(data) as stream:
+        return stream.read(size), bool(stream.read(1))

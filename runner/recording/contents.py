@@ -8,24 +8,30 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final, TypeVar
 
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.chunks import MAX_CHUNK_BYTES, decompress
+from runner.recording.chunks import MAX_CHUNK_BYTES, unpack_chunk
+from runner.recording.index import MAX_NAME_BYTES, MAX_NAMED
 
+MAX_METADATA_BYTES: Final = 4 << 20
+"""The largest metadata record that is read, config and provenance among them."""
 _HEAD = struct.Struct("<BQ")
 _RESULT = "result"
+N = TypeVar("N", AttachmentIndex, MetadataIndex)
+UNREADABLE: Final = (struct.error, ValueError, KeyError, McapError)
+"""What parsing damaged records raises."""
 
 
 @dataclass(frozen=True)
@@ -52,33 +58,41 @@ class Contents:
     metadata: list[MetadataIndex] = field(default_factory=list)
 
 
-def survey(path: Path, keep_result: bool = False) -> Contents:
+Check = Callable[[int, int, bytes, bytes], None]
+"""Called with (opcode, offset, body, unpacked message records) of a good record; raises what it finds."""
+
+
+def survey(path: Path, keep_result: bool = False, check: Check = lambda *_: None) -> Contents:
     """Return what of a recording is good, from its beginning to the first record that is not.
 
     Args:
         path: the recording.
         keep_result: whether a `result` record counts; who goes on writing leaves it out and writes anew.
+        check: looks at each record besides; what it raises ends the walk as damage does.
 
     Raises:
         RecordingError: the file cannot be read.
     """
     try:
         with path.open("rb") as stream:
-            return _survey(stream, keep_result)
+            return _survey(stream, keep_result, check)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
 
 
-def _survey(stream: BinaryIO, keep_result: bool) -> Contents:
+def _survey(stream: BinaryIO, keep_result: bool, check: Check) -> Contents:
     contents = Contents(size=stream.seek(0, 2))
-    surveyor = _Surveyor(contents, keep_result)
+    surveyor = _Surveyor(contents, keep_result, check)
     for opcode, at, body in walk(stream, contents.size):
         if opcode == Opcode.DATA_END:
             return contents
         try:
             surveyor.take(opcode, at, body)
-        except (RecordingError, struct.error, ValueError, EndOfFile) as error:
-            contents.reason = str(error) or f"the record at {at} cannot be read"
+        except RecordingError as error:
+            contents.reason = str(error)
+            return contents
+        except UNREADABLE:
+            contents.reason = f"the record at {at} cannot be read"
             return contents
     contents.reason = f"the file ends at {contents.size}, in the middle of the data"
     return contents
@@ -87,19 +101,21 @@ def _survey(stream: BinaryIO, keep_result: bool) -> Contents:
 class _Surveyor:
     """Takes the records of a data section in order and notes the good ones."""
 
-    def __init__(self, contents: Contents, keep_result: bool) -> None:
+    def __init__(self, contents: Contents, keep_result: bool, check: Check) -> None:
         self._contents = contents
         self._keep_result = keep_result
+        self._check = check
         self._indexed = True
         """Whether every chunk is followed by its message index."""
         self._pending: Part | None = None
 
     def take(self, opcode: int, at: int, body: bytes) -> None:
         """Take one record; raises an error if it is damaged."""
-        contents, end = self._contents, at + 9 + len(body)
+        contents, end, records = self._contents, at + 9 + len(body), b""
         if opcode == Opcode.CHUNK:
-            part, _ = read_chunk(body, at)
+            part, records = read_chunk(body, at)
             if self._indexed:
+                self._check(opcode, at, body, records)
                 self._pending = part
                 return
             contents.chunks.append(part)
@@ -111,12 +127,19 @@ class _Surveyor:
                 return
             if name == "config":
                 self._indexed = asks_for_indexes(metadata_of(body)[1])
-            contents.metadata.append(MetadataIndex(offset=at, length=9 + len(body), name=name))
+            self._note(contents.metadata, MetadataIndex(offset=at, length=9 + len(body), name=name))
         elif opcode == Opcode.ATTACHMENT:
-            contents.attachments.append(_attachment_index(body, at))
+            self._note(contents.attachments, _attachment_index(body, at))
         elif opcode not in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL):
             raise RecordingError(f"found a record of kind {opcode} at {at}, expected none there")
+        self._check(opcode, at, body, records)
         contents.end = end
+
+    @staticmethod
+    def _note(known: list[N], entry: N) -> None:
+        if len(known) == MAX_NAMED or len(entry.name) > MAX_NAME_BYTES:
+            raise RecordingError(f"found a record too many or with too long a name at {entry.offset}")
+        known.append(entry)
 
     def _take_index(self, part: Part, at: int, body: bytes) -> None:
         (channel,) = struct.unpack_from("<H", body)
@@ -145,26 +168,18 @@ def read_chunk(body: bytes, offset: int) -> tuple[Part, bytes]:
         RecordingError: it is damaged, or holds messages of no topic, or of several.
     """
     where = f"chunk at {offset}"
-    start, end, size, crc, name_length = struct.unpack_from("<QQQII", body)
-    compression = body[32 : 32 + name_length].decode("ascii")
-    (packed,) = struct.unpack_from("<Q", body, 32 + name_length)
-    data = memoryview(body)[40 + name_length :]
-    if packed != len(data) or size > MAX_CHUNK_BYTES:
-        raise RecordingError(f"{where}: its sizes contradict each other")
-    records = decompress(data, compression, size, where)
-    if zlib.crc32(records) != crc:
-        raise RecordingError(f"{where}: its content does not match its checksum")
+    head, records = unpack_chunk(body, where)
     channel, messages = _messages(records, where)
     index = ChunkIndex(
         chunk_length=9 + len(body),
         chunk_start_offset=offset,
-        compression=compression,
-        compressed_size=packed,
-        message_end_time=end,
+        compression=head.compression,
+        compressed_size=len(body) - head.data_at,
+        message_end_time=head.end_time,
         message_index_length=0,
         message_index_offsets={},
-        message_start_time=start,
-        uncompressed_size=size,
+        message_start_time=head.start_time,
+        uncompressed_size=head.uncompressed_size,
     )
     return Part(index, channel, messages), records
 
@@ -173,15 +188,19 @@ def _messages(records: bytes, where: str) -> tuple[int, int]:
     """Return the channel of a chunk's messages and how many there are."""
     if len(records) < schema.HEADER_BYTES:
         raise RecordingError(f"{where}: holds no whole message")
-    _, length, channel = struct.unpack_from("<BQH", records)
+    opcode, length, channel = struct.unpack_from("<BQH", records)
+    if opcode != Opcode.MESSAGE or channel not in {topic.channel for topic in schema.TOPICS}:
+        raise RecordingError(f"{where}: holds no messages of ours")
     if channel in {topic.channel for topic in schema.BLOCK_TOPICS}:
-        if len(records) % (9 + length):
+        if len(records) % (9 + length) or 9 + length < schema.HEADER_BYTES:
             raise RecordingError(f"{where}: its messages differ in size")
         return channel, len(records) // (9 + length)
     at = messages = 0
-    while at < len(records):
-        at += 9 + struct.unpack_from("<Q", records, at + 1)[0]
+    while at + schema.HEADER_BYTES <= len(records):
+        at += 9 + max(struct.unpack_from("<Q", records, at + 1)[0], schema.HEADER_BYTES - 9)
         messages += 1
+    if at != len(records):
+        raise RecordingError(f"{where}: its messages do not fill it")
     return channel, messages
 
 
@@ -216,7 +235,13 @@ def attachment_of(body: bytes, offset: int) -> tuple[str, str, bytes]:
 
 
 def metadata_of(body: bytes) -> tuple[str, dict[str, str]]:
-    """Return the name and entries of a metadata record."""
+    """Return the name and entries of a metadata record.
+
+    Raises:
+        RecordingError: it is larger than any of ours.
+    """
+    if len(body) > MAX_METADATA_BYTES:
+        raise RecordingError(f"metadata of {len(body):,} bytes, expected {MAX_METADATA_BYTES:,} at most")
     record = Metadata.read(ReadDataStream(BytesIO(body)))
     return record.name, dict(record.metadata)
 
@@ -229,10 +254,12 @@ def asks_for_indexes(config: dict[str, str]) -> bool:
     """
     try:
         return bool(json.loads(config["json"])["recording"]["index"] == "message")
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
         raise RecordingError("the configuration does not say what it was recorded with") from error
 
 
 def _name(body: bytes, at: int) -> str:
     (length,) = struct.unpack_from("<I", body, at)
+    if length > min(MAX_NAME_BYTES, len(body) - at - 4):
+        raise RecordingError(f"found a name of {length:,} bytes")
     return body[at + 4 : at + 4 + length].decode()

@@ -1,6 +1,7 @@
 """Where things stand in a recording: read from its summary, or found by walking its records.
 
-A file declares sizes and offsets; none is believed before it is compared with the file's own size.
+A file declares sizes and offsets; none is believed before it is compared with the file's own size. What
+is kept of a file is bounded whatever it says: 34 bytes a chunk, and few names.
 """
 
 from __future__ import annotations
@@ -10,8 +11,9 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import BinaryIO, Final, NamedTuple, TypeVar
+from typing import Any, BinaryIO, Final, NamedTuple, TypeVar
 
+import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -24,16 +26,27 @@ from mcap.records import (
     Schema,
 )
 from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.schema import PROFILE
+from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES
+from runner.recording.schema import PROFILE, TOPICS
 
 K = TypeVar("K")
 T = TypeVar("T")
 
-MAX_RECORD_BYTES: Final = 64 << 20
+MAX_CHUNKS: Final = 1 << 21
+"""The most chunks that a recording is read with: a step chunk holds 256 steps or more."""
+MAX_NAMED: Final = 4096
+"""The most attachments, and the most metadata records; a resume adds one."""
+MAX_RECORD_BYTES: Final = 1 << 16
+"""The largest record of a summary, schema or channel; the recorder's are below 4 KiB."""
+UNPACKED_A_BYTE: Final = 1000
+"""How much more than the file its chunks may declare to hold; beyond that they are made to exhaust."""
+_UNPACKED_ANYWAY: Final = 1 << 30
+MAX_NAME_BYTES: Final = 256
+_PIECE: Final = 1 << 20
 _HEAD: Final = struct.Struct("<BQ")
-_CHUNK_HEAD: Final = struct.Struct("<QQQII")
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
 _OFFSET_ENTRY: Final = struct.Struct("<HQ")
 _EXPECTED: Final = frozenset(
@@ -45,6 +58,7 @@ _EXPECTED: Final = frozenset(
 """What the data section has: behind anything else nothing can be believed."""
 _FOOTER_BYTES: Final = 9 + 20
 _TAIL_BYTES: Final = _FOOTER_BYTES + len(MCAP0_MAGIC)
+_CHANNELS: Final = frozenset(topic.channel for topic in TOPICS)
 
 
 class ChunkEntry(NamedTuple):
@@ -53,11 +67,67 @@ class ChunkEntry(NamedTuple):
     offset: int
     length: int
     """Bytes of the record, its head included."""
+    uncompressed_size: int
     start_time: int
     end_time: int
-    uncompressed_size: int
-    channels: tuple[int, ...]
-    """Channels by its message index; empty if it has none."""
+    channel: int
+    """Whose messages it holds, by its message index; 0 if it has none."""
+
+
+_ENTRY: Final = struct.Struct("<QIIQQH")
+_ENTRY_COLUMNS: Final = np.dtype(
+    list(zip(ChunkEntry._fields, ("<u8", "<u4", "<u4", "<u8", "<u8", "<u2"), strict=True))
+)
+
+
+class ChunkTable:
+    """The chunks of a recording in the order of the file, 34 bytes each."""
+
+    def __init__(self) -> None:
+        self._packed = bytearray()
+
+    def __len__(self) -> int:
+        return len(self._packed) // _ENTRY.size
+
+    def __getitem__(self, k: int) -> ChunkEntry:
+        return ChunkEntry(*_ENTRY.unpack_from(self._packed, k * _ENTRY.size))
+
+    def append(self, entry: ChunkEntry, path: str) -> None:
+        """Add a chunk behind the last one.
+
+        Raises:
+            RecordingError: it says what no chunk of ours does.
+        """
+        where = f"{path}: the chunk at {entry.offset}"
+        if entry.length > MAX_CHUNK_BYTES or entry.uncompressed_size > MAX_CHUNK_BYTES:
+            size = max(entry.length, entry.uncompressed_size)
+            raise RecordingError(f"{where} declares {size:,} bytes, expected at most {MAX_CHUNK_BYTES:,}.")
+        if entry.length < 9 + CHUNK_HEAD.size + 8:
+            raise RecordingError(f"{where} declares {entry.length} bytes, fewer than any chunk has.")
+        if len(self) and entry.offset < sum(self[len(self) - 1][:2]):
+            raise RecordingError(f"{where} overlaps the one before it in the index.")
+        if len(self) == MAX_CHUNKS:
+            raise RecordingError(f"{path}: has more than {MAX_CHUNKS:,} chunks; too many to be ours.")
+        self._packed += _ENTRY.pack(*entry)
+
+    def name_last(self, channel: int, path: str) -> None:
+        """Say whose messages the last chunk holds.
+
+        Raises:
+            RecordingError: it was said before, or is no channel of ours.
+        """
+        last = self[len(self) - 1]
+        if last.channel or channel not in _CHANNELS:
+            raise RecordingError(
+                f"{path}: chunk at {last.offset}: found messages of channel {channel}"
+                f"{f' and {last.channel}' if last.channel else ''}, expected those of one of ours."
+            )
+        self._packed[-_ENTRY.size :] = _ENTRY.pack(*last._replace(channel=channel))
+
+    @property
+    def columns(self) -> NDArray[Any]:
+        """All of them as a structured array with the fields of `ChunkEntry`: a view."""
+        return np.frombuffer(self._packed, _ENTRY_COLUMNS)
 
 
 @dataclass
@@ -65,8 +135,8 @@ class Index:
     """The places of a recording's parts."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    chunks: list[ChunkEntry] = field(default_factory=list)
+    schemas: set[int] = field(default_factory=set)
+    chunks: ChunkTable = field(default_factory=ChunkTable)
     attachments: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Name to (offset, length) of the record."""
     metadata: dict[str, tuple[int, int]] = field(default_factory=dict)
@@ -84,11 +154,12 @@ def read_index(stream: BinaryIO, path: str) -> Index:
     size = stream.seek(0, 2)
     _check_beginning(stream, path)
     footer = _footer(stream, size)
-    if footer is not None:
-        return _from_summary(stream, path, footer, size)
-    index = _from_records(stream, path, size)
+    index = _from_records(stream, path, size) if footer is None else _from_summary(stream, path, footer, size)
     if not index.channels:
         raise RecordingError(f"{path}: the recording was cut off before its first message.")
+    unpacked = int(index.chunks.columns["uncompressed_size"].sum(dtype=np.uint64)) if index.chunks else 0
+    if unpacked > size * UNPACKED_A_BYTE + _UNPACKED_ANYWAY:
+        raise RecordingError(f"{path}: {size:,} bytes declare to hold {unpacked:,}; made to exhaust memory.")
     return index
 
 
@@ -126,36 +197,45 @@ def _from_summary(stream: BinaryIO, path: str, footer: Footer, size: int) -> Ind
         raise RecordingError(
             f"{path}: the footer points to a summary at {start}, outside the file; try `repair`."
         )
-    stream.seek(start)
-    summary = stream.read(end - start)
     fields = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, footer.summary_offset_start)
-    if zlib.crc32(fields, zlib.crc32(summary)) != footer.summary_crc:
+    if zlib.crc32(fields, _checksum(stream, start, end)) != footer.summary_crc:
         raise RecordingError(f"{path}: the summary at {start} does not match its checksum; try `repair`.")
     index = Index(finished=True, end=start)
-    view = memoryview(summary)
-    for opcode, offset, body in _records(view, start, path):
-        if opcode == Opcode.SCHEMA:
-            schema = _parse(Schema, body, path, offset)
-            _put(index.schemas, schema.id, schema, path, "schema")
-        elif opcode == Opcode.CHANNEL:
-            channel = _parse(Channel, body, path, offset)
-            _put(index.channels, channel.id, channel, path, "channel")
-        elif opcode == Opcode.CHUNK_INDEX:
-            chunk = _chunk_entry(body, path, offset)
-            _within(path, "chunk", chunk.offset, chunk.length, start)
-            if index.chunks and chunk.offset < index.chunks[-1].offset + index.chunks[-1].length:
-                raise RecordingError(f"{path}: the index has chunks that overlap, at {chunk.offset}.")
-            index.chunks.append(chunk)
-        elif opcode == Opcode.ATTACHMENT_INDEX:
-            attachment = _parse(AttachmentIndex, body, path, offset)
-            _within(path, "attachment", attachment.offset, attachment.length, start)
-            place = (attachment.offset, attachment.length)
-            _put(index.attachments, attachment.name, place, path, "attachment")
-        elif opcode == Opcode.METADATA_INDEX:
-            metadata = _parse(MetadataIndex, body, path, offset)
-            _within(path, "metadata", metadata.offset, metadata.length, start)
-            _put(index.metadata, metadata.name, (metadata.offset, metadata.length), path, "metadata")
+    for opcode, offset, body in _records(stream, start, end, path):
+        _note_summary(index, path, opcode, offset, body, start)
     return index
+
+
+def _checksum(stream: BinaryIO, start: int, end: int) -> int:
+    """Return the checksum of a part of the file, which need not fit into memory."""
+    crc, at = 0, stream.seek(start)
+    while at < end and (piece := stream.read(min(_PIECE, end - at))):
+        crc = zlib.crc32(piece, crc)
+        at += len(piece)
+    return crc
+
+
+def _note_summary(index: Index, path: str, opcode: int, offset: int, body: bytes, data_end: int) -> None:
+    """Take one record of the summary into the index."""
+    if opcode == Opcode.CHUNK_INDEX:
+        chunk = _chunk_entry(body, path, offset)
+        _within(path, "chunk", chunk.offset, chunk.length, data_end)
+        index.chunks.append(chunk._replace(channel=0), path)
+        if chunk.channel:
+            index.chunks.name_last(chunk.channel, path)
+    elif opcode == Opcode.SCHEMA:
+        _note_schema(index, path, offset, body)
+    elif opcode == Opcode.CHANNEL:
+        _note_channel(index, path, offset, body)
+    elif opcode == Opcode.ATTACHMENT_INDEX:
+        attachment = _parse(AttachmentIndex, body, path, offset)
+        _within(path, "attachment", attachment.offset, attachment.length, data_end)
+        place = (attachment.offset, attachment.length)
+        _put(index.attachments, attachment.name, place, path, "attachment")
+    elif opcode == Opcode.METADATA_INDEX:
+        metadata = _parse(MetadataIndex, body, path, offset)
+        _within(path, "metadata", metadata.offset, metadata.length, data_end)
+        _put(index.metadata, metadata.name, (metadata.offset, metadata.length), path, "metadata")
 
 
 def _from_records(stream: BinaryIO, path: str, size: int) -> Index:
@@ -177,63 +257,76 @@ def _from_records(stream: BinaryIO, path: str, size: int) -> Index:
 def _note(index: Index, stream: BinaryIO, path: str, opcode: int, offset: int, length: int) -> None:
     """Take one record of the data section into the index; the stream stands behind its head."""
     if opcode == Opcode.CHUNK:
-        start, end, uncompressed, _, _ = _CHUNK_HEAD.unpack(
-            stream.read(_CHUNK_HEAD.size).ljust(_CHUNK_HEAD.size, b"\0")
-        )
-        index.chunks.append(ChunkEntry(offset, 9 + length, start, end, uncompressed, ()))
+        head = stream.read(min(length, CHUNK_HEAD.size)).ljust(CHUNK_HEAD.size, b"\0")
+        start, end, unpacked, _, _ = CHUNK_HEAD.unpack(head)
+        index.chunks.append(ChunkEntry(offset, 9 + length, unpacked, start, end, 0), path)
     elif opcode == Opcode.MESSAGE_INDEX:
-        (channel,) = struct.unpack("<H", stream.read(2).ljust(2, b"\0"))
-        last = index.chunks[-1]
-        index.chunks[-1] = ChunkEntry(
-            last.offset,
-            last.length,
-            last.start_time,
-            last.end_time,
-            last.uncompressed_size,
-            (*last.channels, channel),
-        )
-    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.ATTACHMENT):
-        body = stream.read(min(length, MAX_RECORD_BYTES))
-        if opcode == Opcode.SCHEMA:
-            schema = _parse(Schema, body, path, offset)
-            _put(index.schemas, schema.id, schema, path, "schema")
-        elif opcode == Opcode.CHANNEL:
-            channel_record = _parse(Channel, body, path, offset)
-            _put(index.channels, channel_record.id, channel_record, path, "channel")
-        elif opcode == Opcode.METADATA:
-            _put(index.metadata, _name(body, 0, path, offset), (offset, 9 + length), path, "metadata")
-        else:
-            _put(index.attachments, _name(body, 16, path, offset), (offset, 9 + length), path, "attachment")
+        (channel,) = struct.unpack("<H", stream.read(min(length, 2)).ljust(2, b"\0"))
+        index.chunks.name_last(channel, path)
+    elif opcode == Opcode.METADATA:
+        name = _name(stream.read(min(length, 4 + MAX_NAME_BYTES)), 0, path, offset)
+        _put(index.metadata, name, (offset, 9 + length), path, "metadata")
+    elif opcode == Opcode.ATTACHMENT:
+        name = _name(stream.read(min(length, 20 + MAX_NAME_BYTES)), 16, path, offset)
+        _put(index.attachments, name, (offset, 9 + length), path, "attachment")
+    elif opcode != Opcode.HEADER:
+        _check_length(length, path, offset)
+        note = _note_schema if opcode == Opcode.SCHEMA else _note_channel
+        note(index, path, offset, stream.read(length))
+    elif offset != len(MCAP0_MAGIC):
+        raise RecordingError(f"{path}: found a second header at {offset}.")
 
 
-def _records(view: memoryview, base: int, path: str) -> Iterator[tuple[int, int, bytes]]:
-    """Yield (opcode, offset in the file, body) of the records in a piece of it."""
-    at = 0
-    while at < len(view):
-        if at + 9 > len(view):
+def _note_schema(index: Index, path: str, offset: int, body: bytes) -> None:
+    schema = _parse(Schema, body, path, offset)
+    if schema.id in index.schemas:
+        raise RecordingError(f"{path}: has schema {schema.id} twice, at {offset} again.")
+    index.schemas.add(schema.id)
+
+
+def _note_channel(index: Index, path: str, offset: int, body: bytes) -> None:
+    channel = _parse(Channel, body, path, offset)
+    _put(index.channels, channel.id, channel, path, "channel")
+
+
+def _records(stream: BinaryIO, start: int, end: int, path: str) -> Iterator[tuple[int, int, bytes]]:
+    """Yield (opcode, offset, body) of the records in a part of the file."""
+    at = stream.seek(start)
+    while at < end:
+        if at + 9 > end:
+            raise RecordingError(f"{path}: found {end - at} stray bytes at {at}, expected a record.")
+        opcode, length = _HEAD.unpack(stream.read(9))
+        if length > end - at - 9:
             raise RecordingError(
-                f"{path}: found {len(view) - at} stray bytes at {base + at}, expected a record."
+                f"{path}: the record at {at} declares {length} bytes, {end - at - 9} are there."
             )
-        opcode, length = _HEAD.unpack(view[at : at + 9])
-        if length > len(view) - at - 9:
-            raise RecordingError(
-                f"{path}: the record at {base + at} declares {length} bytes, {len(view) - at - 9} are there."
-            )
-        yield opcode, base + at, bytes(view[at + 9 : at + 9 + length])
+        _check_length(length, path, at)
+        yield opcode, at, stream.read(length)
         at += 9 + length
+
+
+def _check_length(length: int, path: str, offset: int) -> None:
+    if length > MAX_RECORD_BYTES:
+        raise RecordingError(
+            f"{path}: the record at {offset} declares {length:,} bytes; too large to be ours."
+        )
 
 
 def _chunk_entry(body: bytes, path: str, offset: int) -> ChunkEntry:
     """Return the entry in a ChunkIndex record: there are thousands, so not by the library's reader."""
     try:
         start, end, chunk_offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(body)
-        channels = tuple(channel for channel, _ in _OFFSET_ENTRY.iter_unpack(body[36 : 36 + map_bytes]))
+        channels = [channel for channel, _ in _OFFSET_ENTRY.iter_unpack(body[36 : 36 + map_bytes])]
         at = 36 + map_bytes + 8
         (name_length,) = struct.unpack_from("<I", body, at)
         (uncompressed,) = struct.unpack_from("<Q", body, at + 4 + name_length + 8)
     except struct.error as error:
         raise RecordingError(f"{path}: the ChunkIndex record at {offset} cannot be read.") from error
-    return ChunkEntry(chunk_offset, length, start, end, uncompressed, channels)
+    if len(channels) > 1 or channels == [0]:
+        raise RecordingError(
+            f"{path}: the ChunkIndex record at {offset} names {len(channels)} channels, expected one of ours."
+        )
+    return ChunkEntry(chunk_offset, length, uncompressed, start, end, channels[0] if channels else 0)
 
 
 def _parse(kind: type[T], body: bytes, path: str, offset: int) -> T:
@@ -248,15 +341,22 @@ def _name(body: bytes, at: int, path: str, offset: int) -> str:
     """Return the name that stands, with its length before it, at `at` in a record's body."""
     try:
         (length,) = struct.unpack_from("<I", body, at)
-        return body[at + 4 : at + 4 + length].decode()
+        name = body[at + 4 : at + 4 + length]
+        if len(name) == length:
+            return name.decode()
     except (struct.error, UnicodeDecodeError) as error:
         raise RecordingError(f"{path}: the record at {offset} has no readable name.") from error
+    raise RecordingError(f"{path}: the record at {offset} declares a name of {length:,} bytes.")
 
 
 def _put(known: dict[K, T], key: K, value: T, path: str, what: str) -> None:
     """Add what may stand in a file once."""
     if key in known:
         raise RecordingError(f"{path}: has {what} {key!r} twice.")
+    if len(known) == (len(TOPICS) if what == "channel" else MAX_NAMED):
+        raise RecordingError(f"{path}: has more than {len(known):,} {what} records; too many to be ours.")
+    if isinstance(key, str) and len(key) > MAX_NAME_BYTES:
+        raise RecordingError(f"{path}: has {what} with a name of {len(key):,} letters.")
     known[key] = value
 
 

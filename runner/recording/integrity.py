@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.chunks import decompress, message_index
-from runner.recording.contents import survey, walk
+from runner.recording.chunks import chunk_head, message_index
+from runner.recording.contents import survey
 from runner.recording.writer import RecordingFile, schema_and_channel_bytes
 
 Times = NDArray[np.uint64]
@@ -32,19 +32,19 @@ def check_integrity(path: Path) -> None:
     Raises:
         RecordingError: something is wrong; the first such thing is named with its offset.
     """
-    with path.open("rb") as stream:
-        _check_beginning(stream, path)
-    contents = survey(path, keep_result=True)
-    if contents.reason:
-        raise RecordingError(f"{path}: {contents.reason}; `repair` or `resume` mends it.")
-    with path.open("rb") as stream:  # whose records can be read, as the survey found
-        for opcode, offset, body in walk(stream, contents.end):
-            _check_record(stream, path, opcode, offset, body)
-    with RecordingFile.inspect(path, contents) as file:
-        expected = file.tail()
-    with path.open("rb") as stream:
-        stream.seek(contents.end)
-        found = stream.read(len(expected) + 1)
+    try:
+        with path.open("rb") as stream:
+            _check_beginning(stream, path)
+        contents = survey(path, keep_result=True, check=_IndexCheck(path).take)
+        if contents.reason:
+            raise RecordingError(f"{path}: {contents.reason.removeprefix(f'{path}: ')}; `repair` mends it.")
+        with RecordingFile.inspect(path, contents) as file:
+            expected = file.tail()
+        with path.open("rb") as stream:
+            stream.seek(contents.end)
+            found = stream.read(len(expected) + 1)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
     if found != expected:
         _refuse_tail(path, contents.end, found, expected)
 
@@ -61,30 +61,37 @@ def _check_beginning(stream: BinaryIO, path: Path) -> None:
         raise RecordingError(f"{path}: found other schemas or channels than every recording begins with.")
 
 
-def _check_record(stream: BinaryIO, path: Path, opcode: int, offset: int, body: bytes) -> None:
-    """Check one record of the data section beyond what `survey` does."""
-    if opcode == Opcode.CHUNK and struct.unpack_from("<I", body, 24)[0] == 0:
-        raise RecordingError(f"{path}: the chunk at {offset} has no checksum.")
-    if opcode == Opcode.ATTACHMENT and body[-4:] == b"\0\0\0\0":
-        raise RecordingError(f"{path}: the attachment at {offset} has no checksum.")
-    if opcode == Opcode.CHUNK:
-        _check_chunk(stream, path, offset, body)
+class _IndexCheck:
+    """Checks records beyond what `survey` does; the index of a chunk against the chunk before it."""
 
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._expected = b""
+        """The message index that belongs behind the last chunk."""
 
-def _check_chunk(stream: BinaryIO, path: Path, offset: int, body: bytes) -> None:
-    """Compare a chunk's times and the message index behind it with its messages."""
-    where = f"{path}: chunk at {offset}"
-    start, end, size, _, name_length = struct.unpack_from("<QQQII", body)
-    compression = body[32 : 32 + name_length].decode("ascii", "replace")
-    records = decompress(memoryview(body)[40 + name_length :], compression, size, where)
-    channel, times, offsets = places(records, where)
-    if (start, end) != (int(times[0]), int(times[-1])):
-        raise RecordingError(f"{where}: found times {start} to {end}, expected {times[0]} to {times[-1]}.")
-    stream.seek(offset + 9 + len(body))
-    expected = message_index(channel, times, offsets)
-    found = stream.read(len(expected))
-    if found[:1] == bytes([Opcode.MESSAGE_INDEX]) and found != expected:
-        raise RecordingError(f"{where}: the message index behind it does not lead to its messages.")
+    def take(self, opcode: int, offset: int, body: bytes, records: bytes) -> None:
+        """Check one record."""
+        where = f"{self._path}: the record at {offset}"
+        if opcode == Opcode.CHUNK:
+            self._expected = self._check_chunk(offset, body, records)
+        elif opcode == Opcode.MESSAGE_INDEX and self._expected[9:] != body:
+            raise RecordingError(f"{where} is a message index that does not lead to the chunk's messages")
+        elif opcode == Opcode.ATTACHMENT and body[-4:] == b"\0\0\0\0":
+            raise RecordingError(f"{where} is an attachment without a checksum")
+
+    def _check_chunk(self, offset: int, body: bytes, records: bytes) -> bytes:
+        """Compare a chunk's times with its messages; return the index that belongs to them."""
+        where = f"{self._path}: chunk at {offset}"
+        head = chunk_head(body, len(body), where)
+        if not head.crc:
+            raise RecordingError(f"{where}: has no checksum")
+        channel, times, offsets = places(records, where)
+        if (head.start_time, head.end_time) != (int(times[0]), int(times[-1])):
+            raise RecordingError(
+                f"{where}: found times {head.start_time} to {head.end_time}, "
+                f"expected {times[0]} to {times[-1]}"
+            )
+        return message_index(channel, times, offsets)
 
 
 def places(records: bytes, where: str) -> tuple[int, Times, Times]:

@@ -10,44 +10,35 @@ by one. It is the only way in which the rest of the project reads recordings.
 
 from __future__ import annotations
 
-import json
 import os
-import struct
-import zlib
-from collections import OrderedDict
+import stat
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.records import Metadata
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.mdp import MAX_AGENTS, MAX_EVENTS, Mdp, from_parts
+from runner.mdp import Mdp
 from runner.recording import schema
-from runner.recording.chunks import MAX_CHUNK_BYTES, decompress
+from runner.recording.chunks import MAX_CHUNK_BYTES, MESSAGE_HEAD
+from runner.recording.contents import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
+from runner.recording.facts import check_facts, environment_of, holes, json_object
 from runner.recording.index import ChunkEntry, read_index
 from runner.recording.messages import QTable, decode, decode_q_table
 from runner.recording.schema import BLOCK_TOPICS, Topic
+from runner.recording.store import RecordStore
 
-MAX_ARRAY_BYTES: Final = 256 << 20
-"""The largest array of environment data that is unpacked."""
-_CHUNKS_KEPT: Final = 4
-_FACTS: Final = {
-    **dict.fromkeys(("run_id", "name", "job", "created", "agents")),
-    "seed": 2**64 - 1,
-    "learners": MAX_AGENTS,
-    "events": MAX_EVENTS,
-}
-"""What every recording says of its run; of a number, the largest it can be."""
-_MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
+MAX_EPISODE_BYTES: Final = 128 << 20
+"""The most that `episode_steps` gives as one array: some 1.5 million steps."""
+MAX_METRICS: Final = 1 << 17
+"""The most that `metrics` gives as one list."""
+_METRICS_BYTES: Final = 1 << 20
 
 
 def open_recording(path: str | os.PathLike[str]) -> Recording:
@@ -65,16 +56,22 @@ class Recording:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
+            if not stat.S_ISREG(path.stat().st_mode):  # to open a pipe would wait for its writer
+                raise RecordingError(f"{path}: cannot be read: it is no file.")
             self._stream = path.open("rb")
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise RecordingError(f"{path}: cannot be read ({reason}).") from error
+        self._store = RecordStore(self._stream, str(path))
         try:
             self._index = read_index(self._stream, str(path))
-            self._check_version()
+            check_facts(self.run, self._index, str(path))
+        except OSError as error:
+            self.close()
+            raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
         except BaseException:
-            self._stream.close()
+            self.close()
             raise
-        self._kept: OrderedDict[int, bytes] = OrderedDict()
         self._known_numbers: dict[Topic, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
 
     def __enter__(self) -> Self:
@@ -87,7 +84,7 @@ class Recording:
 
     def close(self) -> None:
         """Close the file."""
-        self._stream.close()
+        self._store.close()
 
     # --- what the recording says of itself ------------------------------------------------------------
 
@@ -111,12 +108,12 @@ class Recording:
         """Messages that a repair could not save: topic to [first, behind the last] numbers; mostly none."""
         if "repair" not in self._index.metadata:
             return {}
-        return dict(_json(self.metadata("repair"), "repair", self.path)["lost"])
+        return holes(self._json("repair"), str(self.path))
 
     @cached_property
     def config(self) -> dict[str, Any]:
         """The resolved configuration, as `runner.config.from_mapping` takes it."""
-        return _json(self.metadata("config"), "config", self.path)
+        return self._json("config")
 
     @cached_property
     def provenance(self) -> dict[str, str]:
@@ -128,7 +125,7 @@ class Recording:
         """What the recorder said at the end: status, digest, counts; empty if it never came to that."""
         if "result" not in self._index.metadata:
             return {}
-        return _json(self.metadata("result"), "result", self.path)
+        return self._json("result")
 
     def run_facts(self) -> dict[str, Any]:
         """Return what `run.json` says, from the recording alone."""
@@ -153,10 +150,12 @@ class Recording:
             raise RecordingError(f"{self.path}: has no metadata {name!r}; it was cut off, or is not ours.")
         offset, length = self._index.metadata[name]
         try:
-            record = Metadata.read(ReadDataStream(BytesIO(self._read(offset, length)[9:])))
-        except (McapError, struct.error, UnicodeDecodeError) as error:
+            found, entries = metadata_of(self._record(Opcode.METADATA, offset, length, MAX_METADATA_BYTES))
+        except UNREADABLE as error:
             raise RecordingError(f"{self.path}: the metadata {name!r} at {offset} cannot be read.") from error
-        return dict(record.metadata)
+        if found != name:
+            raise RecordingError(f"{self.path}: found metadata {found!r} at {offset}, expected {name!r}.")
+        return entries
 
     def attachment(self, name: str) -> bytes:
         """Return an attachment's data, after comparing its checksum.
@@ -167,31 +166,25 @@ class Recording:
         if name not in self._index.attachments:
             raise RecordingError(f"{self.path}: has no attachment {name!r}; it was cut off, or is not ours.")
         offset, length = self._index.attachments[name]
-        body = memoryview(self._read(offset, length))[9:]
-        at = 16
         try:
-            for _ in range(2):  # name, media type
-                at += 4 + struct.unpack_from("<I", body, at)[0]
-            (size,) = struct.unpack_from("<Q", body, at)
-            (crc,) = struct.unpack_from("<I", body, len(body) - 4)
-        except struct.error as error:
+            found, _, data = attachment_of(self._record(Opcode.ATTACHMENT, offset, length), offset)
+        except UNREADABLE as error:
             raise RecordingError(f"{self.path}: the attachment at {offset} cannot be read.") from error
-        data = body[at + 8 : -4]
-        if len(data) != size or zlib.crc32(body[:-4]) != crc:
-            raise RecordingError(
-                f"{self.path}: the attachment {name!r} at {offset} does not match its checksum."
-            )
-        return bytes(data)
+        except RecordingError as error:
+            raise RecordingError(f"{self.path}: {error}.") from error
+        if found != name:
+            raise RecordingError(f"{self.path}: found attachment {found!r} at {offset}, expected {name!r}.")
+        return data
 
     @cached_property
     def mdp(self) -> Mdp:
         """The environment: arrays, agents, events, scene."""
-        description = json.loads(self.attachment("environment.json"))
-        arrays = {
-            name: _array(self.attachment(f"environment/{name}.npy.zst"), f"{self.path}: environment/{name}")
-            for name in description.pop("arrays")
-        }
-        return from_parts(description, arrays)
+        return environment_of(self.environment, self.attachment, str(self.path))
+
+    @property
+    def environment(self) -> dict[str, Any]:
+        """What is said of the environment beside its arrays: agents, events, scene."""
+        return json_object(self.attachment("environment.json"), f"{self.path}: environment.json")
 
     # --- blocks ------------------------------------------------------------------------------------
 
@@ -222,26 +215,27 @@ class Recording:
         """
         firsts, ends = self._numbers(topic)
         stop = int(ends[-1]) if stop is None and len(ends) else (stop or 0)
-        chunks = self._chunks_of[topic.channel]
-        for k in range(int(np.searchsorted(ends, start, side="right")), len(chunks)):
+        chunks = range(
+            int(np.searchsorted(ends, start, side="right")), int(np.searchsorted(firsts, stop, side="left"))
+        )
+        entries = (self._entry(topic, k) for k in chunks)
+        for k, data in zip(chunks, self._store.chunks(entries), strict=True):
             first = int(firsts[k])
-            if first >= stop:
-                return
-            block = self._block(topic, chunks[k])
-            yield block[max(start - first, 0) : stop - first]
+            yield self._block(topic, k, data)[max(start - first, 0) : stop - first]
 
-    def messages(self, topic: Topic) -> Iterator[tuple[int, bytes]]:
+    def messages(self, topic: Topic, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
         """Yield (log time in nanoseconds, payload) of a topic's messages, in order."""
-        for entry in self._chunks_of[topic.channel]:
-            data = self._chunk(entry)
+        for k in range(first_chunk, len(self._chunks_of[topic.channel])):
+            entry = self._entry(topic, k)
+            data = self._store.chunk(entry)
             at = 0
             while at < len(data):
-                if at + _MESSAGE_HEAD.size > len(data):
+                if at + MESSAGE_HEAD.size > len(data):
                     raise self._damaged(entry, f"stray bytes at {at}")
-                opcode, length, channel, _, log_time, _ = _MESSAGE_HEAD.unpack_from(data, at)
+                opcode, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
                 if opcode != 5 or length < 22 or at + 9 + length > len(data) or channel != topic.channel:
                     raise self._damaged(entry, f"no message of {topic.name} at {at}")
-                yield log_time, data[at + _MESSAGE_HEAD.size : at + 9 + length]
+                yield log_time, data[at + MESSAGE_HEAD.size : at + 9 + length]
                 at += 9 + length
 
     def episodes(self, phase: str, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
@@ -263,67 +257,87 @@ class Recording:
         )
         if not total:
             raise RecordingError(f"{self.path}: has no {phase} steps.")
-        if 0 <= episode < ended:
-            record = self.episodes(phase, episode, episode + 1)[0]
-            start, stop = int(record["last_step"]) + 1 - int(record["length"]), int(record["last_step"]) + 1
+        start = stop = 0
+        if 0 <= episode < ended and len(records := self.episodes(phase, episode, episode + 1)):
+            stop = int(records[0]["last_step"]) + 1
+            start = stop - int(records[0]["length"])
         elif episode == ended:
-            start = int(self.episodes(phase, ended - 1, ended)[0]["last_step"]) + 1 if ended else 0
-            stop = total
-        else:
-            start = stop = 0
-        blocks = list(self.blocks(topic, start, stop)) if start < stop else []
-        if not blocks:
+            last = self.episodes(phase, ended - 1, ended)
+            start, stop = int(last[0]["last_step"]) + 1 if len(last) else 0, total
+        if not 0 <= start < stop <= total:
             raise RecordingError(f"{self.path}: has no {phase} episode {episode}; there are {ended}, from 0.")
+        if (stop - start) * self.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
+            raise RecordingError(
+                f"{self.path}: {phase} episode {episode} has {stop - start:,} steps, too many to be given "
+                f"at once; read them in blocks, from {start}."
+            )
+        blocks = list(self.blocks(topic, start, stop))
+        if not blocks:
+            raise RecordingError(f"{self.path}: the steps of {phase} episode {episode} were lost.")
         return np.concatenate(blocks)
 
     def metrics(self, phase: str) -> list[dict[str, Any]]:
-        """Return the metrics of a phase, in order."""
-        topic = schema.TRAIN_METRICS_TOPIC if phase == "train" else schema.EVAL_METRICS_TOPIC
-        return [{"log_time": time} | decode(topic.message, payload) for time, payload in self.messages(topic)]
+        """Return the metrics of a phase, in order.
 
-    def snapshots(self) -> Iterator[QTable]:
-        """Yield the Q-table snapshots, in order."""
-        for _, payload in self.messages(schema.Q_TABLE_TOPIC):
-            yield decode_q_table(payload)
+        Raises:
+            RecordingError: they are damaged, or more than 131,072; `iter_metrics` gives them one by one.
+        """
+        found: list[dict[str, Any]] = []
+        for metrics in self.iter_metrics(phase):
+            if len(found) == MAX_METRICS:
+                raise RecordingError(f"{self.path}: has more than {MAX_METRICS:,} {phase} metrics.")
+            found.append(metrics)
+        return found
+
+    def iter_metrics(self, phase: str) -> Iterator[dict[str, Any]]:
+        """Yield the metrics of a phase, in order."""
+        topic = schema.TRAIN_METRICS_TOPIC if phase == "train" else schema.EVAL_METRICS_TOPIC
+        for time, payload in self.messages(topic):
+            where = f"{self.path}: {topic.name} at {time} ns"
+            if len(payload) > _METRICS_BYTES:
+                raise RecordingError(f"{where}: found {len(payload):,} bytes; too many to be ours.")
+            try:
+                yield {"log_time": time} | decode(topic.message, payload)
+            except RecordingError as error:
+                raise RecordingError(f"{where}: {error}") from error
+
+    def snapshots(self, step: int = 0) -> Iterator[QTable]:
+        """Yield the Q-table snapshots in order; those are left out that are older than needed for `step`.
+
+        Of the last moment at or before `step` all are given, and of the moment before it.
+        """
+        topic = schema.Q_TABLE_TOPIC
+        chunks = range(len(self._chunks_of[topic.channel]))
+        behind = bisect_right(chunks, step, key=lambda k: next(self._snapshots(k)).step) if step else 0
+        yield from self._snapshots(max(0, behind - 2 * int(self.run["learners"])))
+
+    def _snapshots(self, first_chunk: int) -> Iterator[QTable]:
+        for time, payload in self.messages(schema.Q_TABLE_TOPIC, first_chunk):
+            try:
+                yield decode_q_table(payload)
+            except RecordingError as error:
+                raise RecordingError(f"{self.path}: the Q-table at {time} ns: {error}") from error
 
     # --- inside ------------------------------------------------------------------------------------
 
-    def _check_version(self) -> None:
-        topics = {topic.channel: topic.name for topic in schema.TOPICS}
-        for number, channel in self._index.channels.items():
-            if topics.get(number) != channel.topic:
-                raise RecordingError(
-                    f"{self.path}: found channel {number} for {channel.topic!r}, "
-                    f"expected {topics.get(number)!r}: not written by dualtaxi."
-                )
-        version = self.run.get("format_version", "?")
-        if version != str(schema.FORMAT_VERSION):
-            raise RecordingError(
-                f"{self.path}: found a recording of version {version}, expected {schema.FORMAT_VERSION}: "
-                "it takes another version of dualtaxi to read it."
-            )
-        for name, most in _FACTS.items():
-            said = self.run.get(name, "")
-            if not said or (most and not (said.isdecimal() and len(said) <= 20 and int(said) <= most)):
-                raise RecordingError(f"{self.path}: is damaged: of its run it says that {name} is {said!r}.")
+    def _json(self, name: str) -> dict[str, Any]:
+        return json_object(self.metadata(name).get("json"), f"{self.path}: the metadata {name!r}")
 
     @cached_property
-    def _chunks_of(self) -> Mapping[int, list[ChunkEntry]]:
-        """The chunks of each channel, in order."""
-        chunks: dict[int, list[ChunkEntry]] = {topic.channel: [] for topic in schema.TOPICS}
-        for entry in self._index.chunks:
-            channels = entry.channels or (self._first_channel(entry),)
-            if len(channels) != 1 or channels[0] not in chunks:
-                raise self._damaged(entry, f"messages of channels {channels}, expected one of ours")
-            chunks[channels[0]].append(entry)
-        return chunks
+    def _chunks_of(self) -> Mapping[int, NDArray[np.intp]]:
+        """Which chunks each channel has, in order."""
+        table = self._index.chunks
+        channels = table.columns["channel"].copy() if table else np.empty(0, np.uint16)
+        for k in np.flatnonzero(channels == 0).tolist():
+            channel = self._store.first_channel(table[k])
+            if channel not in self._index.channels:
+                raise self._damaged(table[k], f"messages of channel {channel}, expected one of ours")
+            channels[k] = channel
+        return {topic.channel: np.flatnonzero(channels == topic.channel) for topic in schema.TOPICS}
 
-    def _first_channel(self, entry: ChunkEntry) -> int:
-        """Return the channel of a chunk's first message, where no index says it."""
-        data = self._chunk(entry)
-        if len(data) < _MESSAGE_HEAD.size:
-            raise self._damaged(entry, "no whole message")
-        return int(_MESSAGE_HEAD.unpack_from(data)[2])
+    def _entry(self, topic: Topic, k: int) -> ChunkEntry:
+        """Return the entry of a topic's chunk number k."""
+        return self._index.chunks[int(self._chunks_of[topic.channel][k])]
 
     def _numbers(self, topic: Topic) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return, for each chunk of a fixed-width topic, the number of its first message and behind its last.
@@ -331,13 +345,15 @@ class Recording:
         Messages are numbered as recorded; where a repair lost some, the numbers go on behind the gap.
         """
         if topic not in self._known_numbers:
-            size = self.dtypes[topic].itemsize
-            for entry in self._chunks_of[topic.channel]:
-                if entry.uncompressed_size % size:
-                    raise self._damaged(entry, f"{entry.uncompressed_size} bytes, not a multiple of {size}")
-            counts = [entry.uncompressed_size // size for entry in self._chunks_of[topic.channel]]
-            ends = np.cumsum(counts, dtype=np.int64)
-            firsts = ends - np.array(counts, dtype=np.int64)
+            size, chunks = self.dtypes[topic].itemsize, self._chunks_of[topic.channel]
+            sizes = np.empty(0, np.int64)
+            if len(chunks):
+                sizes = self._index.chunks.columns["uncompressed_size"][chunks].astype(np.int64)
+            if (odd := np.flatnonzero(sizes % size)).size:
+                entry = self._entry(topic, int(odd[0]))
+                raise self._damaged(entry, f"{entry.uncompressed_size} bytes, not a multiple of {size}")
+            ends = np.cumsum(sizes // size)
+            firsts = ends - sizes // size
             for start, stop in self.lost.get(topic.name, []):
                 behind = firsts >= start
                 firsts[behind] += stop - start
@@ -345,79 +361,22 @@ class Recording:
             self._known_numbers[topic] = firsts, ends
         return self._known_numbers[topic]
 
-    def _block(self, topic: Topic, entry: ChunkEntry) -> NDArray[np.void]:
+    def _block(self, topic: Topic, k: int, data: bytes) -> NDArray[np.void]:
         """Return a chunk of a fixed-width topic as an array, after looking at its constant bytes."""
-        data = self._chunk(entry)
         dtype = self.dtypes[topic]
-        if len(data) % dtype.itemsize:
-            raise self._damaged(entry, f"{len(data)} bytes, not a multiple of {dtype.itemsize}")
         block = np.frombuffer(data, dtype=dtype)
         if (block["channel_id"] != topic.channel).any() or (
             block["record_length"] != dtype.itemsize - 9
         ).any():
-            raise self._damaged(entry, f"other messages than of {topic.name}")
+            raise self._damaged(self._entry(topic, k), f"other messages than of {topic.name}")
         return block
 
-    def _chunk(self, entry: ChunkEntry) -> bytes:
-        """Return a chunk's message records, after comparing its checksum; keeps the last few."""
-        if entry.offset in self._kept:
-            self._kept.move_to_end(entry.offset)
-            return self._kept[entry.offset]
-        record = self._read(entry.offset, entry.length)
-        where = f"{self.path}: chunk at {entry.offset}"
-        try:
-            size, crc, name_length = struct.unpack_from("<QII", record, 25)
-            name = record[41 : 41 + name_length].decode("ascii")
-            (packed,) = struct.unpack_from("<Q", record, 41 + name_length)
-        except (struct.error, UnicodeDecodeError) as error:
-            raise RecordingError(f"{where}: the record cannot be read.") from error
-        body = memoryview(record)[49 + name_length :]
-        if record[0] != 6 or packed != len(body) or size > MAX_CHUNK_BYTES or size != entry.uncompressed_size:
-            raise RecordingError(f"{where}: the record contradicts itself or its index entry.")
-        data = decompress(body, name, size, where)
-        if zlib.crc32(data) != crc:
-            raise RecordingError(f"{where}: its content does not match its checksum.")
-        self._kept[entry.offset] = data
-        if len(self._kept) > _CHUNKS_KEPT:
-            self._kept.popitem(last=False)
-        return data
-
-    def _read(self, offset: int, length: int) -> bytes:
-        if length > MAX_CHUNK_BYTES:
-            raise RecordingError(
-                f"{self.path}: the record at {offset} declares {length:,} bytes; too large to be ours."
-            )
-        self._stream.seek(offset)
-        data = self._stream.read(length)
-        if len(data) != length:
-            raise RecordingError(f"{self.path}: the record at {offset} is cut off.")
-        return data
+    def _record(self, opcode: int, offset: int, length: int, most: int = MAX_CHUNK_BYTES) -> bytes:
+        """Return the body of a record of this kind."""
+        record = self._store.record(offset, length, most)
+        if record[0] != opcode or int.from_bytes(record[1:9], "little") != length - 9:
+            raise RecordingError(f"{self.path}: found another record at {offset} than the index says.")
+        return record[9:]
 
     def _damaged(self, entry: ChunkEntry, found: str) -> RecordingError:
         return RecordingError(f"{self.path}: chunk at {entry.offset}: found {found}.")
-
-
-def _json(entries: Mapping[str, str], name: str, path: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(entries["json"]))
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise RecordingError(f"{path}: the metadata {name!r} holds no JSON object.") from error
-
-
-def pack_array(array: NDArray[Any]) -> bytes:
-    """Return an array as a `.npy` file, compressed with zstd."""
-    buffer = BytesIO()
-    np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
-    return zstandard.ZstdCompressor(level=9).compress(buffer.getvalue())
-
-
-def _array(data: bytes, where: str) -> NDArray[Any]:
-    """Return the array in a compressed `.npy` file; never unpickles, never unpacks without bound."""
-    try:
-        with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(data) as stream:
-            unpacked = stream.read(MAX_ARRAY_BYTES)
-        return np.asarray(
-            np.lib.format.read_array(BytesIO(unpacked), allow_pickle=False, max_header_size=4096)
-        )
-    except (zstandard.ZstdError, ValueError, EOFError) as error:
-        raise RecordingError(f"{where}: holds no array ({error}).") from error

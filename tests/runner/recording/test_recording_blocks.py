@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from runner.errors import RecordingError
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.store import RecordStore
 
 topics = st.sampled_from(schema.BLOCK_TOPICS)
 places = st.integers(0, 2200)
