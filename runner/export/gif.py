@@ -17,11 +17,11 @@ import numpy as np
 from runner.errors import MissingExtra
 from runner.export import svg
 from runner.export.plots_figure import matplotlib_of
-from runner.export.report_replay import Episode
+from runner.export.report_replay import Episode, deeds_in_words
 from runner.frames import agents_of
 from runner.mdp import Mdp
 from runner.recording.reader import Recording
-from runner.words import actions_in_words, event_in_words, states_in_words
+from runner.words import event_in_words, states_in_words
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -38,7 +38,7 @@ _MARGIN: Final = 14
 _LETTER: Final = 0.615
 """Width of a letter of DejaVu Sans, on average and generously, as a share of the font's size."""
 _TALLEST: Final = 480
-_COLOURS: Final = 96
+_COLOURS: Final = 128
 
 
 def write_gif(
@@ -109,7 +109,7 @@ def pictures(recording: Recording, episode: Episode, width: int = WIDTH) -> list
 
 def captions_of(mdp: Mdp, learners: list[str], episode: Episode, scene: bool = True) -> list[list[str]]:
     """Return for each frame what is written below it: step, actions, rewards, events."""
-    actions = actions_in_words(mdp)
+    actions = deeds_in_words(mdp)
     totals = np.cumsum(episode.rewards, axis=0)
     captions = [[f"step 0 of {episode.length:,}", "the episode begins", ""]]
     for k in range(episode.steps):
@@ -179,11 +179,12 @@ def _pixels(picture: str, width: int) -> Image:
 
 
 def _palette(frames: list[Image]) -> Image:
-    """Return one palette for all frames, from the first, one in the middle and the last."""
+    """Return one palette for all frames: the commonest colours of the first, a middle and the last."""
     from PIL import Image
 
     some = [frames[0], frames[len(frames) // 2], frames[-1]]
-    beside = Image.new("RGB", (sum(frame.width for frame in some), some[0].height))
-    for number, frame in enumerate(some):
-        beside.paste(frame, (number * frame.width, 0))
-    return beside.quantize(_COLOURS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    pixels = np.concatenate([np.asarray(frame).reshape(-1, 3) for frame in some])
+    colours, counts = np.unique(pixels, axis=0, return_counts=True)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(colours[np.argsort(-counts)[:_COLOURS]].tobytes())
+    return palette

@@ -162,10 +162,10 @@ def draw_panel(axes: Axes, panel: Panel, groups: int) -> None:
 def footnote(groups: Sequence[Group]) -> str:
     """Return what lines and bands mean."""
     if max(len(group.runs) for group in groups) == 1:
-        return "Each line is one run, every report of it. Evaluations follow the greedy policy."
+        return "Each line is one run, as reported. Evaluation trials follow the greedy policy: no exploring."
     return (
         "Lines: median over the runs of a configuration; bands: from the lowest run to the highest. "
-        "Evaluations follow the greedy policy."
+        "Evaluation trials follow the greedy policy: no exploring."
     )
 
 
@@ -309,6 +309,8 @@ def _for_page(svg: str, panel: Panel) -> str:
     element = svg[svg.index("<svg") :]
     element = re.sub(r"<metadata>.*?</metadata>", "", element, flags=re.DOTALL)
     element = element.replace(_INK, "currentColor")
+    for number, colour in enumerate(COLOURS):  # the page has lighter ones for the dark
+        element = element.replace(colour.lower(), f"var(--line-{number}, {colour})")
     element = re.sub(r' width="[\d.]+pt" height="[\d.]+pt"', "", element, count=1)
     name = re.sub(r"\W+", "-", panel.metric)
     element = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", element)

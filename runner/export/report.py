@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import MissingExtra, RecordingError
 from runner.export import svg, svg_maps
-from runner.export.plots import Panel, RunSeries, groups_of, panels_of, read_series
+from runner.export.plots import RunSeries, groups_of, panels_of, read_series
 from runner.export.plots_figure import footnote, is_wide, matplotlib_of, panel_svg
 from runner.export.report_maps import MapRow, maps_of, stages_of
 from runner.export.report_replay import Episode, payload, ranked_trials, training_episode, trial
@@ -189,7 +189,12 @@ def _replay(recording: Recording, episodes: list[Episode], drawing: svg.Drawing 
     if drawing is not None:
         first = drawing.places(mdp, episodes[0].states[:1])
         picture = drawing.frame(first[0], "The grid at the step shown below it", first, style="")
-    return {"data": _embedded(data | {"trail": svg.TRAIL}), "picture": picture, "episodes": data["episodes"]}
+    return {
+        "data": _embedded(data | {"trail": svg.TRAIL}),
+        "picture": picture,
+        "key": "" if drawing is None else drawing.key(),
+        "episodes": data["episodes"],
+    }
 
 
 # --- the page -----------------------------------------------------------------------------------------
@@ -212,14 +217,12 @@ def _plots(series: Sequence[RunSeries]) -> dict[str, Any]:
     except RecordingError:
         return {}
     return {
-        "panels": [_panel(panel, len(groups)) for panel in panels],
-        "groups": [(COLOURS[i % len(COLOURS)], group.described) for i, group in enumerate(groups)],
+        "panels": [{"svg": panel_svg(panel, len(groups)), "wide": is_wide(panel)} for panel in panels],
+        "groups": [
+            (i % len(COLOURS), COLOURS[i % len(COLOURS)], group.described) for i, group in enumerate(groups)
+        ],
         "footnote": footnote(groups),
     }
-
-
-def _panel(panel: Panel, groups: int) -> dict[str, Any]:
-    return {"svg": panel_svg(panel, groups), "wide": is_wide(panel), "title": panel.title}
 
 
 def _templates() -> Environment:

@@ -139,6 +139,18 @@ def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
     return int(order[0]), int(order[len(order) // 2]), int(order[-1])
 
 
+def deeds_in_words(mdp: Mdp) -> list[str]:
+    """Return the words of every joint action, saying whose: `taxi 1 south, taxi 2 pickup`."""
+    words = [str(word) for word in actions_in_words(mdp)]
+    if len(mdp.agents) < 2 or action_names(mdp) is None:
+        return words
+    names = [agent.replace("_", " ") for agent in mdp.agents]
+    return [
+        ", ".join(f"{name} {own}" for name, own in zip(names, word.split(" + "), strict=True))
+        for word in words
+    ]
+
+
 def typical_trial(recording: Recording) -> tuple[int, int]:
     """Return the last evaluation (training episodes before it) and its median trial.
 
@@ -164,7 +176,7 @@ def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[
     own = action_names(mdp) or [[f"action {i}" for i in range(n)] for n in mdp.action_counts]
     joint = actions_in_words(mdp).tolist()
     return {
-        "actions": joint,
+        "actions": deeds_in_words(mdp),
         "choices": [joint] if len(agents) == 1 else own,
         "learners": [agent.replace("_", " ") for agent in agents],
         "events": [event_in_words(name) for name in mdp.event_names],

@@ -26,6 +26,9 @@ TRAIL: Final = 40
 """So many of a mover's last places are joined by its trail."""
 
 MOVER_COLOURS: Final = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7", "#F0E442", "#D55E00")
+_COLOUR_NAMES: Final = dict(
+    zip(MOVER_COLOURS, ("orange", "blue", "green", "pink", "yellow", "red"), strict=True)
+)
 _FONT: Final = "font-family:'DejaVu Sans',sans-serif;font-weight:bold"
 
 STYLE: Final = (
@@ -78,6 +81,16 @@ class Drawing:
             places[carried, number, :2] = places[carried, by, :2] + _RIDES
             places[carried, number, 2] = 70
         return places.astype(np.int16)
+
+    def key(self) -> str:
+        """Return in words what the picture shows, for someone who sees it for the first time."""
+        said = [self._thing_in_words(thing) for thing in self._things]
+        named = dict.fromkeys(
+            f"{mark['name']}: {mark['label']}" for mark in self._scene["landmarks"] if "label" in mark
+        )
+        said += [*named]
+        said += ["thick lines: walls"] if self._scene["walls"] else []
+        return "; ".join([*said, "faint line: the way so far"]).capitalize() + "."
 
     def still(self) -> str:
         """Return what never changes: the cells, the landmarks and the walls."""
@@ -155,6 +168,11 @@ class Drawing:
             f"{escape(mark['name'][:2])}</text>"
             + (f'<g transform="translate({x + 50} {y + 50})">{_GOAL}</g>' if kind == "goal" else "")
         )
+
+    def _thing_in_words(self, thing: Mapping[str, Any]) -> str:
+        if thing["kind"] == "mover":
+            return f"{_COLOUR_NAMES[self._colour(self._things.index(thing))]}: {thing['label']}"
+        return f"{'frame with a flag' if thing['kind'] == 'goal' else 'black figure'}: {thing['label']}"
 
     def _shape(self, number: int) -> str:
         thing = self._things[number]
