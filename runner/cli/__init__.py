@@ -21,6 +21,12 @@ from runner.errors import RunnerError, StorageError, nearest
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Do": {
         "run": ("runner.cli.commands.run", "Train, evaluate and record an experiment."),
+        "resume": (
+            "runner.cli.commands.resume",
+            "Go on with a run that was interrupted, as if it never had been.",
+        ),
+        "evaluate": ("runner.cli.commands.evaluate", "Play a run's table of any moment in new episodes."),
+        "rerecord": ("runner.cli.commands.rerecord", "Record the steps of a run that left them out."),
     },
     "Look": {
         "ls": ("runner.cli.commands.ls", "List the recorded runs."),
@@ -30,7 +36,15 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "plot": ("runner.cli.commands.plot", "Draw every metric of one or several runs over episodes."),
         "report": ("runner.cli.commands.report", "Write one self-contained page about one or several runs."),
         "export": ("runner.cli.commands.export", "Write a run in a form that other programs read."),
+        "qtable": ("runner.cli.commands.qtable", "Tell the exact Q-table of a run at any step."),
         "table": ("runner.cli.commands.table", "Print an environment's transition table in words."),
+    },
+    "Compare": {
+        "diff": ("runner.cli.commands.diff", "Tell what differs between two runs, and where they part."),
+    },
+    "Check": {
+        "verify": ("runner.cli.commands.verify", "Check every step of a run by doing it again."),
+        "repair": ("runner.cli.commands.repair", "Make a damaged recording whole; tell what was lost."),
     },
     "Set up": {
         "config": ("runner.cli.commands.config", "Check a configuration; print the schema of one."),

@@ -1,0 +1,222 @@
+"""A `RunDiff` as sections of sentences and tables: what text, Markdown and HTML have in common."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from runner.analysis.diff import Cause, Change, Parting, RunDiff, Update
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A small table of text."""
+
+    headings: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A title, and what is said under it."""
+
+    title: str
+    sentences: list[str] = field(default_factory=list)
+    grids: list[Grid] = field(default_factory=list)
+
+
+def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
+    """Return what is to be said of a difference.
+
+    Args:
+        difference: of two runs.
+        everything: also the sections in which nothing differs.
+    """
+    made = [
+        _runs(difference),
+        _changes("Configuration", difference.config),
+        _environment(difference),
+        _trajectory(difference),
+        _evaluations(difference),
+        _tables(difference),
+        _metrics(difference, everything),
+        _changes("Costs", difference.costs),
+        _changes("Provenance", difference.provenance),
+    ]
+    if everything:
+        return [section if _says(section) else Section(section.title, ["the same"]) for section in made]
+    return [section for section in made if _says(section)]
+
+
+def _says(section: Section) -> bool:
+    return bool(section.sentences or section.grids)
+
+
+def _runs(difference: RunDiff) -> Section:
+    rows = [
+        (name, who["run_id"], who["name"], str(who["seed"]), who["status"])
+        for name, who in (("A", difference.a), ("B", difference.b))
+    ]
+    verdict = "The content is the same." if difference.same_content else "The content differs."
+    grid = Grid(("", "id", "name", "seed", "status"), rows)
+    return Section("Runs", [verdict, *(f"Note: {note}." for note in difference.notes)], [grid])
+
+
+def _changes(title: str, changes: list[Change]) -> Section:
+    rows = [(change.path, _text(change.a), _text(change.b)) for change in changes]
+    return Section(title, grids=[Grid(("", "A", "B"), rows)] if rows else [])
+
+
+def _environment(difference: RunDiff) -> Section:
+    environment = difference.environment
+    if environment.same:
+        return Section("Environment")
+    sentences = []
+    if environment.transitions:
+        share = environment.transitions / environment.of
+        sentences.append(
+            f"{environment.transitions:,} of {environment.of:,} (state, action) pairs ({share:.1%}) have "
+            f"other outcomes; {len(environment.examples)} of them:"
+        )
+    if environment.other_starts:
+        sentences.append("Episodes start in other states, or with other probabilities.")
+    grids = []
+    if environment.description:
+        grids.append(
+            Grid(("", "A", "B"), [(c.path, _text(c.a), _text(c.b)) for c in environment.description])
+        )
+    if environment.examples:
+        rows = [(f"{change.state}: {change.action}", change.a, change.b) for change in environment.examples]
+        grids.append(Grid(("state: action", "A", "B"), rows))
+    return Section("Environment", sentences, grids)
+
+
+def _trajectory(difference: RunDiff) -> Section:
+    overlap, parting = difference.overlap, difference.parting
+    sentences, grids = [], []
+    if parting is not None and difference.cause is not None:
+        sentences += _told(parting, difference.cause)
+        grids += _q_rows(difference.cause)
+    elif overlap is not None:
+        sentences.append("Training is the same, step by step.")
+    if overlap is not None and parting is not None:
+        share = overlap.equal_steps / overlap.compared_steps if overlap.compared_steps else math.nan
+        sentences.append(
+            f"Of the {overlap.episodes:,} episodes of both, {overlap.equal_episodes:,} are the same; of their "
+            f"steps {share:.1%} agree at the same time of the same episode. Mean length "
+            f"{overlap.mean_length_a:.1f} in A, {overlap.mean_length_b:.1f} in B."
+        )
+    return Section("Training", sentences, grids)
+
+
+def _evaluations(difference: RunDiff) -> Section:
+    sentences, grids = [], []
+    for parting, cause in difference.evaluations:
+        sentences += _told(parting, cause)
+        grids += _q_rows(cause)
+    return Section("Evaluation", sentences, grids)
+
+
+def _told(parting: Parting, cause: Cause) -> list[str]:
+    where = f"episode {parting.episode:,}, t {parting.t}"
+    if parting.evaluation is not None:
+        where = f"evaluation {parting.evaluation}, trial {parting.episode:,}, t {parting.t}"
+    said = [
+        f"They part at {where} (step {parting.step:,}) in {parting.field.replace('_', ' ')}: {cause.text}."
+    ]
+    if cause.update is not None:
+        said.append(_update_told(cause.update))
+    return said
+
+
+def _update_told(update: Update) -> str:
+    rewards = ""
+    if update.rewards_a != update.rewards_b:
+        rewards = f" (rewards {update.rewards_a} and {update.rewards_b})"
+    return (
+        f"The tables came to differ at step {update.step:,}, in episode {update.episode:,}: {update.agent}'s "
+        f"value of {update.action} in {update.state} became {update.a:.6g} in A and {update.b:.6g} in B"
+        f"{rewards}."
+    )
+
+
+def _q_rows(cause: Cause) -> list[Grid]:
+    """Return the Q-values of the state in which the greedy actions differ, the best of each agent."""
+    grids = []
+    for agent, rows in cause.rows.items():
+        best = sorted({_argmax(rows["a"]), _argmax(rows["b"])})
+        cells = [(f"action {j}", f"{rows['a'][j]:.6g}", f"{rows['b'][j]:.6g}") for j in best]
+        grids.append(Grid((f"Q of {agent}, the greedy ones", "A", "B"), cells))
+    return grids
+
+
+def _argmax(values: list[float]) -> int:
+    return max(range(len(values)), key=values.__getitem__)
+
+
+def _tables(difference: RunDiff) -> Section:
+    differing = [table for table in difference.tables if table.largest > 0]
+    if not differing:
+        return Section("Q-tables")
+    rows = [
+        (
+            f"{table.episode:,}",
+            table.agent,
+            f"{table.largest:.4g}",
+            f"{table.mean:.4g}",
+            f"{table.greedy_share:.1%}",
+            "–" if math.isnan(table.greedy_share_visited) else f"{table.greedy_share_visited:.1%}",
+        )
+        for table in differing
+    ]
+    headings = ("episode", "agent", "largest", "mean", "other greedy action", "weighted by visits")
+    last = differing[-1]
+    cells = [(f"{cell.state}: {cell.action}", f"{cell.a:.6g}", f"{cell.b:.6g}") for cell in last.cells]
+    where = Grid((f"largest, {last.agent}, episode {last.episode:,}", "A", "B"), cells)
+    return Section("Q-tables", grids=[Grid(headings, rows), where])
+
+
+def _metrics(difference: RunDiff, everything: bool) -> Section:
+    shown = [metric for metric in difference.metrics if everything or not metric.same]
+    rows = [
+        (
+            metric.name,
+            f"{metric.end_a:,.2f}",
+            f"{metric.end_b:,.2f}",
+            f"{metric.end_b - metric.end_a:+,.2f}",
+            "–" if math.isnan(metric.area) else f"{metric.area:+,.2f}",
+        )
+        for metric in shown
+    ]
+    grids = [Grid(("", "A at the end", "B at the end", "B - A", "mean B - A"), rows)] if rows else []
+    crossings = [
+        (f"{metric.name} reaches {level}", *("never" if at is None else f"episode {at:,}" for at in episodes))
+        for metric in difference.metrics
+        for level, episodes in metric.crossings.items()
+    ]
+    if crossings:
+        grids.append(Grid(("first", "A", "B"), crossings))
+    return Section("Metrics", grids=grids)
+
+
+def _text(value: Any) -> str:
+    return "–" if value is None else str(value)
+
+
+def markdown(made: list[Section]) -> Iterator[str]:
+    """Yield the lines of sections in Markdown."""
+    for section in made:
+        yield from (f"## {section.title}", "")
+        for sentence in section.sentences:
+            yield from (sentence, "")
+        for grid in section.grids:
+            yield _row(grid.headings)
+            yield _row(("---",) * len(grid.headings))
+            yield from (_row(row) for row in grid.rows)
+            yield ""
+
+
+def _row(cells: tuple[str, ...]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"

@@ -1,0 +1,123 @@
+"""`dualtaxi diff`: what differs between two runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli.options import RunName, find, json_option, recordings_option
+from runner.cli.output import console, draw, print_json, table, title
+from runner.errors import RunnerError
+
+if TYPE_CHECKING:
+    from runner.analysis.diff import Change, RunDiff
+    from runner.analysis.diff.sections import Section
+
+
+@click.command("diff")
+@click.argument("a", metavar="A", type=RunName())
+@click.argument("b", metavar="B", type=RunName())
+@recordings_option
+@json_option
+@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for a note or an issue.")
+@click.option(
+    "--ignore", multiple=True, metavar="GLOB", help="Leave out settings and provenance whose path fits."
+)
+@click.option("--all", "everything", is_flag=True, help="Also what is the same.")
+@click.option("--first", is_flag=True, help="Only settings, and the first step of training that differs.")
+@click.option(
+    "--target", "targets", multiple=True, metavar="METRIC=LEVEL", help="Tell who reaches a level first."
+)
+@click.pass_context
+def command(
+    ctx: click.Context,
+    a: str,
+    b: str,
+    recordings: Path | None,
+    as_json: bool,
+    as_markdown: bool,
+    ignore: tuple[str, ...],
+    everything: bool,
+    first: bool,
+    targets: tuple[str, ...],
+) -> None:
+    """Tell what differs between the runs A and B, down to the first step at which they part, and why.
+
+    Exit code 0 if both have the same content, whatever they are called, 1 if not.
+
+    \b
+    Examples:
+      dualtaxi diff k3v9m2xq p7 --ignore 'package.*'
+      dualtaxi diff tutorial_cooperative cooperative --target finish_percent=80
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.analysis.diff import diff
+    from runner.recording.reader import open_recording
+
+    levels = dict(_level(target) for target in targets)
+    left, right = find(a, recordings), find(b, recordings)
+    with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
+        difference = _without(diff(recording_a, recording_b, levels, first), ignore)
+    if as_json:
+        print_json(_as_json(difference))
+    else:
+        _print(difference, everything, as_markdown)
+    ctx.exit(0 if difference.same_content else 1)
+
+
+def _level(text: str) -> tuple[str, float]:
+    metric, _, level = text.partition("=")
+    try:
+        return metric, float(level)
+    except ValueError:
+        raise RunnerError(
+            f"--target: found {text!r}, expected METRIC=LEVEL such as finish_percent=80."
+        ) from None
+
+
+def _without(difference: RunDiff, ignore: tuple[str, ...]) -> RunDiff:
+    """Return the difference without the paths that are to be ignored."""
+
+    def kept(changes: list[Change]) -> list[Change]:
+        return [c for c in changes if not any(fnmatch.fnmatchcase(c.path, glob) for glob in ignore)]
+
+    return dataclasses.replace(
+        difference,
+        config=kept(difference.config),
+        provenance=kept(difference.provenance),
+        costs=kept(difference.costs),
+    )
+
+
+def _as_json(difference: RunDiff) -> dict[str, Any]:
+    """Return the difference as JSON can hold it; whole step records are left out."""
+    told = dataclasses.asdict(difference)
+    for parting in (told["parting"], *(pair[0] for pair in told["evaluations"])):
+        if parting is not None:
+            del parting["a_step"], parting["b_step"]
+    return told
+
+
+def _print(difference: RunDiff, everything: bool, as_markdown: bool) -> None:
+    from runner.analysis.diff.sections import markdown, sections
+
+    made = sections(difference, everything)
+    if as_markdown:
+        click.echo("\n".join(markdown(made)))
+        return
+    for section in made:
+        _draw(section)
+
+
+def _draw(section: Section) -> None:
+    draw(title(section.title), *section.sentences)
+    for grid in section.grids:
+        made = table(
+            *grid.headings, left=grid.headings, shrinking=grid.headings if console().is_terminal else ()
+        )
+        for row in grid.rows:
+            made.add_row(*row)
+        draw(made)
