@@ -352,11 +352,11 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
     start = job.config.initial_q
     if not isinstance(start, RunTable):
         return None
-    return recorded_tables(start, run.folder.parent, mdp, job)
+    return _recorded_tables(start, job, run, mdp)
 
 
-def recorded_tables(start: RunTable, recordings: Path, mdp: Mdp, job: Job) -> list[Any]:
-    """Return a recorded run's tables after its last training step, or the step asked for.
+def _recorded_tables(start: RunTable, job: Job, run: Run, mdp: Mdp) -> list[Any]:
+    """Return another run's tables after its last training step, or the step asked for.
 
     Raises:
         RunnerError: there is no such run or step, or its tables have another shape.
@@ -364,7 +364,7 @@ def recorded_tables(start: RunTable, recordings: Path, mdp: Mdp, job: Job) -> li
     from runner.analysis.tables import tables_at
     from runner.recording.reader import open_recording
 
-    source = runs.find_run(start.run, recordings)
+    source = runs.find_run(start.run, run.folder.parent, but=run.run_id)
     with open_recording(source.recording) as recording:
         steps = recording.count(schema.TRAIN_STEP) or source.summary.get("train_steps", 0)
         tables = tables_at(recording, steps if start.step is None else start.step)

@@ -174,17 +174,22 @@ def list_runs(recordings: Path) -> list[Run]:
     return sorted(runs, key=lambda run: (run.facts["created"], run.run_id), reverse=True)
 
 
-def find_run(name: str, recordings: Path) -> Run:
+def find_run(name: str, recordings: Path, but: str = "") -> Run:
     """Return the one run that answers to an id, a unique prefix of it, a name, a path or `@latest`.
 
     `NAME@latest` is the newest run of that name.
+
+    Args:
+        name: what it must answer to.
+        recordings: the folder to look in.
+        but: the id of a run that does not answer: the one that is asking.
 
     Raises:
         RunNotFound: none does, or several do.
     """
     if os.sep in name or name.endswith(".mcap") or (os.altsep and os.altsep in name):
         return _run_at(Path(name))
-    runs = list_runs(recordings)
+    runs = [run for run in list_runs(recordings) if run.run_id != but]
     if name.endswith(_LATEST):
         stem = name.removesuffix(_LATEST)
         newest = next((run for run in runs if stem in ("", run.name)), None)
