@@ -185,7 +185,7 @@ class Twin:
         until = len(phase.episodes) + trials
         while len(phase.episodes) < until:
             trial, t = len(phase.episodes), len(phase.begun)
-            state = phase.steps[-1].next_state if t else self._start(EVALUATION_START, trial)
+            state = phase.steps[-1].next_state if t else self._trial_start(trial)
             if self.learns:
                 action, explored = self._joint([self._greedy(i, state) for i in range(self.learners)]), 0
             else:
@@ -196,6 +196,12 @@ class Twin:
 
     def _start(self, stream: int, episode: int) -> int:
         return pick(self.starts, uniform(draw(self.seed, stream, episode, 0)))
+
+    def _trial_start(self, trial: int) -> int:
+        start = self.config.evaluation.start
+        if start == "each":
+            return self.starts[trial % len(self.starts)][0]
+        return self._start(EVALUATION_START, trial) if start == "random" else start
 
     def _greedy(self, i: int, state: int) -> int:
         row = self.tables[i][state]

@@ -157,6 +157,17 @@ def test_the_second_table_takes_the_first_action_only_where_it_has_one():
         Learner(config, uneven, 0)
 
 
+@pytest.mark.parametrize("start", ["each", 77, "random"])
+def test_trials_start_where_they_are_told_to(start):
+    config, mdp = experiment(SMALL, evaluation={"every": 1, "trials": 1, "start": start})
+    twin = assert_kernel_is_twin(config, mdp, seed=3, blocks=[1000], trials=30)
+    begun = [step.state for step in twin.evaluation.steps if step.t == 0]
+    possible = np.flatnonzero(mdp.start).tolist()
+    expected = {"each": (possible * 9)[:60], 77: [77] * 60}
+    assert begun == expected.get(start, begun)
+    assert set(begun) <= {77, *possible}
+
+
 def test_where_nothing_ends_an_episode_there_is_no_evaluation():
     endless = {"env": {"id": "CliffWalking-v1"}}
     with pytest.raises(EnvironmentNotUsable, match=r"no step limit.*max_episode_steps.*evaluation: null"):
