@@ -6,47 +6,67 @@ import time
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from runner import runs
+from runner.analysis.tables import last_step, tables_at
 from runner.config import ExperimentConfig, from_mapping
-from runner.errors import Diverged, RunnerError
+from runner.errors import Diverged, RunnerError, StorageError
 from runner.execution import Report, Session, Stop, describe, recorder_for, run_job, write_result
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import load_mdp
 from runner.provenance import provenance
+from runner.recording.contents import survey
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
+from runner.resume import owned
 from runner.runs import Run
 from runner.verify import initial_tables
+
+Start = int | Literal["random", "each"]
+
+
+def holds_steps(run: Run) -> bool:
+    """Return whether a run's recording holds its steps."""
+    with open_recording(run.recording) as recording:
+        return bool(recording.config["recording"]["steps"] == "all")
 
 
 def rerecord(run: Run, report: Report = lambda _: None, stop: Stop = lambda: False) -> Run:
     """Record the steps of a run that left them out; proven by the digest that they had.
 
-    The new recording takes the old one's place when it is complete and has the same content digest.
+    The new recording takes the old one's place when it is complete and has the same content digest. A run
+    that holds its steps is returned as it is.
 
     Raises:
-        RunnerError: the run is not finished, or holds its steps already.
+        RunnerError: the run is not finished, or its folder cannot be used.
         Diverged: the job gives another content here than it gave then; the recording stays as it is.
+        KeyboardInterrupt: `stop` said so; the recording stays as it is.
     """
-    if run.status != "finished":
-        raise RunnerError(
-            f"run {run.run_id} is {run.status}; `dualtaxi resume {run.run_id}` finishes it first."
-        )
+    with owned(run) as current:
+        if current.status != "finished":
+            raise RunnerError(
+                f"run {run.run_id} is {current.status}; `dualtaxi resume {run.run_id}` finishes it first."
+            )
+        if holds_steps(current):
+            return current
+        return _rerecord(current, report, stop)
+
+
+def _rerecord(run: Run, report: Report, stop: Stop) -> Run:
     config = from_mapping(run.facts["config"])
-    if config.recording.steps == "all":
-        raise RunnerError(f"run {run.run_id} holds its steps already; there is nothing to do.")
     config = _with(config, recording=config.to_mapping()["recording"] | {"steps": "all"})
-    job = Job(config, run.seed)
     fresh = run.recording.with_suffix(".rerecording")
-    fresh.unlink(missing_ok=True)
     started = time.monotonic()
     try:
-        summary = _record(job, run, fresh, report, stop)
-    except BaseException:
         fresh.unlink(missing_ok=True)
-        raise
-    fresh.replace(run.recording)
+        summary = _record(Job(config, run.seed), run, fresh, report, stop)
+        fresh.replace(run.recording)
+    except OSError as error:
+        raise StorageError(f"{fresh}: cannot be written ({error.strerror}).") from error
+    finally:
+        fresh.unlink(missing_ok=True)
     summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": run.recording.stat().st_size}
     return run.update(config=config.to_mapping(), summary=summary)
 
@@ -55,8 +75,8 @@ def evaluate(
     run: Run,
     recordings: Path,
     step: int | None = None,
-    trials: int = 200,
-    start: int | Literal["random", "each"] = "random",
+    trials: int | None = 200,
+    start: Start = "random",
     seed: int = 0,
     report: Report = lambda _: None,
     stop: Stop = lambda: False,
@@ -67,7 +87,7 @@ def evaluate(
         run: whose table; the new run's `initial_q` names it.
         recordings: the folder for the new run.
         step: after how many training steps; None for the last.
-        trials: how many episodes.
+        trials: how many episodes; None for one in each start state.
         start: where they start: at random, in each start state in turn, or in one state.
         seed: fixes the new run's draws.
         report: called with the progress a few times a second.
@@ -76,19 +96,35 @@ def evaluate(
     Raises:
         RunnerError: the table cannot be had, or the new run not be recorded.
     """
-    known = run.folder.parent.resolve() == recordings.resolve()
-    origin = {"run": run.run_id if known else str(run.recording.resolve()), "step": step}
-    config = _with(
-        from_mapping(run.facts["config"]),
+    config = evaluation_of(run, recordings, step, trials, start, seed)
+    job = Job(config, seed)
+    return run_job(job, runs.create_run(recordings, config, seed), report, stop)
+
+
+def evaluation_of(
+    run: Run, recordings: Path, step: int | None, trials: int | None, start: Start, seed: int
+) -> ExperimentConfig:
+    """Return the experiment that plays a run's table; arguments and errors as for `evaluate`."""
+    with open_recording(run.recording) as recording:
+        chosen = last_step(recording) if step is None else step
+        tables_at(recording, chosen)  # refused here, before there is a run
+        starts = int(np.count_nonzero(recording.mdp.start))
+        original = from_mapping(recording.config)
+    known = run.folder.parent.resolve() == recordings.resolve() and run.recording.name == runs.RECORDING_FILE
+    return _with(
+        original,
         name=f"{run.name[:90]}.evaluated",
         seeds=[seed],
         episodes=0,
-        initial_q=origin,
-        evaluation={"every": 1, "trials": trials, "start": start},
+        initial_q={"run": run.run_id if known else str(run.recording.resolve()), "step": chosen},
+        evaluation={
+            "every": 1,
+            "trials": starts if trials is None else trials,
+            "start": "each" if trials is None else start,
+        },
         snapshots={"every": None},
+        recording=original.to_mapping()["recording"] | {"steps": "all"},
     )
-    job = Job(config, seed)
-    return run_job(job, runs.create_run(recordings, config, seed), report, stop)
 
 
 def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict[str, Any]:
@@ -97,8 +133,12 @@ def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict
     with open_recording(run.recording) as recording:
         learner = Learner(job.config, mdp, job.seed, initial_tables(recording))
         expected, made_by = recording.result["content_digest"], recording.provenance
+        names = [entry.name for entry in survey(run.recording).metadata]
+        resumed = {name: recording.metadata(name) for name in names if name.startswith("resume/")}
     with RecordingFile(fresh) as file:
         describe(file, job, run, learner, made_by)
+        for name, entries in resumed.items():
+            file.add_metadata(name, entries)
         file.add_metadata("rerecord", provenance())
         session = Session(job, learner, recorder_for(job, learner, file, beat=run.beat), report, stop)
         try:
@@ -108,7 +148,7 @@ def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict
             session.recorder.abandon()
             raise
         if not done:
-            raise RunnerError(f"stopped; the recording of run {run.run_id} is as it was.")
+            raise KeyboardInterrupt(f"the recording of run {run.run_id} is as it was")
         summary = session.summary(topics)
         if summary["content_digest"] != expected:
             raise Diverged("the recording", "content digest", summary["content_digest"], expected)

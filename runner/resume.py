@@ -3,42 +3,106 @@
 The job is done again from its beginning, without recording: what the recording holds already is compared
 with what comes, byte for byte, and from its end on everything is recorded. Learning is so much faster
 than recording that this costs a fraction of what it saves, and it proves what it continues.
+
+A recording with a hole, or with damage that good chunks stand behind, is left alone: the run is recorded
+anew beside it, in `recording.anew`, which takes its place when it is complete. That is resumed as well.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import struct
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO, Final
 
-import numpy as np
 from filelock import FileLock, Timeout
+from mcap.opcode import Opcode
 
 from runner import runs
 from runner.config import from_mapping
-from runner.errors import RunnerError
-from runner.execution import Report, Session, Stop, configured_tables, execute, recorder_for, run_job
+from runner.config.model import RunTable
+from runner.errors import Diverged, RecordingError, RunnerError, StorageError
+from runner.execution import (
+    Report,
+    Session,
+    Stop,
+    configured_tables,
+    describe,
+    evaluation_brief,
+    execute,
+    recorder_for,
+)
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import Mdp, load_mdp
 from runner.provenance import provenance
-from runner.recording.contents import Contents, survey
+from runner.recording import schema
+from runner.recording.chunks import MAX_CHUNK_BYTES
+from runner.recording.contents import Contents, read_chunk, survey
 from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
 from runner.recording.writer import RecordingFile
 from runner.runs import Run
-from runner.verify import differing_provenance, initial_tables
+from runner.verify import differing_environment, differing_provenance, initial_tables
 
-DECISIVE = ("dualtaxi", "git", "python", "machine", "package.numpy", "package.numba", "package.llvmlite")
+DECISIVE: Final = (
+    *("dualtaxi", "git", "python", "machine"),
+    *("package.numpy", "package.numba", "package.llvmlite"),
+)
 """Provenance that a continued run must share with its beginning, unless told otherwise."""
-_NEEDED = {"run", "config", "provenance"}
-_LOCK = "owner.lock"
+_NEEDED: Final = {"run", "config", "provenance"}
+_LOCK: Final = "owner.lock"
+_ANEW: Final = ".anew"
+_HEAD: Final = struct.Struct("<BQ")
+
+Changes = dict[str, tuple[str, str]]
+
+
+@contextlib.contextmanager
+def owned(run: Run) -> Iterator[Run]:
+    """Give a run as it is now, its folder kept from every other process that would write to it.
+
+    Raises:
+        RunnerError: it is running, or another process has it in this way.
+        StorageError: the folder cannot be written.
+    """
+    lock = FileLock(run.folder / _LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise RunnerError(f"run {run.run_id} is being worked on by another process; let it.") from error
+    except OSError as error:
+        raise StorageError(f"{run.folder}: cannot be written ({error.strerror}).") from error
+    try:
+        if run.facts.get("recording", runs.RECORDING_FILE) == runs.RECORDING_FILE:
+            run = runs.find_run(os.fspath(run.folder.absolute()), run.folder.parent)
+        if run.status == "running":
+            owner = run.facts.get("owner", {})
+            raise RunnerError(
+                f"run {run.run_id} is running (process {owner.get('pid')} on {owner.get('host')}); let it."
+            )
+        yield run
+    finally:
+        lock.release()
+
+
+def is_finished(run: Run) -> bool:
+    """Return whether a run came to its end and its recording is whole, as far as it says itself."""
+    try:
+        with open_recording(run.recording) as recording:
+            return recording.finished and recording.result.get("status") == "finished"
+    except RecordingError:
+        return False
 
 
 def resume(
     run: Run, accept_changes: bool = False, report: Report = lambda _: None, stop: Stop = lambda: False
 ) -> Run:
-    """Go on with a run to its end; return it as it then is.
+    """Go on with a run to its end; return it as it then is. A finished one is returned as it is.
 
     Args:
         run: an interrupted or failed run.
@@ -48,66 +112,223 @@ def resume(
         stop: asked every few milliseconds whether to stop.
 
     Raises:
-        RunnerError: the run is finished, or runs; something decisive differs; or what is recorded is
-            not what the job gives.
+        RunnerError: the run is running; something decisive differs; or its folder cannot be used.
+        Diverged: what is recorded is not what the job gives.
     """
-    lock = FileLock(run.folder / _LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout as error:
-        raise RunnerError(f"run {run.run_id} is being resumed by another process.") from error
-    try:
-        if run.status == "running":
-            raise RunnerError(
-                f"run {run.run_id} is running (process {run.facts['owner'].get('pid')}); let it."
-            )
-        return _go_on(run, accept_changes, report, stop)
-    finally:
-        lock.release()
+    if run.recording.name != runs.RECORDING_FILE:
+        raise RunnerError(
+            f"{run.recording}: found a recording that stands alone, expected a run. To go on with it, put it "
+            f"into a folder of its own as {runs.RECORDING_FILE}."
+        )
+    with owned(run) as current:
+        if is_finished(current):
+            return _settled(current)
+        return _go_on(current, accept_changes, report, stop)
+
+
+def _settled(run: Run) -> Run:
+    """Return a run whose recording is finished; if its owner died before saying so, say it."""
+    if run.status == "finished":
+        return run
+    with open_recording(run.recording) as recording:
+        facts = recording.run_facts()
+        return run.update(status="finished", summary=facts["summary"] | {"bytes": recording.size})
 
 
 def _go_on(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
     started = time.monotonic()
-    job = Job(from_mapping(run.facts["config"]), run.seed)
-    contents = survey(run.recording) if run.recording.is_file() else Contents()
-    if not _describes_itself(contents):
-        run.recording.unlink(missing_ok=True)
-        return run_job(job, _taken_over(run), report, stop)
+    path, contents = _place(run)
+    changes = _changes(run)
+    job = Job(from_mapping(_config(run)), run.seed)
     mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
-    with open_recording(run.recording) as recording:
-        changes = _changes(recording, mdp)
-        initial = initial_tables(recording)
+    changes |= _environment_changes(run, mdp)
     if changes and not accept_changes:
         raise RunnerError(_refusal(run, changes))
-    if initial is None:
-        initial = configured_tables(job, run, mdp)
-    learner = Learner(job.config, mdp, job.seed, initial)
-    run = _taken_over(run)
-    with RecordingFile.reopen(run.recording, contents) as file:
-        file.add_metadata(f"resume/{_resumes(contents) + 1}", _note(changes))
-        with open_recording(run.recording) as recording:
-            past = Past(recording, without_steps=job.config.recording.steps == "none")
-            recorder = recorder_for(job, learner, file, past, beat=run.beat)
-            return execute(Session(job, learner, recorder, report, stop), file, run, started)
+    learner = Learner(job.config, mdp, job.seed, _first_tables(job, run, mdp))
+    proof = _proof(run)
+    run = run.update(status="running", owner=runs.owner(), summary={}, proof=proof)
+    with _opened(path, contents, job, run, learner, changes) as file, open_recording(path) as recording:
+        past = Past(recording, without_steps=job.config.recording.steps == "none")
+        recorder = recorder_for(job, learner, file, past, beat=run.beat)
+        done = execute(_Continued(recording, past, job, learner, recorder, report, stop), file, run, started)
+    return _put_in_place(done, path) if done.status == "finished" else done
 
 
-def _describes_itself(contents: Contents) -> bool:
-    """Return whether a recording got as far as its first chunk: all that describes it stands before."""
-    return bool(contents.chunks) and {entry.name for entry in contents.metadata} >= _NEEDED
+def _place(run: Run) -> tuple[Path, Contents]:
+    """Return the file to go on with, and what of it is good: the recording, or one made anew beside it."""
+    anew = run.recording.with_suffix(_ANEW)
+    if not run.recording.is_file():
+        return run.recording, Contents()
+    contents = survey(run.recording)
+    if _may_be_cut(run.recording, contents):
+        return run.recording, contents
+    contents = survey(anew) if anew.is_file() else Contents()
+    return anew, contents if _may_be_cut(anew, contents) else Contents()
 
 
-def _taken_over(run: Run) -> Run:
-    return run.update(status="running", owner=runs.owner())
+def _may_be_cut(path: Path, contents: Contents) -> bool:
+    """Return whether nothing is missing in what is good, and nothing good stands behind it."""
+    if any(entry.name == "repair" for entry in contents.metadata):
+        return False
+    if not contents.reason:
+        return True
+    try:
+        with path.open("rb") as stream:
+            return _ends_torn(stream, contents)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
 
 
-def _changes(recording: Recording, mdp: Mdp) -> dict[str, tuple[str, str]]:
+def _ends_torn(stream: BinaryIO, contents: Contents) -> bool:
+    """Return whether a file ends with a record that was not written to its end, or with nothing but zeros.
+
+    Before it may stand a good chunk without its index, which comes again.
+    """
+    offset = contents.end
+    if offset == 0:
+        return contents.size == 0 or _only_zeros(stream, 0)
+    for _ in range(2):
+        stream.seek(offset)
+        head = stream.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            return True
+        opcode, length = _HEAD.unpack(head)
+        if offset + 9 + length > contents.size and 0 < opcode <= Opcode.DATA_END:
+            return bool(length <= MAX_CHUNK_BYTES)
+        if opcode != Opcode.CHUNK or not _is_good_chunk(stream.read(length), offset):
+            return _only_zeros(stream, offset)
+        offset += 9 + length
+    return False
+
+
+def _is_good_chunk(body: bytes, offset: int) -> bool:
+    try:
+        read_chunk(body, offset)
+    except (RecordingError, struct.error, ValueError):
+        return False
+    return True
+
+
+def _only_zeros(stream: BinaryIO, offset: int) -> bool:
+    stream.seek(offset)
+    while piece := stream.read(1 << 20):
+        if any(piece):
+            return False
+    return True
+
+
+def _config(run: Run) -> dict[str, Any]:
+    """Return the configuration that the recording holds, else what `run.json` says."""
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        return recording.config
+    return dict(run.facts.get("config", {}))
+
+
+def _proof(run: Run) -> str | None:
+    """Return the content digest that the run had when it was finished, if it ever was."""
+    if run.status == "finished":
+        return run.summary.get("content_digest")
+    proof = run.facts.get("proof")
+    return str(proof) if proof else None
+
+
+def _first_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
+    """Return the tables that the run began with if it took them over from another; None if it did not."""
+    if not isinstance(job.config.initial_q, RunTable):
+        return None
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        if (tables := initial_tables(recording)) is not None:
+            return tables
+    return configured_tables(job, run, mdp)
+
+
+@contextlib.contextmanager
+def _opened(
+    path: Path, contents: Contents, job: Job, run: Run, learner: Learner, changes: Changes
+) -> Iterator[RecordingFile]:
+    """Give the file to go on with: cut behind what is good of it, or begun anew where that says nothing."""
+    described = bool(contents.chunks) and {entry.name for entry in contents.metadata} >= _NEEDED
+    try:
+        if not described:
+            path.unlink(missing_ok=True)
+        file = RecordingFile.reopen(path, contents) if described else RecordingFile(path)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror}).") from error
+    with file:
+        if not described:
+            describe(file, job, run, learner)
+        if described or changes:
+            number = 1 + sum(entry.name.startswith("resume/") for entry in contents.metadata)
+            file.add_metadata(f"resume/{number}", _note(changes))
+        yield file
+
+
+def _put_in_place(run: Run, path: Path) -> Run:
+    """Prove a finished recording by the digest it once had; let one made anew take the old one's place.
+
+    Raises:
+        Diverged: it is another; the damaged recording stays.
+    """
+    found, expected = run.summary["content_digest"], run.facts.get("proof")
+    if expected and found != expected:
+        run.update(status="interrupted")
+        raise Diverged("the recording made anew", "content digest", found, expected)
+    if path != run.recording:
+        path.replace(run.recording)
+    return run.update(proof=None)
+
+
+class _Continued(Session):
+    """A session that, if it is stopped before the end of what is recorded, tells of all that is recorded."""
+
+    def __init__(self, recording: Recording, past: Past, *session: Any) -> None:
+        super().__init__(*session)
+        self._recording = recording
+        self._past = past
+
+    def summary(self, topics: dict[str, str]) -> dict[str, Any]:
+        """Return what is worth knowing of the run without opening its recording."""
+        own = super().summary(topics)
+        return own if self._past.exhausted else own | _recorded(self._recording)
+
+
+def _recorded(recording: Recording) -> dict[str, Any]:
+    """Return how far a recording goes, as a summary says it; its digest is not known."""
+    counts = {topic.name: recording.count(topic) for topic in schema.TOPICS}
+    evaluations = recording.metrics("eval")
+    return {
+        "content_digest": None,
+        "topic_digests": {},
+        "episodes": counts[schema.TRAIN_EPISODE.name],
+        "train_steps": _steps(recording, "train"),
+        "eval_steps": _steps(recording, "eval"),
+        "messages": {name: count for name, count in counts.items() if count},
+        "last_evaluation": evaluation_brief(evaluations[-1]) if evaluations else None,
+    }
+
+
+def _steps(recording: Recording, phase: str) -> int:
+    """Return how many steps of a phase are recorded, or were taken in the episodes that are."""
+    steps, episodes = schema.PHASES[phase]
+    ended = recording.count(episodes)
+    if ended == 0:
+        return recording.count(steps)
+    last = recording.episodes(phase, ended - 1, ended)[-1]
+    return max(recording.count(steps), int(last["last_step"]) + 1)
+
+
+def _changes(run: Run) -> Changes:
     """Return what is decisive and differs from the recording's beginning: key to (then, now)."""
-    changes = {key: values for key, values in differing_provenance(recording).items() if key in DECISIVE}
-    then, now = recording.mdp.arrays(), mdp.arrays()
-    for name in sorted({*then, *now}):
-        if name not in then or name not in now or not np.array_equal(then[name], now[name]):
-            changes[f"environment.{name}"] = ("as recorded", "another")
-    return changes
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        found = differing_provenance(recording)
+        return {key: values for key, values in found.items() if key in DECISIVE}
+    return {}
+
+
+def _environment_changes(run: Run, mdp: Mdp) -> Changes:
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        return differing_environment(recording, mdp)
+    return {}
 
 
 def _refusal(run: Run, changes: Mapping[str, tuple[str, str]]) -> str:
@@ -128,7 +349,3 @@ def _note(changes: Mapping[str, tuple[str, str]]) -> dict[str, str]:
     """Return the metadata that says who went on, and in spite of which changes."""
     accepted = {key: f"{then} -> {now}" for key, (then, now) in changes.items()}
     return {**provenance(), "accepted_changes": json.dumps(accepted, sort_keys=True)}
-
-
-def _resumes(contents: Contents) -> int:
-    return sum(entry.name.startswith("resume/") for entry in contents.metadata)

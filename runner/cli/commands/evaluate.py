@@ -1,0 +1,103 @@
+"""`dualtaxi evaluate`: play a recorded table in new episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from runner.cli import INTERRUPTED
+from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.output import console, draw, facts, print_json, say
+from runner.cli.working import at_work, run_as_json, run_in_words
+
+if TYPE_CHECKING:
+    from runner.runs import Run
+
+TRIALS = 200
+
+
+@click.command("evaluate")
+@run_argument
+@click.option(
+    "--step",
+    type=click.IntRange(0),
+    metavar="N",
+    help="The table after N training steps.  [default: the last]",
+)
+@click.option(
+    "--trials", type=click.IntRange(1), metavar="K", help=f"How many episodes.  [default: {TRIALS}]"
+)
+@click.option(
+    "--all", "every_start", is_flag=True, help="One episode from each state that episodes start in."
+)
+@click.option(
+    "--start", type=click.IntRange(0), metavar="STATE", help="The state that all episodes start in."
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**64 - 1),
+    default=0,
+    show_default=True,
+    metavar="S",
+    help="What the new episodes' draws follow from.",
+)
+@recordings_option
+@json_option
+@click.pass_context
+def command(
+    ctx: click.Context,
+    run_name: str,
+    step: int | None,
+    trials: int | None,
+    every_start: bool,
+    start: int | None,
+    seed: int,
+    recordings: Path | None,
+    as_json: bool,
+) -> None:
+    r"""Play the trained table of RUN, greedily, in new episodes.
+
+    The table of any moment can be played. The episodes are recorded as a run of its own, whose
+    configuration names the run and step that the table comes from.
+
+    \b
+    Examples:
+      dualtaxi evaluate @latest
+      dualtaxi evaluate k3v9m2xq --step 50000 --trials 1000 --seed 7
+      dualtaxi evaluate k3v9m2xq --all
+    """
+    if every_start and (trials is not None or start is not None):
+        raise click.UsageError("--all plays each start state once: leave out --trials and --start.")
+    from runner.again import evaluate
+    from runner.runs import recordings_folder
+
+    source, folder = find(run_name, recordings), recordings_folder(recordings)
+    count = None if every_start else trials or TRIALS
+    with at_work("", 0) as (report, interrupt):
+        run = evaluate(
+            source, folder, step, count, "random" if start is None else start, seed, report, interrupt
+        )
+    origin = run.facts["config"]["initial_q"]
+    if as_json:
+        print_json(run_as_json(run) | {"origin": origin}, indent=None)
+    elif run.status == "finished":
+        _summarise(run, origin)
+    if interrupt.came and run.status == "interrupted":
+        say(f"Interrupted: what was played is kept; `dualtaxi resume {run.run_id}` plays the rest.")
+        ctx.exit(INTERRUPTED)
+
+
+def _summarise(run: Run, origin: dict[str, object]) -> None:
+    from runner.cli.evaluations import evaluation_table
+    from runner.frames import environment_of, evaluation_records
+    from runner.recording.reader import open_recording
+
+    with open_recording(run.recording) as recording:
+        table = evaluation_table(
+            evaluation_records(recording), environment_of(recording)["success_events"], console()
+        )
+    told = run_in_words(run)
+    told |= {"table": f"of run {origin['run']} after {origin['step']:,} training steps"}
+    draw(table, "", facts(told | {"next": f"dualtaxi play {run.run_id} --eval 0:0"}))

@@ -1,0 +1,123 @@
+"""`dualtaxi repair`: make a damaged recording whole again."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from runner.cli.options import json_option, recordings_option, run_argument
+from runner.cli.output import draw, facts, print_json, size
+from runner.cli.working import recording_of
+
+if TYPE_CHECKING:
+    from runner.recording.repair import Repair
+    from runner.runs import Run
+
+_WORDS: Final = {
+    "/train/step": "training steps",
+    "/eval/step": "evaluation steps",
+    "/train/episode": "training episodes",
+    "/eval/episode": "evaluation episodes",
+    "/train/metrics": "reports of training",
+    "/eval/metrics": "evaluations",
+    "/q_table": "Q-table snapshots",
+    "/log": "log lines",
+}
+
+
+@click.command("repair")
+@run_argument
+@recordings_option
+@json_option
+@click.pass_context
+def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json: bool) -> None:
+    r"""Make the recording of RUN, or one by its path, whole again: for every reader, with index and summary.
+
+    Every good chunk is copied to a new file, also those behind a damaged place; the file is read back and
+    counted before it takes the place of the old one, which is not touched until then. Where something in
+    the middle was lost, the damaged file is kept beside it. What was lost is said; `dualtaxi resume`
+    brings it back.
+
+    Exit code 1 if anything was lost.
+
+    \b
+    Examples:
+      dualtaxi repair @latest
+      dualtaxi repair backup/recording.mcap
+    """
+    from runner.recording.repair import repair
+    from runner.verify import refuse_foreign
+
+    path, run = recording_of(run_name, recordings)
+    refuse_foreign(path)
+    with _kept(run):
+        done = repair(path)
+        if run is not None and done.lost:
+            _tell_run(run)
+    if as_json:
+        print_json(_as_json(done))
+    else:
+        draw(facts(_in_words(done, run)))
+    if not done.lossless:
+        ctx.exit(1)
+
+
+def _kept(run: Run | None) -> contextlib.AbstractContextManager[Any]:
+    """Return a context in which no other process writes to the run."""
+    from runner.resume import owned
+
+    return contextlib.nullcontext() if run is None else owned(run)
+
+
+def _tell_run(run: Run) -> None:
+    """Note that a run's recording is not whole any more; the digest it had proves it when it is resumed."""
+    if run.status == "finished":
+        run.update(status="interrupted", proof=run.summary.get("content_digest"))
+
+
+def _in_words(done: Repair, run: Run | None) -> dict[str, str]:
+    told = {"recording": str(done.path)}
+    if done.was_whole:
+        return told | {"verdict": "whole; there was nothing to do"}
+    kept = [f"{count:,} {_WORDS[topic]}" for topic, count in done.kept.items() if topic != "/log"]
+    told |= {
+        "verdict": "repaired" if done.lossless else "repaired, but not all could be saved",
+        "kept": ", ".join(kept) or "nothing but the description: it ended before its first message",
+    }
+    if not done.lossless:
+        told["lost"] = "\n".join(_losses(done))
+    if done.original is not None:
+        told["damaged"] = f"{done.original} is kept"
+    if run is not None and not done.lossless:
+        told["next"] = f"dualtaxi resume {run.run_id}"
+    return told
+
+
+def _losses(done: Repair) -> list[str]:
+    """Return what was lost, a line each."""
+    lines = [
+        f"{_WORDS[topic]} {first:,} to {behind - 1:,} ({behind - first:,})"
+        for topic, holes in done.lost.items()
+        for first, behind in holes
+    ]
+    if done.torn_steps:
+        lines.append(f"{done.torn_steps:,} steps in a chunk that was being written")
+    elif not lines:
+        lines.append("no whole step: a record that was being written")
+    return [*lines, f"{size(done.lost_bytes)} of the file in all"] if done.lost_bytes else lines
+
+
+def _as_json(done: Repair) -> dict[str, Any]:
+    return {
+        "path": str(done.path.absolute()),
+        "was_whole": done.was_whole,
+        "lossless": done.lossless,
+        "kept": done.kept,
+        "lost": done.lost,
+        "torn_steps": done.torn_steps,
+        "lost_bytes": done.lost_bytes,
+        "original": None if done.original is None else str(done.original.absolute()),
+    }

@@ -1,0 +1,43 @@
+"""`dualtaxi rerecord`: record the steps of a run that left them out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.output import draw, facts, print_json, say
+from runner.cli.working import at_work, refuse_running, run_as_json, run_in_words
+
+
+@click.command("rerecord")
+@run_argument
+@recordings_option
+@json_option
+def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
+    r"""Record the steps of RUN, which was run with recording.steps: none.
+
+    The job is done again. The full recording takes the place of the old one when it is complete and has
+    the content digest that the run had: that proves that these are its steps. A run that holds its steps
+    has nothing to do.
+
+    \b
+    Example:
+      dualtaxi run configs/quick.yaml --set recording.steps=none
+      dualtaxi rerecord @latest
+    """
+    from runner.again import holds_steps, rerecord
+
+    run = find(run_name, recordings)
+    refuse_running(run)
+    nothing_to_do = run.status == "finished" and holds_steps(run)
+    with at_work("", run.facts.get("config", {}).get("episodes", 0)) as (report, interrupt):
+        run = rerecord(run, report, interrupt)
+    if as_json:
+        print_json(run_as_json(run), indent=None)
+    elif not nothing_to_do:
+        proof = {"proof": "the content digest is the one that the run had"}
+        draw(facts(run_in_words(run) | proof | {"next": f"dualtaxi play {run.run_id}"}))
+    if nothing_to_do:
+        say(f"Run {run.run_id} holds its steps already; there is nothing to do.")

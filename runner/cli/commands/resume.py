@@ -1,0 +1,57 @@
+"""`dualtaxi resume`: go on with a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli import INTERRUPTED
+from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.output import draw, facts, print_json, say
+from runner.cli.working import at_work, run_as_json, run_in_words
+
+
+@click.command("resume")
+@run_argument
+@click.option(
+    "--accept-changes",
+    is_flag=True,
+    help="Go on although code, environment or numerical libraries are others than at the beginning.",
+)
+@recordings_option
+@json_option
+@click.pass_context
+def command(
+    ctx: click.Context, run_name: str, accept_changes: bool, recordings: Path | None, as_json: bool
+) -> None:
+    r"""Go on with RUN, interrupted or failed, to its end: as if it had never stopped.
+
+    Its job is done again without recording, which is quick, and compared with what is recorded, byte for
+    byte; what is missing is then recorded. The content digest is that of an uninterrupted run. A recording
+    that lost something in its middle is made anew and replaced at the end. A finished run has nothing to
+    do.
+
+    A run that was begun by another version of the code, the environment or a numerical library is refused
+    with what differs. --accept-changes goes on all the same, and the recording says so.
+
+    \b
+    Examples:
+      dualtaxi resume @latest
+      dualtaxi resume k3v9m2xq --json
+    """
+    from runner.resume import is_finished, resume
+
+    run = find(run_name, recordings)
+    nothing_to_do = is_finished(run)
+    with at_work("", run.facts.get("config", {}).get("episodes", 0)) as (report, interrupt):
+        run = resume(run, accept_changes, report, interrupt)
+    if as_json:
+        print_json(run_as_json(run), indent=None)
+    elif not nothing_to_do:
+        draw(facts(run_in_words(run) | {"next": f"dualtaxi show {run.run_id}"}))
+    if nothing_to_do:
+        say(f"Run {run.run_id} is finished; there is nothing to do.")
+    if interrupt.came and run.status == "interrupted":
+        say(f"Interrupted again; `dualtaxi resume {run.run_id}` goes on from what is kept.")
+        ctx.exit(INTERRUPTED)

@@ -1,0 +1,114 @@
+"""`dualtaxi verify`: whether a recording is what its job gives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli.options import json_option, recordings_option, run_argument
+from runner.cli.output import UNKNOWN, draw, facts, print_json
+from runner.cli.working import at_work, recording_of, refuse_running
+
+if TYPE_CHECKING:
+    from runner.errors import Diverged
+    from runner.verify import Verification
+
+
+@click.command("verify")
+@run_argument
+@click.option("--rerun", is_flag=True, help="Compare with what the installed environment gives.")
+@recordings_option
+@json_option
+@click.pass_context
+def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | None, as_json: bool) -> None:
+    r"""Check RUN, or a recording by its path: every byte, step, episode, figure and table.
+
+    The job is done again, in memory, by the environment that the recording holds, and compared. The first
+    thing that is wrong is named: topic, episode, step, field, what was found and what was expected. With
+    --rerun the job is done by the installed environment: the verdict says whether the run can be
+    reproduced here, and if not, at which step it diverges and what differs from then: packages,
+    processor, code.
+
+    Exit code 1 if anything is wrong.
+
+    \b
+    Examples:
+      dualtaxi verify @latest
+      dualtaxi verify k3v9m2xq --rerun
+      dualtaxi verify backup/recording.mcap --json
+    """
+    from runner.verify import verify
+
+    path, run = recording_of(run_name, recordings)
+    refuse_running(run)
+    episodes = run.facts.get("config", {}).get("episodes", 0) if run else 0
+    with at_work("verifying", episodes) as (report, _):
+        found = verify(path, rerun, report)
+    if as_json:
+        print_json(_as_json(found, rerun))
+    else:
+        draw(facts(_in_words(found, rerun)))
+    if not found.sound:
+        ctx.exit(1)
+
+
+def _verdict(found: Verification, rerun: bool) -> str:
+    if found.sound:
+        return "identical" if rerun else "sound"
+    return "diverged" if rerun and found.difference is not None else "wrong"
+
+
+def _in_words(found: Verification, rerun: bool) -> dict[str, str]:
+    step = found.difference.step if found.difference is not None else None
+    verdict = _verdict(found, rerun)
+    told = {
+        "recording": str(found.path),
+        "verdict": f"diverged at step {step:,}" if verdict == "diverged" and step is not None else verdict,
+    }
+    if found.sound:
+        told["compared"] = f"{found.train_steps:,} steps of training, {found.eval_steps:,} of evaluation"
+        told["digest"] = found.content_digest or f"{UNKNOWN} (told when a run ends properly)"
+    else:
+        told["first"] = found.finding
+    if found.notes:
+        told["note"] = "\n".join(found.notes)
+    if found.provenance:
+        told["differs"] = "\n".join(
+            f"{key}: {then or 'unknown'} then, {now or 'unknown'} here"
+            for key, (then, now) in found.provenance.items()
+        )
+    elif rerun:
+        told["differs"] = "nothing: the same code, packages and processor"
+    return told
+
+
+def _as_json(found: Verification, rerun: bool) -> dict[str, Any]:
+    return {
+        "path": str(found.path.absolute()),
+        "verdict": _verdict(found, rerun),
+        "finding": found.finding or None,
+        "difference": None if found.difference is None else _difference(found.difference),
+        "train_steps": found.train_steps,
+        "eval_steps": found.eval_steps,
+        "content_digest": found.content_digest or None,
+        "notes": list(found.notes),
+        "provenance": {key: {"then": then, "here": here} for key, (then, here) in found.provenance.items()},
+    }
+
+
+def _difference(difference: Diverged) -> dict[str, Any]:
+    return {
+        "topic": difference.topic,
+        "episode": difference.episode,
+        "step": difference.step,
+        "field": difference.field,
+        "found": _plain(difference.found),
+        "expected": _plain(difference.expected),
+    }
+
+
+def _plain(value: object) -> object:
+    """Return a value that JSON can hold."""
+    return value if isinstance(value, str | int | float | list | dict | None) else str(value)

@@ -1,0 +1,88 @@
+"""What the commands on recorded runs share: finding the file, doing a job, telling what came of it."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runner.cli.options import find
+from runner.cli.output import UNKNOWN, duration, say, size
+from runner.errors import RecordingError, RunnerError, RunNotFound
+from runner.runs import RECORDING_FILE, RUN_FILE, recordings_folder
+
+if TYPE_CHECKING:
+    from runner.api import Interrupt
+    from runner.execution import Report
+    from runner.runs import Run
+
+
+def recording_of(name: str, recordings: Path | None) -> tuple[Path, Run | None]:
+    """Return the recording of a run, or of a path, however damaged; and the run, if there is one around it.
+
+    Raises:
+        RunnerError: there is neither.
+    """
+    try:
+        run = find(name, recordings)
+        in_folder = run.recording.name == RECORDING_FILE and (run.folder / RUN_FILE).is_file()
+        return run.recording, run if in_folder else None
+    except (RunNotFound, RecordingError):
+        folders = (Path(name), recordings_folder(recordings) / name)
+        for path in (Path(name), *(folder / RECORDING_FILE for folder in folders)):
+            if path.is_file():
+                return path, None
+        raise
+
+
+def refuse_running(run: Run | None) -> None:
+    """Refuse what cannot be done to a run while it is running.
+
+    Raises:
+        RunnerError: it is.
+    """
+    if run is not None and run.status == "running":
+        raise RunnerError(f"run {run.run_id} is running; wait for its end, or interrupt it.")
+
+
+@contextlib.contextmanager
+def at_work(label: str, episodes: int) -> Iterator[tuple[Report, Interrupt]]:
+    """Give what a job reports to, and what says whether to stop; as `dualtaxi run` has them."""
+    from runner.api import interruptible
+    from runner.cli.progress import progress_line
+    from runner.learning.compilation import announced
+
+    with (
+        interruptible(second=signal.SIG_DFL) as interrupt,
+        progress_line(label, episodes) as report,
+        announced(lambda: say("Compiling the learning kernel, this once: a few seconds.")),
+    ):
+        yield report, interrupt
+
+
+def run_as_json(run: Run) -> dict[str, Any]:
+    """Return what programs want to know of a run that is over."""
+    summary = run.summary
+    known = ("content_digest", "episodes", "train_steps", "eval_steps", "seconds", "bytes", "last_evaluation")
+    return {
+        "run_id": run.run_id,
+        "name": run.name,
+        "seed": run.seed,
+        "status": run.status,
+        "path": str(run.recording.absolute()),
+        **{key: summary.get(key) for key in known},
+    }
+
+
+def run_in_words(run: Run) -> dict[str, str]:
+    """Return the facts of a run that is over, as text by name."""
+    summary = run.summary
+    took = "" if summary.get("seconds") is None else f", in {duration(summary['seconds'])}"
+    return {
+        "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
+        "steps": f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation{took}",
+        "digest": summary.get("content_digest") or UNKNOWN,
+        "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
+    }
