@@ -1,0 +1,37 @@
+"""Every shipped experiment runs, shortened where it is long, and gives a finished recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from runner.config import load
+from runner.execution import run_job
+from runner.job import jobs_of
+from runner.recording import open as open_recording
+from runner.recording import schema
+from runner.recording.integrity import check_integrity
+from runner.runs import create_run
+
+CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+SHORT = ["episodes=30", "evaluation.every=15", "evaluation.trials=3", "log.every_steps=1000"]
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_a_shipped_experiment_runs(path, tmp_path):
+    config = load(path, SHORT)
+    job = next(jobs_of(config))
+    run = run_job(job, create_run(tmp_path, config, job.seed))
+    assert (run.status, run.name) == ("finished", path.stem)
+    check_integrity(run.recording)
+    with open_recording(run.recording) as recording:
+        assert recording.finished
+        assert recording.count(schema.TRAIN_EPISODE) == 30
+        assert recording.count(schema.EVAL_EPISODE) == 9
+        assert recording.count(schema.TRAIN_STEP) >= 30
+        assert {table.episode for table in recording.snapshots()} >= {0, 30}
+
+
+def test_what_is_shipped_is_found():
+    assert {"quick", "cooperative", "competitive", "tutorial_cooperative"} <= {path.stem for path in CONFIGS}

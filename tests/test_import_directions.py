@@ -1,0 +1,98 @@
+"""Imports go one way: a part of the runner knows those on the lines above its own, and no others."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ORDER = """
+    errors
+    config
+    job toy_text
+    mdp
+    words learning recording
+    provenance runs
+    analysis frames
+    execution export
+    verify
+    resume
+    again
+    api
+    cli
+"""
+RANK = {part: rank for rank, line in enumerate(ORDER.split("\n")) for part in line.split()}
+FILES = {
+    "runner": sorted((ROOT / "runner").rglob("*.py")),
+    "dualtaxi": sorted((ROOT / "dualtaxi").rglob("*.py")),
+}
+
+
+def imported(file: Path) -> Iterator[tuple[str, ...]]:
+    """Yield the names that a file imports, anywhere in it, as their parts."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (tuple(alias.name.split(".")) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: an import relative to its place"
+            yield from ((*node.module.split("."), alias.name) for alias in node.names)
+
+
+def part_of(file: Path) -> str:
+    return file.relative_to(ROOT / "runner").parts[0].removesuffix(".py")
+
+
+def test_every_part_of_the_runner_has_its_place_in_the_order():
+    parts = {part_of(file) for file in FILES["runner"]} - {"__init__", "__main__"}
+    assert parts == set(RANK), "say in ORDER what a new part may know"
+
+
+@pytest.mark.parametrize("part", RANK)
+def test_a_part_knows_only_what_comes_before_it(part):
+    known = {
+        names[1]
+        for file in FILES["runner"]
+        if part_of(file) == part
+        for names in imported(file)
+        if names[0] == "runner" and len(names) > 1
+    }
+    assert {other for other in known & set(RANK) if RANK[other] >= RANK[part]} <= {part}
+
+
+def test_the_environment_and_the_runner_do_not_know_each_other():
+    for package, other in (("runner", "dualtaxi"), ("dualtaxi", "runner")):
+        assert len(FILES[package]) > 5
+        assert [file for file in FILES[package] for names in imported(file) if names[0] == other] == []
+
+
+def roots(folder: str) -> set[str]:
+    """Return the packages that the files of a folder import."""
+    return {names[0] for file in (ROOT / folder).rglob("*.py") for names in imported(file)}
+
+
+def test_learning_knows_numbers_and_nothing_of_files_clocks_or_commands():
+    assert roots("runner/learning") - {"runner"} <= {
+        "__future__",
+        "typing",
+        "collections",
+        "math",
+        "numpy",
+        "numba",
+    }
+
+
+def test_recording_knows_nothing_of_learning_environments_or_commands():
+    assert not roots("runner/recording") & {"numba", "gymnasium", "click", "rich"}
+
+
+def test_the_environment_needs_numpy_and_gymnasium_and_pettingzoo_in_one_file():
+    outside = roots("dualtaxi") - set(sys.stdlib_module_names) - {"dualtaxi"}
+    assert outside == {"numpy", "gymnasium", "pettingzoo"}
+    with_pettingzoo = {
+        file.name for file in FILES["dualtaxi"] for names in imported(file) if names[0] == "pettingzoo"
+    }
+    assert with_pettingzoo == {"parallel.py"}
