@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 Choice = tuple[str, int, int]
 """An episode to show: ("train", number, 0), or ("eval", training episodes before it, trial)."""
 
+BROAD: Final = 8.5 * svg.CELL
+"""A grid wider than this is shown over the whole width of the page."""
 TEMPLATES: Final = files("runner.export") / "templates"
 
 
@@ -108,6 +110,7 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
         "last": evaluations[-1] if evaluations else None,
         "evaluations": evaluations,
         "event_names": [_heading(name) for name in environment["event_names"]],
+        "broad": drawing is not None and drawing.width > BROAD,
         "config": _flat(recording.config),
         "provenance": recording.provenance,
         "notes": shortcomings(recording),

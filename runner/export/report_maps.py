@@ -131,15 +131,16 @@ def _pair_row(
     grids = []
     for stage in stages:
         values = np.full((cells, cells), np.nan)
-        values[at[:, 0], at[:, 1]] = stage.tables[learner][states].max(axis=1)
+        values[at[:, 0], at[:, 1]] = _highest(stage.tables[learner][states])
         grids.append(values)
     bounds = _bounds(grids)
     one, other = (mdp.scene["things"][mover]["label"] for mover in movers)
     whose = "" if len(learners) == 1 else f" of {learners[learner].replace('_', ' ')}"
     title = f"Highest Q-value{whose} for every pair of places"
     fixed = situation_in_words(mdp, state, movers)
-    told = f"Large square: where {one} is. In it the grid again: where {other} is." + (
-        f" Situation: {fixed}." if fixed else ""
+    told = (
+        f"Large square: where {one} is. In it the grid again: where {other} is. "
+        "Grey: all actions are worth the same." + (f" Situation: {fixed}." if fixed else "")
     )
     svgs = [
         (stage.title, pair_map(mdp.scene, grid, bounds, f"{title}, {stage.title}; {_span(grid)}"))
@@ -161,7 +162,7 @@ def _policy_row(mdp: Mdp, learners: Sequence[str], stages: Sequence[Stage], stat
     bounds = _bounds([values for values, _ in made])
     fixed = situation_in_words(mdp, state, [mover])
     title = f"What {thing['label']} would do, and the highest Q-value"
-    told = "Arrow: the greedy action in that cell; a dot where all actions are worth the same." + (
+    told = "Arrow: the greedy action in that cell. Grey: all actions are worth the same there." + (
         f" Situation: {fixed}." if fixed else ""
     )
     svgs = [
@@ -183,7 +184,7 @@ def _best(
     values = np.full(cells, np.nan)
     greedy: list[int | None] = [None] * cells
     rows = table[states]
-    values[at] = rows.max(axis=1)
+    values[at] = _highest(rows)
     for cell, row in zip(at.tolist(), rows, strict=True):
         if row.max() > row.min():
             best = int(row.argmax())
@@ -191,9 +192,18 @@ def _best(
     return values, greedy
 
 
+def _highest(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the highest value of each row; nan where all are the same, so that nothing is preferred."""
+    best = rows.max(axis=1)
+    return np.where(best > rows.min(axis=1), best, np.nan)
+
+
 def _bounds(grids: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
-    return float(min(np.nanmin(grid) for grid in grids)), float(max(np.nanmax(grid) for grid in grids))
+    known = np.concatenate([grid[~np.isnan(grid)] for grid in grids])
+    return (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
 
 
 def _span(values: NDArray[np.float64]) -> str:
+    if np.isnan(values).all():
+        return "nothing is preferred anywhere"
     return f"from {np.nanmin(values):.4g} to {np.nanmax(values):.4g}"

@@ -90,7 +90,8 @@ class Drawing:
         )
         said += [*named]
         said += ["thick lines: walls"] if self._scene["walls"] else []
-        return "; ".join([*said, "faint line: the way so far"]).capitalize() + "."
+        text = "; ".join([*said, "faint line: the way so far"])
+        return f"{text[0].upper()}{text[1:]}."
 
     def still(self) -> str:
         """Return what never changes: the cells, the landmarks and the walls."""

@@ -59,8 +59,8 @@ def policy_map(
 
     Args:
         scene: its grid and its actions.
-        values: [cells], the highest value there; nan where there is no such state.
-        greedy: the mover's greedy action in each cell; None where no action is better than another.
+        values: [cells], the highest value there; nan where no action is better than another.
+        greedy: the mover's greedy action in each cell; None where there is none.
         bounds: the values of the darkest and of the lightest colour.
         title: what readers of the page hear.
     """
@@ -124,7 +124,7 @@ def _cell_signs(scene: Mapping[str, Any], x: int, y: int, value: float, action: 
     middle = x + CELL // 2
     number = f'<text class="m-text" x="{middle}" y="{y + CELL - 9}" fill="{ink}">{short(value)}</text>'
     if action is None:
-        return number + f'<circle cx="{middle}" cy="{y + 46}" r="4" fill="{ink}"/>'
+        return number
     move = scene["actions"][action]["move"]
     if move is None:
         word = scene["actions"][action]["name"].replace("_", "-")
