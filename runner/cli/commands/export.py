@@ -44,5 +44,5 @@ def command() -> None:
 
     \b
     Example:
-      dualtaxi export rerun @latest --help
+      dualtaxi export rerun @latest
     """  # noqa: D301 - Click wants the backspace itself
