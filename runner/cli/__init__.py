@@ -128,7 +128,7 @@ class LazyGroup(click.Group):
             sys.stdout.flush()
         except RunnerError as error:
             raise Failure(error) from error
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, click.Abort):
             raise click.exceptions.Exit(INTERRUPTED) from None
         except BrokenPipeError:
             _forget_stdout()

@@ -83,7 +83,7 @@ def test_a_small_disk_is_warned_of_where_nobody_answers(command, tiny, monkeypat
     assert "1.0 kB left" in result.stderr
 
 
-@pytest.mark.parametrize(("answer", "code", "runs"), [("n\n", 1, 0), ("y\n", 0, 1)])
+@pytest.mark.parametrize(("answer", "code", "runs"), [("n\n", 1, 0), ("y\n", 0, 1), ("", 130, 0)])
 def test_a_small_disk_is_asked_about_on_a_terminal(command, tiny, monkeypatch, answer, code, runs):
     monkeypatch.setattr(estimate, "free_bytes", lambda _: 1000)
     monkeypatch.setattr(run_command, "_someone_answers", lambda: True)
