@@ -84,7 +84,8 @@ class Run:
     def _owner_lives(self) -> bool:
         owner = self.facts.get("owner", {})
         if owner.get("host") == socket.gethostname() and owner.get("boot_id") == boot_id():
-            return bool(process_start(owner.get("pid", 0)) == owner.get("process_started"))
+            started = process_start(owner.get("pid", 0))
+            return started is not None and started == owner.get("process_started")
         with contextlib.suppress(OSError):
             return time.time() - (self.folder / RUN_FILE).stat().st_mtime < HEARTBEAT_SECONDS
         return False
@@ -280,7 +281,20 @@ def boot_id() -> str:
 
 
 def process_start(pid: int) -> float | None:
-    """Return when a process began, in seconds since the epoch; None if there is none."""
+    """Return when a process began; None if there is none. To be compared within one start of the machine.
+
+    On Linux it is counted in ticks since the machine started, so that setting the clock changes nothing.
+    """
+    if not isinstance(pid, int) or isinstance(pid, bool):
+        return None  # a file may say anything
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return None if fields[0] == "Z" else float(fields[19])
+    except (OSError, ValueError, IndexError):
+        return None if Path("/proc/self/stat").exists() else _process_start_elsewhere(pid)
+
+
+def _process_start_elsewhere(pid: int) -> float | None:
     import psutil
 
     try:
