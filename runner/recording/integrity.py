@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.chunks import chunk_head, message_index
-from runner.recording.contents import survey
+from runner.recording.contents import Contents, survey
 from runner.recording.writer import RecordingFile, schema_and_channel_bytes
 
 Times = NDArray[np.uint64]
@@ -47,6 +47,22 @@ def check_integrity(path: Path) -> None:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
     if found != expected:
         _refuse_tail(path, contents.end, found, expected)
+
+
+def checked_survey(path: Path) -> Contents:
+    """Return what of a recording is good to the last byte, from its beginning on; its result left out.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as stream:
+            _check_beginning(stream, path)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+    except RecordingError as error:
+        return Contents(size=path.stat().st_size, reason=str(error))
+    return survey(path, check=_IndexCheck(path).take)
 
 
 def _check_beginning(stream: BinaryIO, path: Path) -> None:

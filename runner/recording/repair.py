@@ -31,6 +31,7 @@ from runner.recording.schema import BLOCK_TOPICS, TOPICS, Topic
 from runner.recording.writer import RecordingFile
 
 _HEAD: Final = struct.Struct("<BQ")
+_CHUNK_TIMES: Final = struct.Struct("<QQ")
 _CHUNK_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
 _NEEDED: Final = {"run", "config", "provenance"}
 _EXPECTED: Final = {
@@ -183,14 +184,16 @@ class _Salvage:
             self._next[topic] = int(numbers[-1]) + 1
         else:
             self._next[topic] += part.messages
+        start, end = int(times[0]), int(times[-1])
+        body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
         chunk = Chunk(
             record=_HEAD.pack(Opcode.CHUNK, len(body)) + body,
             index=message_index(part.channel, times, offsets) if self._indexed else b"",
             compression=part.index.compression,
             compressed_size=part.index.compressed_size,
             uncompressed_size=part.index.uncompressed_size,
-            start_time=int(times[0]),
-            end_time=int(times[-1]),
+            start_time=start,
+            end_time=end,
             messages=part.messages,
         )
         file.add_chunk(topic, chunk)
