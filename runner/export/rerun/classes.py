@@ -61,7 +61,7 @@ class Vocabulary:
     greedy: int
     """The mark of a greedy action."""
     chosen: int
-    """The marks of the chosen action: greedy, explored."""
+    """What is said of the chosen action: greedy, explored, explored and yet the greedy one."""
 
     def of_t(self, t: NDArray[Any]) -> NDArray[np.uint16]:
         """Return the class of each `t`."""
@@ -124,7 +124,7 @@ def vocabulary(
             colour = MOVER_COLOURS[i % len(MOVER_COLOURS)] if whose else INK
             told.append((classes.add([f"reward{whose} {_signed(r)}" for r in distinct], colour), distinct))
     greedy = classes.add([""], INK)
-    chosen = classes.add(["", "explored"], ["#009E73", BAD_COLOUR])
+    chosen = classes.add(["greedy", "explored", "explored"], ["#009E73", BAD_COLOUR, BAD_COLOUR])
     return Vocabulary(
         classes, mark, passenger, riding, t, tuple(told), _levels(classes, value_range), greedy, chosen
     )

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from runner.export.rerun.columns import Batch, Sender
 from runner.export.rerun.scene import event_words, events_of_steps
 from runner.mdp import Mdp
 from runner.words import states_in_words
 
-if TYPE_CHECKING:
-    from runner.export.rerun.steps import Batch
 
-
-class EventWriter:
+class EventWriter(Sender):
     """Sends the events of one phase's steps."""
 
     def __init__(self, stream: rr.RecordingStream, path: str, phase: str, mdp: Mdp) -> None:
-        self._stream = stream
-        self._path = f"{path}/events"
+        super().__init__(stream, path)
         self._phase = phase
         self._mdp = mdp
         self._states = states_in_words(mdp)
@@ -29,7 +26,7 @@ class EventWriter:
         self._told = np.uint32((1 << len(mdp.event_names)) - 1 - sum(1 << bit for bit in quiet))
         self._words: dict[int, str] = {}
 
-    def send(self, batch: Batch) -> None:
+    def write(self, batch: Batch) -> None:
         """Send the events of a batch; an illegal action is none, there are too many at first."""
         records = batch.records
         masks = events_of_steps(self._mdp, records) & self._told
@@ -43,13 +40,8 @@ class EventWriter:
         levels = ["INFO"] * len(begins) + [self._level(mask) for mask in masks[happens].tolist()]
         order = np.argsort(rows, kind="stable")
         rows = rows[order]
-        times = [
-            rr.TimeColumn("step", sequence=batch.time[rows]),
-            rr.TimeColumn("episode", sequence=batch.episode[rows]),
-            rr.TimeColumn("t", sequence=records["t"][rows].astype(np.int64)),
-        ]
         columns = rr.TextLog.columns(text=[text[i] for i in order], level=[levels[i] for i in order])
-        self._stream.send_columns(self._path, times, columns)
+        self.send("events", batch.times(rows), columns)
 
     def _beginning(self, batch: Batch, row: int) -> str:
         record = batch.records[row]
@@ -57,9 +49,7 @@ class EventWriter:
         return f"{named} begins: {self._states[record['state']]}"
 
     def _happening(self, record: np.void, mask: int) -> str:
-        if mask not in self._words:
-            self._words[mask] = event_words(self._mdp, mask)
-        words = [self._words[mask]] if mask else []
+        words = [self._in_words(mask)] if mask else []
         if record["terminated"]:
             words.append(f"episode over after {int(record['t']) + 1} steps")
         elif record["truncated"]:
@@ -67,14 +57,13 @@ class EventWriter:
         return ", ".join(words)
 
     def _level(self, mask: int) -> str:
-        good = self._mdp.success_mask
-        return (
-            "INFO"
-            if mask & good
-            else "WARN"
-            if mask and "collision" in event_words(self._mdp, mask)
-            else "INFO"
-        )
+        good = mask & self._mdp.success_mask
+        return "WARN" if not good and "collision" in self._in_words(mask) else "INFO"
+
+    def _in_words(self, mask: int) -> str:
+        if mask not in self._words:
+            self._words[mask] = event_words(self._mdp, mask)
+        return self._words[mask]
 
 
 def evaluation_texts(metrics: list[dict[str, Any]]) -> list[str]:

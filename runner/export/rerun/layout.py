@@ -9,8 +9,9 @@ from typing import Any, Final
 import rerun as rr
 import rerun.blueprint as rrb
 
-from runner.export.rerun.scene import INK, Scene, action_labels, agent_label
-from runner.export.rerun.steps import BAR_LEFT, BAR_LENGTH, CHOSEN_X, GREEDY_X, LABEL_RISE, NUMBER_X, bar_rows
+from runner.export.rerun.maps import draw_blocks
+from runner.export.rerun.scene import Scene, agent_label
+from runner.export.rerun.values import TOP, WIDTH, bar_rows, draw_table
 from runner.mdp import Mdp
 
 FRAMES_A_SECOND: Final = 10.0
@@ -66,8 +67,11 @@ def blueprint(runs: Sequence[Shown]) -> rrb.Blueprint:
 
 def _single(run: Shown) -> list[Any]:
     left = rrb.Vertical(_grid(run), _events(run), row_shares=[3, 1])
-    right = [_values(run), *_maps(run)]
-    return [left, rrb.Vertical(*right, row_shares=[4] + [4] * (len(right) - 1))]
+    maps = _maps(run)
+    if not maps:
+        return [left, _values(run)]
+    below = rrb.Horizontal(*maps) if len(maps) > 1 else maps[0]
+    return [left, rrb.Vertical(_values(run), below, row_shares=[1, 1])]
 
 
 def _pair(run: Shown) -> list[Any]:
@@ -97,7 +101,7 @@ def _grid(run: Shown) -> Any:
 
 def _values(run: Shown) -> Any:
     bottom = float(bar_rows(run.mdp)[-1][-1]) + 0.9
-    bounds = rrb.VisualBounds2D(x_range=(-0.2, CHOSEN_X + 1.6), y_range=(-1.4, bottom))
+    bounds = rrb.VisualBounds2D(x_range=(-0.4, WIDTH), y_range=(TOP, bottom))
     contents = [f"{run.root}/table/**", f"{run.root}/train/q/**", f"{run.root}/eval/q/**"]
     return rrb.Spatial2DView(
         origin=f"{run.root}/",
@@ -111,7 +115,7 @@ def _maps(run: Shown) -> list[Any]:
     if run.scene is None or run.scene.placements is None:
         return []
     pictures = run.scene.placements
-    bounds = rrb.VisualBounds2D(x_range=(-0.5, pictures.width + 0.5), y_range=(-2.2, pictures.height + 0.5))
+    bounds = rrb.VisualBounds2D(x_range=(-0.5, pictures.width + 0.5), y_range=(-3.2, pictures.height + 0.5))
     views = []
     for learner in run.learners:
         contents = [
@@ -124,7 +128,7 @@ def _maps(run: Shown) -> list[Any]:
                 origin=f"{run.root}/",
                 contents=contents,
                 visual_bounds=bounds,
-                name=f"Max Q and greedy moves: {agent_label(learner)}",
+                name=f"{agent_label(learner)}: max Q, greedy moves",
             )
         )
     return views
@@ -132,7 +136,8 @@ def _maps(run: Shown) -> list[Any]:
 
 def _events(run: Shown) -> Any:
     contents = [f"{run.root}/train/events", f"{run.root}/eval/events"]
-    return rrb.TextLogView(origin=f"{run.root}/", contents=contents, name="Events")
+    columns = rrb.TextLogColumns(timeline_columns=["step"], text_log_columns=["body"])
+    return rrb.TextLogView(origin=f"{run.root}/", contents=contents, name="Events", columns=columns)
 
 
 def _plots(runs: Sequence[Shown], last: int) -> Any:
@@ -160,10 +165,11 @@ def _plots(runs: Sequence[Shown], last: int) -> Any:
 def draw_background(stream: rr.RecordingStream, run: Shown) -> None:
     """Log what never changes: cells, walls, landmarks, and the frame of the table of values."""
     if run.steps:
-        _draw_table(stream, run)
+        draw_table(stream, f"{run.root}/table/words", run.mdp)
     if run.scene is not None and run.steps:
         _draw_scene(stream, f"{run.root}/scene", run.scene)
-        _draw_frame(stream, f"{run.root}/frame", run.scene)
+        if run.scene.placements is not None:
+            draw_blocks(stream, f"{run.root}/frame", run.scene.placements)
 
 
 def _draw_scene(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
@@ -176,13 +182,13 @@ def _draw_scene(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
         static=True,
     )
     border: Any = [(0, 0), (columns, 0), (columns, rows), (0, rows), (0, 0)]
-    walls = [border, *(_wall(first, second) for first, second in scene.description["walls"])]
+    walls = [border, *(_wall(first, second) for first, second in scene.description.get("walls", []))]
     stream.log(
         f"{path}/walls",
         rr.LineStrips2D(walls, colors=[(128, 128, 128)], radii=0.05, draw_order=25),
         static=True,
     )
-    marks = scene.description["landmarks"]
+    marks = scene.description.get("landmarks", [])
     tints = [(*_rgb(mark["colour"]), 110) for mark in marks]
     if marks:
         stream.log(
@@ -227,40 +233,6 @@ def _wall(first: Sequence[int], second: Sequence[int]) -> list[tuple[float, floa
         return [(x, row), (x, row + 1)]
     y = max(row, other_row)
     return [(column, y), (column + 1, y)]
-
-
-def _draw_table(stream: rr.RecordingStream, run: Shown) -> None:
-    """Log the words around the table of values."""
-    places: list[tuple[float, float]] = []
-    labels: list[str] = []
-    for agent, rows, names in zip(run.mdp.agents, bar_rows(run.mdp), action_labels(run.mdp), strict=True):
-        labels.append(agent_label(agent).upper())
-        places.append((1.0, float(rows[0]) - 1.35))
-        labels += names
-        places += [(1.0, float(y) - LABEL_RISE) for y in rows]
-    top = -0.9
-    labels += ["worst to best", "Q-value", "greedy", "chosen"]
-    places += [(BAR_LEFT + BAR_LENGTH / 2, top), (NUMBER_X, top), (GREEDY_X, top), (CHOSEN_X, top)]
-    stream.log(
-        f"{run.root}/table/words",
-        rr.Points2D(places, labels=labels, colors=[_rgb(INK)], radii=0.0, show_labels=True),
-        static=True,
-    )
-
-
-def _draw_frame(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
-    """Log the lines between the blocks of the map."""
-    pictures = scene.placements
-    if pictures is None:
-        return
-    rows, columns = pictures.block
-    across = [[(0, y), (pictures.width, y)] for y in range(0, pictures.height + 1, rows)]
-    down = [[(x, 0), (x, pictures.height)] for x in range(0, pictures.width + 1, columns)]
-    stream.log(
-        f"{path}/blocks",
-        rr.LineStrips2D(across + down, colors=[(255, 255, 255)], radii=0.06, draw_order=30),
-        static=True,
-    )
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:

@@ -144,6 +144,14 @@ class Placements:
     block: tuple[int, int]
     """Rows and columns of the grid that each block of the picture shows."""
 
+    def order(self, mover: int) -> NDArray[np.int64]:
+        """Return the pixels of this picture in the order of one in which that mover is the inner one."""
+        rows, columns = self.block
+        if mover == 0 or (self.height, self.width) == self.block:
+            return np.arange(self.height * self.width)
+        pixels = np.arange(self.height * self.width).reshape(rows, rows, columns, columns)
+        return pixels.transpose(1, 0, 3, 2).reshape(-1)
+
 
 def scene_of(mdp: Mdp) -> Scene | None:
     """Return the scene of an environment; None if it has none that can be drawn."""
@@ -276,7 +284,8 @@ def _contexts(scene: Scene) -> tuple[NDArray[np.int64], tuple[str, ...]]:
 def _context_name(scene: Scene, things: Sequence[int], key: NDArray[np.int64]) -> str:
     described = scene.description
     marks = {
-        mark["cell"][0] * scene.columns + mark["cell"][1]: mark["name"] for mark in described["landmarks"]
+        mark["cell"][0] * scene.columns + mark["cell"][1]: mark["name"]
+        for mark in described.get("landmarks", [])
     }
     words = []
     for thing, place in zip(things, key.tolist(), strict=True):

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from runner.errors import StorageError
 from runner.export.rerun.classes import Vocabulary, vocabulary
-from runner.export.rerun.events import EventWriter
+from runner.export.rerun.columns import Batch
 from runner.export.rerun.layout import Shown, blueprint, draw_background
 from runner.export.rerun.metrics import MetricWriter, send_metrics
 from runner.export.rerun.scene import TRAIL_STEPS, Marks, Scene, marks_of, scene_of
 from runner.export.rerun.selection import Request, Selection, select
-from runner.export.rerun.steps import Batch, StepWriter
+from runner.export.rerun.steps import StepWriter
 from runner.export.rerun.thoughts import Thinker, Thoughts
 from runner.frames import agents_of
 from runner.recording import schema
@@ -27,6 +27,8 @@ from runner.recording.reader import Recording
 
 BATCH: Final = 8_192
 """Rows sent at a time: larger columns are dropped by the web viewer."""
+BATCHES_WAITING: Final = 8
+"""Batches that may wait to be written: they are made faster than they are compressed, and would pile up."""
 APPLICATION: Final = "dualtaxi"
 
 
@@ -84,6 +86,7 @@ class RunExporter:
         self._recording = source.recording
         self._selection = selection
         self._source = source
+        self._sent = 0
         self._learners = tuple(agents_of(source.recording))
         self._scene: Scene | None = scene_of(source.recording.mdp)
         self._marks: Marks | None = marks_of(self._scene) if self._scene else None
@@ -124,21 +127,21 @@ class RunExporter:
         """Send the steps of a phase; return the stretches of time that they cover."""
         pieces = self._training(thinker) if phase == "train" else self._evaluating(thinker)
         mdp = self._recording.mdp
-        writer = StepWriter(
-            self._stream, self._source.root, phase, mdp, self._scene, self._marks, words, self._learners
-        )
-        events = EventWriter(self._stream, writer.path, phase, mdp)
+        path = f"{self._source.root}/{phase}"
+        writer = StepWriter(self._stream, path, phase, mdp, self._scene, self._marks, words, self._learners)
         dressed = False
         covered: list[tuple[int, int]] = []
         for batch in _batches(pieces):
             if not dressed:
                 writer.dress()
                 dressed = True
-            writer.send(batch)
-            events.send(batch)
+            writer.write(batch)
+            self._sent += 1
+            if self._sent % BATCHES_WAITING == 0:
+                self._stream.flush()
             _cover(covered, batch.time)
         if covered:
-            writer.clear(stop for _, stop in covered)
+            writer.end(stop for _, stop in covered)
         return covered
 
     def _training(self, thinker: Thinker) -> Iterator[Piece]:

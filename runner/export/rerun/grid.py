@@ -1,0 +1,140 @@
+"""The grid at each step: who is where, carries whom, came which way, does what, and what came of it."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from runner.export.rerun.classes import Vocabulary
+from runner.export.rerun.columns import Batch, Sender, ink, instances, place, rgba, strips, texts
+from runner.export.rerun.scene import (
+    GOAL_COLOUR,
+    MOVER_COLOURS,
+    TRAIL_STEPS,
+    Marks,
+    Scene,
+    events_of_steps,
+)
+
+TITLE_Y: Final = -0.62
+FACTS_BELOW: Final = 0.12
+
+
+class GridWriter(Sender):
+    """Sends the grid of one phase.
+
+    The movers, passengers and written facts of a step are the points of one entity, with their arrows and
+    trails: a row costs more than what is in it.
+    """
+
+    def __init__(
+        self, stream: rr.RecordingStream, path: str, scene: Scene, marks: Marks, words: Vocabulary
+    ) -> None:
+        super().__init__(stream, path)
+        self._scene = scene
+        self._marks = marks
+        self._words = words
+
+    def dress(self) -> None:
+        """Log sizes and colours."""
+        movers = len(self._scene.movers)
+        colours = [MOVER_COLOURS[i % len(MOVER_COLOURS)] for i in range(movers)]
+        facts = 1 + len(self._words.rewards)
+        radii = [0.15] * movers + [0.1] * len(self._scene.passengers) + [0.0] * facts
+        self.static(
+            "grid/things",
+            rr.Points2D.from_fields(radii=radii, show_labels=True, draw_order=40.0),
+            rr.Arrows2D.from_fields(colors=[rgba(c) for c in colours], radii=0.035, draw_order=45.0),
+            rr.LineStrips2D.from_fields(colors=[rgba(c, 120) for c in colours], radii=0.05, draw_order=30.0),
+        )
+        self.static("grid/title", rr.Points2D.from_fields(radii=0.0, show_labels=True))
+        self.static(
+            "grid/goal", rr.Boxes2D.from_fields(colors=[rgba(GOAL_COLOUR)], radii=0.04, show_labels=True)
+        )
+
+    def write(self, batch: Batch, phase: str) -> None:
+        """Send the grid of each step of a batch."""
+        self.send("grid/things", batch.times(), self._things(batch))
+        rows = np.flatnonzero(batch.records["t"] == 0)
+        if len(rows):
+            self._episodes(batch, rows, phase)
+
+    def _things(self, batch: Batch) -> list[Any]:
+        """Return the columns of what moves, its trail and its arrows."""
+        scene, records, n = self._scene, batch.records, len(batch.records)
+        state, movers = records["state"].astype(np.int64), len(scene.movers)
+        points = scene.points[state]
+        vectors = scene.arrows(
+            state, records["action"].astype(np.int64), records["next_state"].astype(np.int64)
+        )
+        positions = np.concatenate((points, self._fact_points(n)), axis=1)
+        return [
+            *instances(rr.Points2D, n, positions=positions, class_ids=self._classes(records, state)),
+            *instances(rr.Arrows2D, n, vectors=vectors, origins=points[:, :movers]),
+            *strips(trails(scene, batch)),
+        ]
+
+    def _fact_points(self, n: int) -> NDArray[np.float32]:
+        """Return where `t` and the rewards are written: below the grid."""
+        count = 1 + len(self._words.rewards)
+        x = (np.arange(count) + 0.5) * self._scene.columns / count
+        points = np.stack((x, np.full(count, self._scene.rows + FACTS_BELOW)), axis=1).astype(np.float32)
+        return np.broadcast_to(points, (n, count, 2))
+
+    def _classes(self, records: NDArray[np.void], state: NDArray[np.int64]) -> NDArray[np.uint16]:
+        """Return the label of each point of each step, by number."""
+        scene, words = self._scene, self._words
+        events = events_of_steps(scene.mdp, records)
+        waits = np.arange(len(scene.passengers)) + words.passenger
+        parts = [
+            self._marks.of(scene.carried[state], events) + np.uint16(words.mark),
+            np.where(scene.rides[state], words.riding, waits).astype(np.uint16),
+            words.of_t(records["t"])[:, None],
+        ]
+        if words.rewards:
+            parts.append(words.of_rewards(records["rewards"]))
+        return np.concatenate(parts, axis=1)
+
+    def _episodes(self, batch: Batch, rows: NDArray[np.int64], phase: str) -> None:
+        """Send what changes with the episode: its title and the goals."""
+        scene, records, n = self._scene, batch.records[rows], len(rows)
+        numbers = zip(batch.episode[rows].tolist(), records["episode"].tolist(), strict=True)
+        titles = texts([_title(phase, trained, own) for trained, own in numbers])
+        points = place(n, scene.columns / 2, TITLE_Y)
+        columns = instances(rr.Points2D, n, positions=points, labels=titles, colors=ink(n))
+        self.send("grid/title", batch.times(rows), columns)
+        goals = len(scene.goals)
+        if not goals:
+            return
+        names = np.array([scene.description["things"][thing]["label"] for thing in scene.goals])
+        self.send(
+            "grid/goal",
+            batch.times(rows),
+            instances(
+                rr.Boxes2D,
+                n,
+                centers=scene.goal_points[records["state"]],
+                half_sizes=np.full((n, goals, 2), 0.44, np.float32),
+                labels=np.broadcast_to(names, (n, goals)),
+            ),
+        )
+
+
+def trails(scene: Scene, batch: Batch) -> NDArray[np.float32]:
+    """Return the way each mover came, [n, movers, 6, 2]: the last five steps of the episode, to here."""
+    movers, k = len(scene.movers), len(batch.before)
+    states = np.concatenate((batch.before["state"], batch.records["state"])).astype(np.int64)
+    back = np.arange(TRAIL_STEPS, -1, -1)[None, :]
+    back = np.minimum(back, batch.records["t"][:, None].astype(np.int64))
+    index = np.maximum(np.arange(k, k + len(batch.records))[:, None] - back, 0)
+    way = scene.points[:, :movers][states[index]]
+    return np.ascontiguousarray(way.swapaxes(1, 2))
+
+
+def _title(phase: str, trained: int, own: int) -> str:
+    if phase == "train":
+        return f"TRAINING, episode {trained:,}"
+    return f"EVALUATION after {trained:,} episodes, trial {own:,} of all"

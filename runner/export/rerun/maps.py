@@ -1,0 +1,145 @@
+"""The map: the greatest value and the greedy moves for every placement of the movers.
+
+The first mover's cells lie within blocks, and each block is a cell of the second; for the second mover's
+own table it is the other way round.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from runner.export.rerun.columns import Batch, Sender, centres, images, ink, instances, place, rgba, texts
+from runner.export.rerun.scene import BAD_COLOUR, MOVER_COLOURS, Placements, Scene, own_actions
+
+LABEL_Y: Final = -2.6
+_ASIDE: Final = 0.21
+"""From the centre of a pixel to the arrow of either of two agents."""
+
+
+class MapWriter(Sender):
+    """Sends the maps of one phase, one a learner."""
+
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        path: str,
+        scene: Scene,
+        pictures: Placements,
+        learners: tuple[str, ...],
+    ) -> None:
+        super().__init__(stream, path)
+        self._scene = scene
+        self._mdp = scene.mdp
+        self._pictures = pictures
+        self._learners = learners
+        self._own = own_actions(self._mdp)
+        self._moves = [self._agent_moves(agent) for agent in range(len(self._mdp.agents))]
+        self._orders = [pictures.order(self._first_mover(i)) for i in range(len(learners))]
+        """[pixels] a learner: which pixel of the common picture each of its own is."""
+
+    def dress(self) -> None:
+        """Log sizes and colours."""
+        pictures = self._pictures
+        middle = centres(pictures.height, pictures.width)
+        shape = rr.components.ImageFormat(
+            width=pictures.width,
+            height=pictures.height,
+            channel_datatype=rr.ChannelDatatype.F32,
+            color_model=rr.ColorModel.L,
+        )
+        for i, learner in enumerate(self._learners):
+            shown = self._agents(i)
+            apart = [(k - (len(shown) - 1) / 2) * 2 * _ASIDE for k in range(len(shown))]
+            origins = np.concatenate([middle + np.array([[x, 0.0]], np.float32) for x in apart])
+            tints = [rgba(MOVER_COLOURS[k % len(MOVER_COLOURS)]) for k in shown for _ in middle]
+            self.static(
+                f"map/{learner}",
+                rr.DepthImage.from_fields(format=shape, colormap=rr.components.Colormap.Viridis),
+            )
+            self.static(
+                f"map/{learner}/moves",
+                rr.Arrows2D.from_fields(origins=origins, colors=tints, radii=0.06, draw_order=40.0),
+            )
+            self.static(
+                f"map/{learner}/here",
+                rr.Boxes2D.from_fields(colors=[rgba(BAD_COLOUR)], radii=0.1, draw_order=50.0),
+            )
+            self.static(f"map/{learner}/label", rr.Points2D.from_fields(radii=0.0, show_labels=True))
+
+    def write(self, batch: Batch) -> None:
+        """Send where each step of a batch is in the map, and the map where it was renewed."""
+        pictures, thoughts, n = self._pictures, batch.thoughts, len(batch.records)
+        middle = centres(pictures.height, pictures.width)
+        rows, times = thoughts.renewed, batch.times()
+        half = np.full((n, 1, 2), 0.5, np.float32)
+        for i, learner in enumerate(self._learners):
+            order = self._orders[i]
+            pixel = np.argsort(order)[pictures.pixel[batch.records["state"]]]
+            here = instances(rr.Boxes2D, n, centers=middle[pixel][:, None], half_sizes=half)
+            self.send(f"map/{learner}/here", times, here)
+            if len(rows):
+                moves = self._arrows(i, thoughts.greedy_maps[:, i][:, order])
+                self._renew(batch, learner, thoughts.value_maps[:, i][:, order], moves)
+
+    def _renew(
+        self, batch: Batch, learner: str, values: NDArray[np.float32], moves: NDArray[np.float32]
+    ) -> None:
+        rows = batch.thoughts.renewed
+        times, n = batch.times(rows), len(rows)
+        self.send(f"map/{learner}", times, images(values))
+        self.send(f"map/{learner}/moves", times, instances(rr.Arrows2D, n, vectors=moves))
+        contexts = self._pictures.context[batch.records["state"][rows]].tolist()
+        names = self._pictures.names
+        labels = texts(
+            [
+                f"as of step {time:,}\n{names[context]}"
+                for time, context in zip(batch.time[rows].tolist(), contexts, strict=True)
+            ]
+        )
+        points = place(n, self._pictures.width / 2, LABEL_Y)
+        columns = instances(rr.Points2D, n, positions=points, labels=labels, colors=ink(n))
+        self.send(f"map/{learner}/label", times, columns)
+
+    def _agents(self, learner: int) -> list[int]:
+        """Return the agents whose moves a learner's table decides."""
+        agents = range(len(self._mdp.agents))
+        return [learner] if len(self._learners) == len(agents) else list(agents)
+
+    def _first_mover(self, learner: int) -> int:
+        """Return which mover's cells lie within the blocks of a learner's map."""
+        return self._mover(self._agents(learner)[0])
+
+    def _mover(self, agent: int) -> int:
+        things = self._scene.description["things"]
+        named = [things[mover].get("agent") for mover in self._scene.movers]
+        name = self._mdp.agents[agent]
+        return named.index(name) if name in named else 0
+
+    def _arrows(self, learner: int, greedy: NDArray[np.int32]) -> NDArray[np.float32]:
+        """Return the arrows of greedy actions, [k, agents * pixels, 2]."""
+        shown = self._agents(learner)
+        arrows = []
+        for agent in shown:
+            own = greedy if len(shown) == 1 else self._own[greedy, agent]
+            arrows.append(np.where((greedy >= 0)[..., None], self._moves[agent][own], np.float32(0)))
+        return np.concatenate(arrows, axis=1)
+
+    def _agent_moves(self, agent: int) -> NDArray[np.float32]:
+        """Return the arrow of each own action of an agent, [actions, 2]."""
+        own = self._own[:, agent]
+        first = [int(np.argmax(own == action)) for action in range(self._mdp.action_counts[agent])]
+        moves: NDArray[np.float32] = self._scene.moves[first, self._mover(agent)] * np.float32(1.2)
+        return moves
+
+
+def draw_blocks(stream: rr.RecordingStream, path: str, pictures: Placements) -> None:
+    """Log the lines between the blocks of the map."""
+    rows, columns = pictures.block
+    across = [[(0, y), (pictures.width, y)] for y in range(0, pictures.height + 1, rows)]
+    down = [[(x, 0), (x, pictures.height)] for x in range(0, pictures.width + 1, columns)]
+    lines = rr.LineStrips2D(across + down, colors=[(255, 255, 255)], radii=0.06, draw_order=30)
+    stream.log(path, lines, static=True)

@@ -1,0 +1,147 @@
+"""The table of values at each step: what actions seemed worth, the greedy one, the chosen one."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from runner.export.rerun.classes import Vocabulary
+from runner.export.rerun.columns import Batch, Sender, instances, rgba, strips
+from runner.export.rerun.scene import INK, MOVER_COLOURS, action_labels, agent_label, own_actions
+from runner.mdp import Mdp
+
+NAME_X: Final = 1.0
+BAR_LEFT: Final = 2.5
+BAR_LENGTH: Final = 5.0
+NUMBER_X: Final = 9.4
+GREEDY_X: Final = 12.2
+CHOSEN_X: Final = 15.2
+WIDTH: Final = 17.0
+TOP: Final = -1.7
+"""Columns of the table, in rows of height 1."""
+LABEL_RISE: Final = 0.5
+"""How much higher a point must be for its label, which is written below it, to stand in its row."""
+_GAP: Final = 2.0
+_FINENESS: Final = 64
+"""Parts of a row's height to which the length of a bar is rounded: shorter in the file, not to be seen."""
+
+
+class ValueWriter(Sender):
+    """Sends the table of values of one phase; its numbers as text are rounded, its scalars are exact."""
+
+    def __init__(
+        self, stream: rr.RecordingStream, path: str, mdp: Mdp, words: Vocabulary, learners: int
+    ) -> None:
+        super().__init__(stream, path)
+        self._words = words
+        self._mdp = mdp
+        self._own = own_actions(mdp)
+        self._rows = bar_rows(mdp)
+        agents = len(mdp.agents)
+        self._explored_bit = np.arange(agents) if learners == agents else np.zeros(agents, np.int64)
+
+    def dress(self) -> None:
+        """Log sizes, colours and the names of the series."""
+        counts = self._mdp.action_counts
+        colours = [MOVER_COLOURS[i % len(MOVER_COLOURS)] for i in range(len(counts))]
+        bars = [rgba(colour) for colour, count in zip(colours, counts, strict=True) for _ in range(count)]
+        radii = [0.0] * sum(counts) + [0.25] * len(counts) + [0.0] * len(counts)
+        series = [
+            f"{agent_label(agent)} {name}"
+            for agent, names in zip(self._mdp.agents, action_labels(self._mdp), strict=True)
+            for name in names
+        ]
+        self.static(
+            "q",
+            rr.LineStrips2D.from_fields(colors=bars, radii=0.22),
+            rr.Points2D.from_fields(radii=radii, show_labels=True, draw_order=40.0),
+            rr.SeriesLines(names=series),
+        )
+
+    def write(self, batch: Batch) -> None:
+        """Send the values of each step of a batch: as they were before its update."""
+        values, n = batch.thoughts.values, len(batch.records)
+        points = self._points(batch)
+        columns = [
+            *rr.Scalars.columns(scalars=values),
+            *instances(rr.Points2D, n, positions=points, class_ids=self._classes(batch)),
+            *strips(self._bars(values)),
+        ]
+        self.send("q", batch.times(), columns)
+
+    def _points(self, batch: Batch) -> NDArray[np.float32]:
+        """Return where the numbers, the greedy marks and the chosen marks are."""
+        n, agents = batch.thoughts.greedy.shape
+        height = np.concatenate(self._rows)
+        first = np.array([rows[0] for rows in self._rows])
+        points = np.empty((n, len(height) + 2 * agents, 2), np.float32)
+        points[:, : len(height), 0] = NUMBER_X
+        points[:, : len(height), 1] = height - LABEL_RISE
+        points[:, len(height) : -agents, 0] = GREEDY_X
+        points[:, len(height) : -agents, 1] = first + batch.thoughts.greedy
+        points[:, -agents:, 0] = CHOSEN_X
+        points[:, -agents:, 1] = first + self._own[batch.records["action"]] - LABEL_RISE
+        return points
+
+    def _classes(self, batch: Batch) -> NDArray[np.uint16]:
+        """Return the label of each of those points, by number."""
+        words, greedy = self._words, batch.thoughts.greedy
+        explored = batch.records["explored"][:, None] >> self._explored_bit & 1
+        is_greedy = self._own[batch.records["action"]] == greedy
+        parts = (
+            words.values.of(batch.thoughts.values),
+            np.full(greedy.shape, words.greedy),
+            words.chosen + explored.astype(np.int64) * (1 + is_greedy),
+        )
+        return np.concatenate(parts, axis=1).astype(np.uint16)
+
+    def _bars(self, values: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return a bar a value, [n, values, 2 points, 2]: from the agent's lowest there to its highest."""
+        n, at = len(values), 0
+        bars = np.empty((n, values.shape[1], 2, 2), np.float32)
+        bars[:, :, 0, 0] = BAR_LEFT
+        for rows in self._rows:
+            part = slice(at, at + len(rows))
+            own = values[:, part]
+            low = own.min(axis=1, keepdims=True)
+            spread = own.max(axis=1, keepdims=True) - low
+            share = (own - low) * (BAR_LENGTH * _FINENESS / np.where(spread > 0, spread, 1.0))
+            bars[:, part, 1, 0] = BAR_LEFT + np.ceil(share) / _FINENESS
+            bars[:, part, :, 1] = rows[:, None]
+            at += len(rows)
+        return bars
+
+
+def bar_rows(mdp: Mdp) -> list[NDArray[np.float64]]:
+    """Return the height of each agent's rows in the table of values, from top to bottom."""
+    rows: list[NDArray[np.float64]] = []
+    top = 1.0
+    for count in mdp.action_counts:
+        rows.append(np.arange(count, dtype=np.float64) + top)
+        top += count + _GAP
+    return rows
+
+
+def draw_table(stream: rr.RecordingStream, path: str, mdp: Mdp) -> None:
+    """Log the words around the table of values."""
+    places: list[tuple[float, float]] = []
+    labels: list[str] = []
+    colours: list[Any] = []
+    for i, (agent, rows, names) in enumerate(zip(mdp.agents, bar_rows(mdp), action_labels(mdp), strict=True)):
+        labels += [agent_label(agent).upper(), *names]
+        places += [(NAME_X, float(y) - LABEL_RISE) for y in (rows[0] - 1.15, *rows)]
+        colours += [rgba(MOVER_COLOURS[i % len(MOVER_COLOURS)])] + [rgba(INK)] * len(names)
+    headings = {
+        BAR_LEFT + BAR_LENGTH / 2: "worst to best",
+        NUMBER_X: "Q",
+        GREEDY_X: "greedy",
+        CHOSEN_X: "chosen",
+    }
+    labels += headings.values()
+    places += [(x, -0.15 - LABEL_RISE) for x in headings]
+    colours += [rgba(INK)] * len(headings)
+    words = rr.Points2D(places, labels=labels, colors=colours, radii=0.0, show_labels=True)
+    stream.log(path, words, static=True)
