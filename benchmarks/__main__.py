@@ -15,9 +15,11 @@ from pathlib import Path
 
 import benchmarks
 from benchmarks.figures import Figure, heading, row
-from benchmarks.machine import machine
+from benchmarks.machine import OtherWork, machine
 
 PREFIX = "bench_"
+DISTURBING = 0.1
+"""Cores that others may use before the table says so."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,14 +45,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     facts = machine()
     print("\n".join(f"{key:<10} {value}" for key, value in facts.items()))
     print(f"\n{heading()}", flush=True)
-    figures: dict[str, list[Figure]] = {}
+    rows = []
     for name in options.names or names:
         print(f"\n{name}", flush=True)
-        figures[name] = _measure(name, options.quick)
-        for figure in figures[name]:
+        with OtherWork() as other:
+            figures = _measure(name, options.quick)
+        for figure in figures:
             print(row(figure), flush=True)
+            rows.append({"benchmark": name, **dataclasses.asdict(figure), "standing": figure.standing})
+            rows[-1]["other_work_cores"] = round(other.cores, 2)
+        if other.cores > DISTURBING:
+            print(
+                f"    disturbed: other work on the machine took {other.cores:.1f} cores meanwhile", flush=True
+            )
     if options.json:
-        _write(options.json, facts, figures)
+        text = json.dumps({"machine": facts, "figures": rows}, indent=1, ensure_ascii=False)
+        options.json.write_text(text + "\n", encoding="utf-8")
     return 0
 
 
@@ -58,15 +68,6 @@ def _measure(name: str, quick: bool) -> list[Figure]:
     module = importlib.import_module(f"benchmarks.{PREFIX}{name}")
     measured: list[Figure] = module.measure(quick)
     return measured
-
-
-def _write(path: Path, facts: dict[str, str], figures: dict[str, list[Figure]]) -> None:
-    rows = [
-        {"benchmark": name, **dataclasses.asdict(figure), "standing": figure.standing}
-        for name, measured in figures.items()
-        for figure in measured
-    ]
-    path.write_text(json.dumps({"machine": facts, "figures": rows}, indent=1, ensure_ascii=False) + "\n")
 
 
 if __name__ == "__main__":

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-import platform
+import time
+from types import TracebackType
+from typing import Self
 
 import psutil
 
@@ -11,7 +13,7 @@ from runner.provenance import provenance
 
 
 def machine() -> dict[str, str]:
-    """Return processor, cores, memory, load, and the versions that speed depends on."""
+    """Return processor, cores, memory, and the versions that speed depends on."""
     facts = provenance()
     keys = ("processor", "platform", "git", "python")
     packages = {key: value for key, value in facts.items() if key.startswith("package.")}
@@ -19,7 +21,27 @@ def machine() -> dict[str, str]:
         **{key: facts[key] for key in keys if key in facts},
         "cores": str(os.cpu_count()),
         "memory": f"{psutil.virtual_memory().total / 2**30:.1f} GiB",
-        "load": f"{os.getloadavg()[0]:.2f} at the start: other work on the machine shows in the figures",
         "packages": ", ".join(f"{key.removeprefix('package.')} {value}" for key, value in packages.items()),
-        "system": platform.system(),
     }
+
+
+class OtherWork:
+    """Over a `with` block: how many cores were busy with anything but this program; it spoils figures."""
+
+    def __enter__(self) -> Self:
+        self.cores = 0.0
+        self._begin = _moment()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        clock, busy = (now - then for now, then in zip(_moment(), self._begin, strict=True))
+        self.cores = max(busy / clock, 0.0)
+
+
+def _moment() -> tuple[float, float]:
+    """Return the clock, and the processor seconds that others have used up to now."""
+    all_of_it, own = psutil.cpu_times(), os.times()
+    busy = all_of_it.user + all_of_it.system + getattr(all_of_it, "nice", 0.0)
+    return time.perf_counter(), busy - sum(own[:4])
