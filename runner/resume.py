@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from runner import runs
 from runner.config import from_mapping
 from runner.config.model import RunTable
-from runner.errors import Diverged, RecordingError, RunnerError, StorageError
+from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, StorageError
 from runner.execution import (
     Report,
     Session,
@@ -42,7 +42,8 @@ from runner.mdp import Mdp, load_mdp
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES
-from runner.recording.contents import Contents, read_chunk, survey
+from runner.recording.contents import Contents, read_chunk
+from runner.recording.integrity import checked_survey
 from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
 from runner.recording.writer import RecordingFile
@@ -137,9 +138,9 @@ def _settled(run: Run) -> Run:
 
 def _go_on(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
     started = time.monotonic()
-    path, contents = _place(run)
+    job, described = _job(run)
+    path, contents = _place(run, described)
     changes = _changes(run)
-    job = Job(from_mapping(_config(run)), run.seed)
     mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
     changes |= _environment_changes(run, mdp)
     if changes and not accept_changes:
@@ -154,15 +155,20 @@ def _go_on(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
     return _put_in_place(done, path) if done.status == "finished" else done
 
 
-def _place(run: Run) -> tuple[Path, Contents]:
-    """Return the file to go on with, and what of it is good: the recording, or one made anew beside it."""
+def _place(run: Run, described: bool) -> tuple[Path, Contents]:
+    """Return the file to go on with, and what of it is good: the recording, or one made anew beside it.
+
+    Args:
+        run: whose.
+        described: whether the recording says of which job it is.
+    """
     anew = run.recording.with_suffix(_ANEW)
     if not run.recording.is_file():
         return run.recording, Contents()
-    contents = survey(run.recording)
-    if _may_be_cut(run.recording, contents):
+    contents = checked_survey(run.recording)
+    if _may_be_cut(run.recording, contents) and (described or not contents.chunks):
         return run.recording, contents
-    contents = survey(anew) if anew.is_file() else Contents()
+    contents = checked_survey(anew) if anew.is_file() else Contents()
     return anew, contents if _may_be_cut(anew, contents) else Contents()
 
 
@@ -217,11 +223,22 @@ def _only_zeros(stream: BinaryIO, offset: int) -> bool:
     return True
 
 
-def _config(run: Run) -> dict[str, Any]:
-    """Return the configuration that the recording holds, else what `run.json` says."""
-    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        return recording.config
-    return dict(run.facts.get("config", {}))
+def _job(run: Run) -> tuple[Job, bool]:
+    """Return the job that a run does, and whether its recording says so; else `run.json` does.
+
+    Raises:
+        Diverged: the recording says that it is of another job than it describes.
+    """
+    told = Job(from_mapping(run.facts.get("config", {})), run.seed)
+    try:
+        with open_recording(run.recording) as recording:
+            recorded = Job(from_mapping(recording.config), int(recording.run["seed"]))
+            claimed = recording.run["job"]
+    except (RecordingError, ConfigError, KeyError, ValueError):
+        return told, False
+    if claimed in (recorded.identity, told.identity):
+        return (recorded, True) if claimed == recorded.identity else (told, False)
+    raise Diverged("metadata run", "job", claimed, recorded.identity)
 
 
 def _proof(run: Run) -> str | None:
