@@ -1,0 +1,200 @@
+"""The difference of two runs names its true cause."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from runner import runs
+from runner.analysis.diff import RunDiff, diff
+from runner.analysis.diff.sections import markdown, sections
+from runner.analysis.diff.trajectory import FIELDS, first_difference
+from runner.analysis.tables import tables_at
+from runner.cli import cli
+from runner.config import from_mapping
+from runner.execution import run_job
+from runner.job import Job
+from runner.recording import open as open_recording
+from runner.recording import schema
+
+BASE = {
+    "name": "base",
+    "mode": "competitive",
+    "episodes": 120,
+    "discount": 0.8,
+    "epsilon": 0.6,
+    "evaluation": {"every": 60, "trials": 10},
+    "snapshots": {"every": 60},
+    "quirks": {"second_table_uses_first_action": True},
+    "recording": {"chunk_steps": 1024},
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("recordings")
+
+
+@pytest.fixture(scope="module")
+def record(folder):
+    """Record the base run with some other values, once for each."""
+    known: dict[str, Path] = {}
+
+    def recorded(*overrides: str) -> Path:
+        key = " ".join(overrides)
+        if key not in known:
+            config = from_mapping(BASE, overrides)
+            run = runs.create_run(folder, config, config.seeds[0])
+            known[key] = run_job(Job(config, config.seeds[0]), run).recording
+        return known[key]
+
+    return recorded
+
+
+@pytest.fixture(scope="module")
+def compare(record):
+    def compared(*overrides: str) -> RunDiff:
+        with open_recording(record()) as a, open_recording(record(*overrides)) as b:
+            return diff(a, b, {"finish_percent": 1.0})
+
+    return compared
+
+
+def test_a_name_and_a_compression_change_nothing(compare):
+    difference = compare("name=other", "recording.compression=lz4")
+    assert difference.same_content
+    assert {change.path for change in difference.config} == {
+        "name",
+        "recording.compression",
+        "recording.level",
+    }
+    assert difference.parting is None
+    assert difference.environment.same
+
+
+def test_another_seed_starts_elsewhere(compare):
+    difference = compare("seed=1")
+    assert [(change.path, change.a, change.b) for change in difference.config] == [("seed", 0, 1)]
+    assert (difference.parting.step, difference.cause.kind) == (0, "start")
+    assert difference.overlap.equal_episodes == 0
+
+
+def test_another_discount_shows_in_the_first_update_that_used_it(compare, record):
+    difference = compare("discount=0.9")
+    assert difference.cause.kind == "greedy_action"
+    update = difference.cause.update
+    assert update.rewards_a == update.rewards_b
+    with open_recording(record()) as a, open_recording(record("discount=0.9")) as b:
+        before = [tables_at(recording, update.step) for recording in (a, b)]
+        after = [tables_at(recording, update.step + 1) for recording in (a, b)]
+    assert all(np.array_equal(x, y) for x, y in zip(*before, strict=True))
+    assert any(not np.array_equal(x, y) for x, y in zip(*after, strict=True))
+    assert update.step < difference.parting.step
+
+
+def test_the_second_tables_quirk_shows_in_the_second_table(compare):
+    difference = compare("quirks.second_table_uses_first_action=false")
+    assert [change.path for change in difference.config] == ["quirks.second_table_uses_first_action"]
+    assert difference.cause.update.agent == "taxi_2"
+    assert {table.agent for table in difference.tables if table.largest > 0} == {"taxi_1", "taxi_2"}
+
+
+def test_another_reward_is_an_other_environment(compare):
+    difference = compare("env.kwargs.rewards.illegal_action=-7")
+    assert difference.environment.transitions > 1000
+    assert "reward -7" in " ".join(change.b for change in difference.environment.examples)
+    assert (difference.cause.kind, difference.parting.field) == ("transition", "rewards")
+    assert "-7.0" in difference.cause.text
+
+
+def test_other_modes_are_compared_as_far_as_they_can_be(compare):
+    difference = compare("mode=cooperative", "quirks.second_table_uses_first_action=false")
+    assert any("other modes" in note for note in difference.notes)
+    assert difference.parting is not None
+    assert difference.tables == []
+    assert difference.metrics
+
+
+def test_more_episodes_go_on_from_where_fewer_end(compare):
+    difference = compare("episodes=150", "snapshots.every=30")
+    assert difference.cause.kind == "end"
+    assert difference.overlap.equal_episodes == 120
+    assert difference.overlap.equal_steps == difference.overlap.steps_a
+    assert all(table.largest == 0 for table in difference.tables)
+
+
+def test_what_an_interrupted_run_has_is_compared(record, folder):
+    config = from_mapping(BASE)
+    run = runs.create_run(folder, config, 0)
+    asked = iter(range(10**9))
+    run = run_job(Job(config, 0), run, stop=lambda: next(asked) > 20)
+    with open_recording(record()) as a, open_recording(run.recording) as b:
+        difference = diff(a, b)
+    assert difference.b["status"] == "interrupted"
+    assert "B is not finished" in difference.notes[0]
+    assert difference.cause is None or difference.cause.kind == "end"
+
+
+def test_without_steps_only_the_rest_is_compared(compare):
+    difference = compare("recording.steps=none", "seed=3")
+    assert difference.parting is None
+    assert any("rerecord" in note for note in difference.notes)
+    assert difference.metrics
+    assert difference.tables
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_an_altered_step_is_the_first_difference(record, data):
+    with open_recording(record()) as recording:
+        blocks = list(recording.blocks(schema.TRAIN_STEP))
+    steps = np.concatenate(blocks)
+    at = data.draw(st.integers(0, len(steps) - 1))
+    field = data.draw(st.sampled_from(FIELDS))
+    altered = steps.copy()
+    value = altered[field][at]
+    altered[field][at] = ~value if altered[field].dtype == bool else value + 1
+    size = data.draw(st.integers(1, 3000))
+    cut = (altered[first : first + size] for first in range(0, len(altered), size))
+    position, left, right = first_difference(iter(blocks), cut)
+    assert position == at
+    assert left[field][0].tolist() != right[field][0].tolist()
+
+
+def test_equal_streams_have_no_difference_however_they_are_cut(record):
+    with open_recording(record()) as recording:
+        blocks = list(recording.blocks(schema.TRAIN_STEP))
+    steps = np.concatenate(blocks)
+    cut = (steps[first : first + 777] for first in range(0, len(steps), 777))
+    assert first_difference(iter(blocks), cut) is None
+
+
+def test_markdown_tables_have_as_many_cells_as_headings(compare):
+    lines = list(markdown(sections(compare("discount=0.9"), everything=True)))
+    assert "## Training" in lines
+    for above, line in pairwise(lines):
+        if above.startswith("|") and line.startswith("|"):
+            assert above.count(" | ") == line.count(" | ")
+
+
+def test_the_command_says_what_differs_and_ends_with_1(record, folder):
+    ids = [record(*overrides).parent.name for overrides in ((), ("discount=0.9",), ("name=other",))]
+    run = CliRunner().invoke
+    told = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder)])
+    assert told.exit_code == 1
+    assert "They part at" in told.stdout
+    assert "discount" in told.stdout
+    as_json = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--json", "--ignore", "disc*"])
+    assert json.loads(as_json.stdout)["config"] == []
+    assert json.loads(as_json.stdout)["cause"]["kind"] == "greedy_action"
+    same = run(cli, ["diff", ids[0], ids[2], "--recordings", str(folder)])
+    assert same.exit_code == 0, same.output
+    wrong = run(cli, ["diff", ids[0], "nothing", "--recordings", str(folder)])
+    assert wrong.exit_code == 2
