@@ -20,7 +20,7 @@ from runner.export.rerun.scene import (
 )
 
 TITLE_Y: Final = -0.62
-FACTS_BELOW: Final = 0.12
+FACTS_BELOW: Final = 0.35
 
 
 class GridWriter(Sender):

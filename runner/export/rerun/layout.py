@@ -49,13 +49,16 @@ def blueprint(runs: Sequence[Shown]) -> rrb.Blueprint:
     last = max(run.last for run in runs)
     plots = _plots(runs, last)
     with_steps = [run for run in runs if run.steps]
+    body: Any
     if len(runs) == 1:
-        parts = [*(_single(with_steps[0]) if with_steps else ()), plots]
+        parts = [*(_single(with_steps[0]) if with_steps else ()), rrb.Grid(*plots, grid_columns=2)]
         shares = [4, 3, 4] if len(parts) == 3 else [1] * len(parts)
-        body: Any = rrb.Horizontal(*parts, column_shares=shares)
+        body = rrb.Horizontal(*parts, column_shares=shares)
     else:
-        columns = [rrb.Vertical(*_pair(run), row_shares=[3, 2], name=run.title) for run in with_steps]
-        body = rrb.Vertical(rrb.Horizontal(*columns), plots, row_shares=[3, 2]) if columns else plots
+        halves = [rrb.Horizontal(*_half(run), name=run.title) for run in with_steps]
+        rows = [rrb.Horizontal(*plots[k : k + 4], name=name) for k, name in ((0, "Results"), (4, "Training"))]
+        below = rrb.Tabs(*(row for row in rows if row.contents))
+        body = rrb.Vertical(rrb.Horizontal(*halves), below, row_shares=[7, 3]) if halves else below
     return rrb.Blueprint(
         body,
         rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_A_SECOND),
@@ -74,7 +77,7 @@ def _single(run: Shown) -> list[Any]:
     return [left, rrb.Vertical(_values(run), below, row_shares=[1, 1])]
 
 
-def _pair(run: Shown) -> list[Any]:
+def _half(run: Shown) -> list[Any]:
     return [_grid(run), rrb.Tabs(_values(run), *_maps(run), _events(run))]
 
 
@@ -88,7 +91,7 @@ def _grid(run: Shown) -> Any:
         )
     margin = 0.8
     bounds = rrb.VisualBounds2D(
-        x_range=(-margin, run.scene.columns + margin), y_range=(-margin - 0.1, run.scene.rows + 0.7)
+        x_range=(-margin, run.scene.columns + margin), y_range=(-margin - 0.1, run.scene.rows + 0.9)
     )
     contents = [
         f"{run.root}/scene/**",
@@ -140,7 +143,7 @@ def _events(run: Shown) -> Any:
     return rrb.TextLogView(origin=f"{run.root}/", contents=contents, name="Events", columns=columns)
 
 
-def _plots(runs: Sequence[Shown], last: int) -> Any:
+def _plots(runs: Sequence[Shown], last: int) -> list[Any]:
     axis = rrb.TimeAxis(
         view_range=rr.TimeRange(
             start=rr.TimeRangeBoundary.absolute(seq=0), end=rr.TimeRangeBoundary.absolute(seq=last)
@@ -159,7 +162,7 @@ def _plots(runs: Sequence[Shown], last: int) -> Any:
                     plot_legend=rrb.PlotLegend(visible=True),
                 )
             )
-    return rrb.Grid(*views, grid_columns=2 if len(runs) == 1 else 4)
+    return views
 
 
 def draw_background(stream: rr.RecordingStream, run: Shown) -> None:

@@ -88,7 +88,7 @@ class MetricWriter:
             "eval/metrics/returns",
             rows,
             [r["mean_returns"] for r in rows],
-            [f"evaluation {name}" for name in self._learners],
+            self._whose("evaluation"),
         )
         counts = np.array([row["events"] for row in rows], float).reshape(len(rows), -1)
         trials = np.array([[row["trials"]] for row in rows], float)
@@ -135,10 +135,14 @@ class MetricWriter:
             "train/metrics/returns",
             rows,
             means[:, 2 : 2 + learners],
-            [f"training {name}" for name in self._learners],
+            self._whose("training"),
         )
         for name, column in self._collisions(means[:, 2 + learners :]):
             self._series(f"train/metrics/{name}", rows, column, ["training"])
+
+    def _whose(self, phase: str) -> list[str]:
+        """Return the name of each learner's series in a phase."""
+        return [f"{phase} {name}" for name in self._learners] if len(self._learners) > 1 else [phase]
 
     def _collisions(self, counts: NDArray[np.float64]) -> list[tuple[str, NDArray[np.float64]]]:
         """Return the columns of the events that concern all agents."""
@@ -166,8 +170,6 @@ class MetricWriter:
         trained = path.startswith("train/")
         colours = [COLOURS[i % len(COLOURS)] for i in range(len(names))]
         if len(names) == 1:
-            colours = [TRAIN_COLOUR if trained else EVAL_COLOUR]
-        if path.endswith("returns") and len(names) == 1:
             colours = [TRAIN_COLOUR if trained else EVAL_COLOUR]
         if self._tint:
             colours = [self._tint] * len(names)

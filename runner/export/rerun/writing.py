@@ -111,7 +111,7 @@ class RunExporter:
             self._learners,
             source.recording.mdp.event_names,
             source.tint,
-            source.title if source.tint else "",
+            source.recording.run["run_id"] if source.tint else "",
         )
         send_metrics(writer, self._recording)
         if not self._selection.steps:
