@@ -5,6 +5,7 @@ The page needs no network: styles, script, plots and data are in it. All of it i
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Sequence
@@ -17,7 +18,14 @@ from runner.export import svg, svg_maps
 from runner.export.plots import RunSeries, groups_of, panels_of, read_series
 from runner.export.plots_figure import footnote, is_wide, matplotlib_of, panel_svg
 from runner.export.report_maps import MapRow, maps_of, stages_of
-from runner.export.report_replay import Episode, payload, ranked_trials, training_episode, trial
+from runner.export.report_replay import (
+    Episode,
+    last_whole_evaluation,
+    payload,
+    ranked_trials,
+    training_episode,
+    trial,
+)
 from runner.export.report_runs import has_steps, shortcomings, state_of
 from runner.frames import agents_of, environment_of, evaluation_records
 from runner.recording import schema
@@ -95,7 +103,7 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
     """Return all that the page says of a run."""
     evaluations = evaluation_records(recording)
     environment = environment_of(recording)
-    episodes = _episodes(recording, evaluations, chosen)
+    episodes = _episodes(recording, chosen)
     drawing = None if environment["scene"] is None else svg.Drawing(environment["scene"])
     return {
         "number": number,
@@ -140,9 +148,7 @@ def _facts(recording: Recording) -> dict[str, str]:
     return {key: str(value) for key, value in told.items()}
 
 
-def _episodes(
-    recording: Recording, evaluations: Sequence[dict[str, Any]], chosen: Sequence[Choice]
-) -> list[Episode]:
+def _episodes(recording: Recording, chosen: Sequence[Choice]) -> list[Episode]:
     """Return the episodes that are shown: of the last evaluation, and the first and last of training."""
     if not has_steps(recording):
         return []
@@ -157,17 +163,16 @@ def _episodes(
             "chosen",
             training_episode(recording, number) if phase == "train" else trial(recording, number, of),
         )
-    if evaluations and recording.count(schema.EVAL_STEP):
-        after = evaluations[-1]["episode"]
+    after = last_whole_evaluation(recording)
+    if after is not None:
         worst, typical, best = ranked_trials(recording, after)
         add("typical trial", trial(recording, after, typical))
         add("best trial", trial(recording, after, best))
         add("worst trial", trial(recording, after, worst))
     ended = recording.count(schema.TRAIN_EPISODE)
-    if recording.count(schema.TRAIN_STEP):
-        add("first of training", training_episode(recording, 0))
-        if ended > 1:
-            add("last of training", training_episode(recording, ended - 1))
+    for told, number in (("first of training", 0), ("last of training", ended - 1)):
+        with contextlib.suppress(RecordingError):  # the steps may have been cut off, or never recorded
+            add(told, training_episode(recording, number))
     return list(found.values())
 
 

@@ -17,6 +17,7 @@ from runner.errors import RecordingError
 from runner.export.report_runs import require_steps
 from runner.frames import agents_of
 from runner.mdp import Mdp
+from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.words import action_names, actions_in_words, agent_actions, event_in_words, states_in_words
 
@@ -155,13 +156,29 @@ def typical_trial(recording: Recording) -> tuple[int, int]:
     """Return the last evaluation (training episodes before it) and its median trial.
 
     Raises:
-        RecordingError: there is no evaluation.
+        RecordingError: there is no evaluation, or no steps.
     """
-    evaluations = recording.metrics("eval")
-    if not evaluations:
-        raise RecordingError(f"{recording.path}: has no evaluations; choose a training episode by --episode.")
-    after = int(evaluations[-1]["episode"])
+    require_steps(recording)
+    after = last_whole_evaluation(recording)
+    if after is None:
+        raise RecordingError(
+            f"{recording.path}: has no whole evaluation; choose a training episode by --episode."
+        )
     return after, ranked_trials(recording, after)[1]
+
+
+def last_whole_evaluation(recording: Recording) -> int | None:
+    """Return the training episodes before the last evaluation all of whose trials are there.
+
+    A recording that was cut off may have an evaluation's metrics without its trials.
+    """
+    ends, after = 0, None
+    episodes, steps = recording.count(schema.EVAL_EPISODE), recording.count(schema.EVAL_STEP)
+    for metrics in recording.metrics("eval"):
+        ends += int(metrics["trials"])
+        if ends <= episodes and recording.episodes("eval", ends - 1, ends)[0]["last_step"] < steps:
+            after = int(metrics["episode"])
+    return after
 
 
 def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[str, Any]:

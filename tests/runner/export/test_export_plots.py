@@ -1,0 +1,135 @@
+"""Plots: what is in the panels is what the recordings say; files are real; mistakes are told."""
+
+from __future__ import annotations
+
+from statistics import median
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.figure import Figure
+
+from runner.cli import cli
+from runner.errors import RunnerError
+from runner.export.plots import groups_of, panels_of, read_series
+from runner.export.plots_figure import draw_figure, draw_panel
+from runner.frames import evaluation_records
+from runner.recording.reader import open_recording
+
+
+def series(*runs):
+    found = []
+    for run in runs:
+        with open_recording(run.recording) as recording:
+            found.append(read_series(recording))
+    return found
+
+
+@pytest.fixture
+def seeds(pictured):
+    return [pictured("rivals", seed=seed) for seed in (1, 2, 3)]
+
+
+def plot(*words):
+    return CliRunner().invoke(cli, ["plot", *map(str, words)])
+
+
+def test_seeds_are_one_group_with_median_and_band(seeds):
+    (group,) = groups_of(series(*seeds))
+    panel = next(panel for panel in panels_of([group]) if panel.metric == "mean_length")
+    (curve,) = panel.curves
+    lengths = []
+    for run in seeds:
+        with open_recording(run.recording) as recording:
+            lengths.append([record["mean_length"] for record in evaluation_records(recording)])
+    assert curve.episodes.tolist() == [0, 20, 40]
+    assert curve.median.tolist() == [median(each) for each in zip(*lengths, strict=True)]
+    assert curve.low.tolist() == [min(each) for each in zip(*lengths, strict=True)]
+    assert curve.high.tolist() == [max(each) for each in zip(*lengths, strict=True)]
+
+
+def test_every_metric_of_the_tutorial_and_every_event_has_a_panel(pictured):
+    panels = panels_of(groups_of(series(pictured("taxis"))))
+    metrics = {panel.metric for panel in panels}
+    assert {"finish_percent", "mean_length", "mean_penalties", "training.mean_length"} <= metrics
+    assert {"training.percent_filled", "training.reward", "event.pickup", "event.collision"} <= metrics
+    shares = next(panel for panel in panels if panel.metric == "training.reward")
+    totals = sum(np.interp(shares.curves[0].episodes, c.episodes, c.median) for c in shares.curves)
+    assert totals == pytest.approx(np.full(len(totals), 100.0))
+
+
+def test_groups_of_one_name_are_labelled_by_what_differs(pictured):
+    one, other = pictured("lake"), pictured("lake", discount=0.5)
+    labels = [group.label for group in groups_of(series(one, other))]
+    assert labels[1] == "lake, discount=0.5"
+    assert labels[0].startswith("lake, discount=")
+    described = groups_of(series(one))[0].described
+    assert one.run_id in described
+    assert "seed 1" in described
+
+
+def test_axes_are_honest(seeds, pictured):
+    groups = groups_of(series(*seeds, pictured("taxis")))
+    for panel in panels_of(groups):
+        axes = Figure().add_subplot()
+        draw_panel(axes, panel, len(groups))
+        low, high = axes.get_ylim()
+        assert axes.get_xlim()[0] == 0
+        assert not panel.percent or (low == 0 and 100 <= high <= 105)
+        assert not panel.at_least_zero or low == 0
+        assert low <= min(curve.low.min() for curve in panel.curves)
+        assert high >= max(curve.high.max() for curve in panel.curves)
+
+
+def test_the_figure_names_its_runs_and_what_bands_are(seeds, pictured):
+    groups = groups_of(series(*seeds, pictured("taxis")))
+    figure = draw_figure(groups, panels_of(groups))
+    texts = [text.get_text() for text in (*figure.texts, *figure.legends[0].get_texts())]
+    assert any("median" in text and "lowest" in text for text in texts)
+    assert all(any(run.run_id in text for text in texts) for run in (*seeds, pictured("taxis")))
+
+
+@pytest.mark.parametrize(("suffix", "magic"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_the_command_writes_the_file_once(pictured, tmp_path, suffix, magic):
+    path = tmp_path / f"plot.{suffix}"
+    result = plot(pictured("stairs", log=None).recording, "-o", path)
+    assert result.exit_code == 0, result.output
+    assert path.read_bytes().startswith(magic)
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_file_is_replaced_only_when_asked(pictured, tmp_path):
+    path = tmp_path / "plot.svg"
+    path.write_text("mine")
+    result = plot(pictured("stairs", log=None).recording, "-o", path)
+    assert (result.exit_code, path.read_text()) == (2, "mine")
+    assert "--force" in result.stderr
+    assert plot(pictured("stairs", log=None).recording, "-o", path, "--force").exit_code == 0
+    assert path.read_text() != "mine"
+
+
+def test_a_name_stands_for_all_its_runs(pictured, tmp_path):
+    runs = [pictured("lake", name="trio", seed=seed) for seed in (1, 2, 3)]
+    words = ("trio", "--recordings", runs[0].folder.parent, "-o", tmp_path / "p.svg")
+    assert "of 3 runs" in plot(*words).stdout
+
+
+def test_mistakes_are_told(pictured, tmp_path):
+    assert "expected one of .png" in plot(pictured("lake").recording, "-o", tmp_path / "x.bmp").stderr
+    assert "no run 'nobody'" in plot("nobody", "--recordings", tmp_path, "-o", tmp_path / "x.png").stderr
+    silent = pictured("lake", evaluation=None, log=None)
+    with pytest.raises(RunnerError, match=f"no metrics in {silent.run_id}"):
+        panels_of(groups_of(series(silent)))
+
+
+def test_a_missing_package_is_named(pictured, tmp_path, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "matplotlib", None)
+    result = plot(pictured("lake").recording, "-o", tmp_path / "x.png")
+    assert result.exit_code == 2
+    assert "dualtaxi[plots]" in result.stderr
+
+
+def test_where_success_is_unknown_there_is_no_panel_of_it(pictured):
+    metrics = {panel.metric for panel in panels_of(groups_of(series(pictured("stairs"))))}
+    assert "finish_percent" not in metrics
+    assert "mean_length" in metrics

@@ -1,0 +1,208 @@
+"""What an export says, read back and compared with the recording, step by step."""
+
+from __future__ import annotations
+
+import subprocess
+
+import numpy as np
+import pytest
+
+from runner.analysis.tables import TableReplay, tables_at
+from runner.export.rerun.scene import events_of_steps, marks_of, own_actions, scene_of
+from runner.export.rerun.selection import Request
+from runner.export.rerun.viewer import viewer_program
+from runner.export.rerun.writing import Source, export
+from runner.frames import agents_of
+from runner.recording import schema
+from runner.recording.reader import open_recording
+
+reading = pytest.importorskip("rerun.chunk")
+
+TOPICS = {"train": schema.TRAIN_STEP, "eval": schema.EVAL_STEP}
+
+
+class Exported:
+    """A whole run, exported and read back."""
+
+    def __init__(self, recording, path):
+        self.recording = recording
+        self.path = path
+        (self.selection,) = export([Source(recording, "a run")], Request(everything=True), path)
+        self.store = reading.RrdReader(str(path)).store()
+
+    def table(self, entity):
+        """Return the columns of an entity's rows that have times, in order of the step."""
+        chunks = self.store.stream().filter(content=entity).to_chunks()
+        batches = [chunk.to_record_batch() for chunk in chunks if not chunk.is_static]
+        batches = [batch for batch in batches if "Clear:is_recursive" not in batch.schema.names]
+        names = [name for name in batches[0].schema.names if not name.startswith("rerun.")]
+        columns = {name: sum((batch.column(name).to_pylist() for batch in batches), []) for name in names}
+        order = np.argsort(columns["step"], kind="stable")
+        return {name: [values[i] for i in order] for name, values in columns.items()}
+
+    def steps(self, phase):
+        """Return the recorded steps of a phase."""
+        return np.concatenate(list(self.recording.blocks(TOPICS[phase])))
+
+
+@pytest.fixture(scope="module", params=["taxis", "rivals", "lake", "stairs"])
+def exported(request, pictured, tmp_path_factory):
+    with open_recording(pictured(request.param).recording) as recording:
+        yield Exported(recording, tmp_path_factory.mktemp("rerun") / "run.rrd")
+
+
+def saw(recording, phase, steps):
+    """Return what the learners saw at each step, [n, learners, widest]: by the replay alone."""
+    if phase == "train":
+        return TableReplay(recording, 0).rows(len(steps))
+    trained = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS - steps["step"] - 1
+    tables = {step: tables_at(recording, int(step)) for step in np.unique(trained)}
+    return np.array(
+        [[table[state] for table in tables[step]] for step, state in zip(trained, steps["state"], strict=True)]
+    )
+
+
+@pytest.mark.parametrize("phase", TOPICS)
+class TestSteps:
+    def test_every_step_is_there_at_its_time(self, exported, phase):
+        steps, table = exported.steps(phase), exported.table(f"/{phase}/reward")
+        assert table["step"] == (steps["log_time"] // schema.STEP_NANOSECONDS).tolist()
+        assert table["t"] == steps["t"].tolist()
+        if phase == "train":
+            assert table["episode"] == steps["episode"].tolist()
+        else:
+            trials = exported.recording.config["evaluation"]["trials"]
+            after = [row["episode"] for row in exported.recording.metrics("eval")]
+            assert table["episode"] == [after[k // trials] for k in steps["episode"].tolist()]
+
+    def test_rewards(self, exported, phase):
+        assert exported.table(f"/{phase}/reward")["Scalars:scalars"] == exported.steps(phase)["rewards"].tolist()
+
+    def test_values_are_those_of_the_step(self, exported, phase):
+        steps, counts = exported.steps(phase), exported.recording.mdp.action_counts
+        rows = saw(exported.recording, phase, steps)
+        if rows.shape[1] == len(counts):
+            expected = np.concatenate([rows[:, i, :count] for i, count in enumerate(counts)], axis=1)
+        else:
+            joint = rows[:, 0].reshape(len(steps), *counts)
+            expected = np.concatenate((joint.max(axis=2), joint.max(axis=1)), axis=1)
+        assert np.array_equal(exported.table(f"/{phase}/q")["Scalars:scalars"], expected)
+
+    def test_positions_and_moves(self, exported, phase):
+        mdp = exported.recording.mdp
+        scene, steps = scene_of(mdp), exported.steps(phase)
+        if scene is None:
+            assert exported.table(f"/{phase}/state")["Scalars:scalars"] == [[s] for s in steps["state"].tolist()]
+            assert exported.table(f"/{phase}/action")["Scalars:scalars"] == [[a] for a in steps["action"].tolist()]
+            return
+        table = exported.table(f"/{phase}/grid/things")
+        points = np.array(table["Points2D:positions"])
+        for i, mover in enumerate(scene.movers):
+            cells = mdp.scene_cells[steps["state"], mover]
+            drawn = np.floor(points[:, i]).astype(int)
+            assert np.array_equal(drawn[:, 1] * scene.columns + drawn[:, 0], cells)
+            tips = np.floor(points[:, i] + np.array(table["Arrows2D:vectors"])[:, i]).astype(int)
+            moved = mdp.scene_cells[steps["next_state"], mover]
+            went = moved != cells
+            assert np.array_equal((tips[:, 1] * scene.columns + tips[:, 0])[went], moved[went])
+
+    def test_trails_are_the_last_five_steps_of_the_episode(self, exported, phase):
+        scene, steps = scene_of(exported.recording.mdp), exported.steps(phase)
+        if scene is None:
+            return
+        strips = exported.table(f"/{phase}/grid/things")["LineStrips2D:strips"]
+        for k in (0, 1, 3, 7, len(steps) - 1):
+            back = [max(k - j, k - int(steps["t"][k])) for j in range(5, -1, -1)]
+            expected = scene.points[steps["state"][back], : len(scene.movers)].swapaxes(0, 1)
+            assert np.array_equal(np.array(strips[k], np.float32), expected)
+
+    def test_maps_are_of_the_step_they_name(self, exported, phase):
+        recording = exported.recording
+        scene = scene_of(recording.mdp)
+        if scene is None or scene.placements is None:
+            return
+        steps, pictures = exported.steps(phase), scene.placements
+        time = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
+        for learner, name in enumerate(agents_of(recording)):
+            table = exported.table(f"/{phase}/map/{name}")
+            context = pictures.context[steps["state"]]
+            changed = np.append(True, context[1:] != context[:-1]) | (steps["t"] == 0)
+            assert table["step"] == time[changed].tolist()
+            for k in range(0, len(table["step"]), max(1, len(table["step"]) // 7)):
+                step = steps[np.searchsorted(time, table["step"][k])]
+                trained = int(step["step"]) if phase == "train" else table["step"][k] - int(step["step"]) - 1
+                q = tables_at(recording, trained)[learner].max(axis=1)
+                shown = np.array(table["DepthImage:buffer"][k][0], np.uint8).view(np.float32)
+                order = pictures.order(learner if len(agents_of(recording)) > 1 else 0)
+                states = pictures.states[pictures.context[step["state"]]][order]
+                assert np.array_equal(shown[states >= 0], q[states[states >= 0]].astype(np.float32))
+
+    def test_events_are_in_the_log(self, exported, phase):
+        mdp, steps = exported.recording.mdp, exported.steps(phase)
+        table = exported.table(f"/{phase}/events")
+        said = [text for (text,) in table["TextLog:text"]]
+        assert sum("begins:" in text for text in said) == (steps["t"] == 0).sum()
+        assert sum("time-out" in text for text in said) == (steps["truncated"] & ~steps["terminated"]).sum()
+        if "collision" in mdp.event_names:
+            bit = mdp.event_names.index("collision")
+            happened = events_of_steps(mdp, steps) >> bit & 1
+            assert sum(text.startswith("collision") for text in said) == happened.sum()
+        if phase == "eval":
+            results = len(exported.recording.metrics("eval"))
+            assert sum(text.startswith("evaluation after") for text in said) == results
+
+
+def test_the_marks_say_what_went_wrong(exported):
+    mdp, steps = exported.recording.mdp, exported.steps("train")
+    scene = scene_of(mdp)
+    if scene is None or "collision" not in mdp.event_names:
+        return
+    marks, events = marks_of(scene), events_of_steps(mdp, steps)
+    said = np.array(marks.labels)[marks.of(scene.carried[steps["state"]], events)]
+    illegal = events >> mdp.event_names.index("taxi_2.illegal_pickup") & 1
+    assert [("illegal pickup" in label) for label in said[:, 1]] == illegal.astype(bool).tolist()
+    assert not any("illegal pickup" in label for label in said[illegal == 0, 1])
+
+
+def test_every_metric_is_there(exported):
+    metrics = exported.recording.metrics("eval")
+    assert exported.table("/eval/metrics/episode_length")["Scalars:scalars"] == [
+        [row["eval_mean_length"]] for row in metrics
+    ]
+    if metrics[0]["successes"] >= 0:
+        finished = [[row["finish_percent"]] for row in metrics]
+        assert exported.table("/eval/metrics/finish_percent")["Scalars:scalars"] == finished
+    names = ["filled_percent", "epsilon", "step_size", "discount", "episode_length", "penalties", "returns"]
+    for name in [*names, "reward_percent"]:
+        assert exported.table(f"/train/metrics/{name}")["Scalars:scalars"]
+    lengths = [row[0] for row in exported.table("/train/episodes")["Scalars:scalars"]]
+    assert lengths == exported.recording.episodes("train")["length"].tolist()
+
+
+def test_means_between_reports_are_of_the_episodes_that_ended_there(exported):
+    recording = exported.recording
+    episodes = recording.episodes("train")
+    reports = sorted([*recording.metrics("train"), *recording.metrics("eval")], key=lambda row: row["log_time"])
+    table = exported.table("/train/metrics/penalties")
+    found = dict(zip(table["step"], (value for (value,) in table["Scalars:scalars"]), strict=True))
+    before = 0
+    for row in reports:
+        ended = episodes[(episodes["last_step"] >= before) & (episodes["last_step"] < row["step"])]
+        time = row["log_time"] // schema.STEP_NANOSECONDS
+        if len(ended):
+            assert found[time] == pytest.approx(ended["penalties"].mean())
+        before = max(before, row["step"])
+
+
+def test_rerun_finds_the_file_sound(exported):
+    done = subprocess.run(
+        [viewer_program(), "rrd", "verify", exported.path], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_own_actions_make_up_the_joint_one(exported):
+    mdp = exported.recording.mdp
+    assert np.array_equal(
+        np.ravel_multi_index(tuple(own_actions(mdp).T), mdp.action_counts), np.arange(mdp.joint_actions)
+    )
