@@ -12,7 +12,8 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,10 +22,13 @@ from numpy.typing import NDArray
 
 from runner.config.values import plain
 from runner.errors import EnvironmentNotUsable, nearest
+from runner.scene import is_text, is_whole, scene_mistake
 from runner.toy_text import grid_world
 
 MAX_EVENTS = 31
 MAX_AGENTS = 31
+MAX_ARRAYS_BYTES = 128 << 20
+"""What all arrays of an environment may take, so that a recording of it can be read again."""
 _DTYPES = {
     "next_state": np.int32,
     "probability": np.float64,
@@ -138,7 +142,7 @@ def from_parts(description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]
             **arrays,
         )
         _check(mdp)
-    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError, RecursionError) as error:
         raise EnvironmentNotUsable(f"what is said of the environment makes no sense: {error!r}") from error
     return mdp
 
@@ -263,37 +267,68 @@ def _transitions_from_p(
 
 
 def _check(mdp: Mdp) -> None:
-    """Refuse arrays that contradict each other: an environment, or a recording, may bring anything."""
-    shape = mdp.next_state.shape
-    problems = [
-        (f"{name} must be of {np.dtype(kind)}", getattr(mdp, name).dtype == kind)
-        for name, kind in _DTYPES.items()
-    ]
-    problems += [
-        ("next_state must have three axes", mdp.next_state.ndim == 3 and mdp.next_state.size > 0),
-        ("next_state must name states", _within(mdp.next_state, 0, shape[0])),
-        ("shapes must agree", mdp.probability.shape == mdp.terminated.shape == mdp.events.shape == shape),
-        ("rewards must add one axis", mdp.rewards.shape[:-1] == shape),
-        ("rewards must be one, or one an agent", mdp.rewards.shape[-1] in (1, len(mdp.agents))),
-        ("rewards must be finite", bool(np.isfinite(mdp.rewards).all())),
-        ("probabilities of a pair must add up to 1", _sums_to_one(mdp.probability)),
-        (
-            "start must be a distribution over states",
-            mdp.start.shape == shape[:1] and _sums_to_one(mdp.start),
-        ),
-        ("the agents' actions must make the joint actions", int(np.prod(mdp.action_counts)) == shape[1]),
-        ("each agent needs a number of actions", len(mdp.agents) == len(mdp.action_counts)),
-        ("each agent needs at least one action", all(count >= 1 for count in mdp.action_counts)),
-        (f"at most {MAX_AGENTS} agents", 1 <= len(mdp.agents) <= MAX_AGENTS),
-        ("the step limit must be a number from 0", isinstance(mdp.step_limit, int) and mdp.step_limit >= 0),
-        ("the scene's arrays must have a row a state", _rows(mdp.scene_cells) == _rows(mdp.scene_carriers)),
-        ("the scene's arrays must have a row a state", _rows(mdp.scene_cells) in (None, shape[0])),
-        (f"at most {MAX_EVENTS} events", len(mdp.event_names) <= MAX_EVENTS),
-        ("success events must be events", set(mdp.success_events) <= set(mdp.event_names)),
-    ]
-    for expectation, holds in problems:
-        if not holds:
-            raise EnvironmentNotUsable(f"environment {mdp.env_id!r}: {expectation}; found otherwise.")
+    """Refuse parts that contradict each other: an environment, or a recording, may bring anything.
+
+    One expectation relies on those before it.
+    """
+    with np.errstate(all="ignore"):
+        for expectations in (_said_right(mdp), _arrays_right(mdp)):
+            for expectation, holds in expectations:
+                if not holds:
+                    raise EnvironmentNotUsable(f"environment {mdp.env_id!r}: {expectation}; found otherwise.")
+    mistake = scene_mistake(mdp.scene, mdp.scene_cells, mdp.scene_carriers, mdp.states)
+    if mistake is not None:
+        raise EnvironmentNotUsable(f"environment {mdp.env_id!r}: {mistake}; found otherwise.")
+
+
+def _said_right(mdp: Mdp) -> Iterator[tuple[str, bool]]:
+    """Yield what must hold of what is said beside the arrays, and whether it does."""
+    yield "an id must be text", is_text(mdp.env_id)
+    yield "kwargs must be a mapping", isinstance(mdp.kwargs, Mapping)
+    yield f"1 to {MAX_AGENTS} agents", 1 <= len(mdp.agents) <= MAX_AGENTS
+    yield "an agent has a name", all(map(is_text, mdp.agents))
+    yield "each agent needs a number of actions", len(mdp.agents) == len(mdp.action_counts)
+    yield "each agent needs at least one action", all(is_whole(n, 1, 2**31) for n in mdp.action_counts)
+    yield f"at most {MAX_EVENTS} events", len(mdp.event_names) <= MAX_EVENTS
+    yield "an event has a name of its own", _distinct(mdp.event_names)
+    yield (
+        "success events must be events",
+        _distinct(mdp.success_events) and (set(mdp.success_events) <= set(mdp.event_names)),
+    )
+    yield "penalty_below must be a number", isinstance(mdp.penalty_below, int | float)
+    yield "the step limit must be a number from 0", is_whole(mdp.step_limit, 0, 2**31 - 1)
+
+
+def _arrays_right(mdp: Mdp) -> Iterator[tuple[str, bool]]:
+    """Yield what must hold of the arrays, and whether it does."""
+    for name, kind in _DTYPES.items():
+        array = getattr(mdp, name)
+        yield f"{name} must be an array of {np.dtype(kind)}", _is_array(array, kind)
+    shape, size = mdp.next_state.shape, sum(array.nbytes for array in mdp.arrays().values())
+    yield f"its arrays may take {MAX_ARRAYS_BYTES:,} bytes, to be recorded", size <= MAX_ARRAYS_BYTES
+    yield "next_state must have three axes", mdp.next_state.ndim == 3 and mdp.next_state.size > 0
+    yield "next_state must name states", _within(mdp.next_state, 0, shape[0])
+    yield "shapes must agree", mdp.probability.shape == mdp.terminated.shape == mdp.events.shape == shape
+    yield "rewards must add one axis", mdp.rewards.ndim == 4 and mdp.rewards.shape[:-1] == shape
+    yield "rewards must be one, or one an agent", mdp.rewards.shape[-1] in (1, len(mdp.agents))
+    yield "rewards must be finite", bool(np.isfinite(mdp.rewards).all())
+    yield "probabilities of a pair must add up to 1", _sums_to_one(mdp.probability)
+    distribution = mdp.start.shape == shape[:1] and _sums_to_one(mdp.start)
+    yield "start must be a distribution over states", distribution
+    yield "the agents' actions must make the joint actions", math.prod(mdp.action_counts) == shape[1]
+    same = mdp.scene_cells is None or mdp.scene_carriers is None or _rows(mdp.scene_cells) == shape[0]
+    yield (
+        "the scene's arrays must have a row a state",
+        same and (_rows(mdp.scene_cells) == _rows(mdp.scene_carriers)),
+    )
+
+
+def _distinct(names: tuple[Any, ...]) -> bool:
+    return all(map(is_text, names)) and len(set(names)) == len(names)
+
+
+def _is_array(array: Any, kind: Any) -> bool:
+    return isinstance(array, np.ndarray) and array.dtype == kind
 
 
 def _within(values: NDArray[Any], low: int, high: int) -> bool:
@@ -301,12 +336,15 @@ def _within(values: NDArray[Any], low: int, high: int) -> bool:
 
 
 def _rows(array: NDArray[Any] | None) -> int | None:
-    return None if array is None else len(array)
+    return None if array is None or not array.ndim else len(array)
 
 
 def _sums_to_one(probability: NDArray[np.float64]) -> bool:
-    total = probability.sum(axis=-1)
-    return bool((probability >= 0).all() and np.allclose(total, 1.0, atol=1e-9))
+    """Return whether the last axis adds up to 1, as well as decimal fractions can."""
+    if not probability.size or not (probability >= 0).all():
+        return False
+    total = np.asarray(probability.sum(axis=-1))
+    return bool(total.min() >= 1 - 1e-5 and total.max() <= 1 + 1e-5)
 
 
 def description_bytes(mdp: Mdp) -> bytes:

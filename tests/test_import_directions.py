@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = """
     errors
     config
-    job toy_text
+    job toy_text scene
     mdp
     words learning recording
     provenance runs

@@ -12,9 +12,8 @@ import zstandard
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
+from runner.mdp import MAX_ARRAYS_BYTES
 
-MAX_ARRAYS_BYTES: Final = 128 << 20
-"""The most that all arrays of an environment may take, unpacked."""
 _MAX_WINDOW: Final = 1 << 27
 _HEAD_BYTES: Final = 1024
 _HEAD: Final = re.compile(

@@ -9,9 +9,9 @@ from typing import Any, Final
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.mdp import MAX_AGENTS, MAX_EVENTS, Mdp, from_parts
+from runner.mdp import MAX_AGENTS, MAX_ARRAYS_BYTES, MAX_EVENTS, Mdp, from_parts
 from runner.recording import schema
-from runner.recording.arrays import MAX_ARRAYS_BYTES, unpack_array
+from runner.recording.arrays import unpack_array
 from runner.recording.contents import MAX_METADATA_BYTES
 from runner.recording.index import Index
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -23,6 +24,7 @@ from runner.recording.contents import Contents, survey
 from runner.recording.writer import RecordingFile, schema_and_channel_bytes
 
 Times = NDArray[np.uint64]
+_schemas_and_channels = cache(schema_and_channel_bytes)
 _BLOCK_CHANNELS = {topic.channel for topic in schema.BLOCK_TOPICS}
 
 
@@ -71,7 +73,7 @@ def _check_beginning(stream: BinaryIO, path: Path) -> None:
     if start[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
         raise RecordingError(f"{path}: found {start[:8]!r} at 0, expected the MCAP magic.")
     opcode, length = struct.unpack("<BQ", start[len(MCAP0_MAGIC) :].ljust(9, b"\0"))
-    expected = schema_and_channel_bytes()
+    expected = _schemas_and_channels()
     stream.seek(len(MCAP0_MAGIC) + 9 + min(length, 4096))
     if opcode != Opcode.HEADER or stream.read(len(expected)) != expected:
         raise RecordingError(f"{path}: found other schemas or channels than every recording begins with.")

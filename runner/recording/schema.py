@@ -35,7 +35,7 @@ class Field:
     repeated: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MessageType:
     """A protobuf message, with its fields in the order they are written."""
 
@@ -49,7 +49,7 @@ class MessageType:
         return f"{self.package}.{self.name}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Topic:
     """A topic of the recording; its channel and schema ids are the same in every recording."""
 
