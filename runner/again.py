@@ -10,6 +10,7 @@ import numpy as np
 
 from runner import runs
 from runner.analysis.tables import last_step, tables_at
+from runner.api import unless_empty
 from runner.config import ExperimentConfig, from_mapping
 from runner.errors import Diverged, RunnerError, StorageError
 from runner.execution import Report, Session, Stop, describe, recorder_for, run_job, write_result
@@ -97,8 +98,9 @@ def evaluate(
         RunnerError: the table cannot be had, or the new run not be recorded.
     """
     config = evaluation_of(run, recordings, step, trials, start, seed)
-    job = Job(config, seed)
-    return run_job(job, runs.create_run(recordings, config, seed), report, stop)
+    fresh = runs.create_run(recordings, config, seed)
+    with unless_empty(fresh):
+        return run_job(Job(config, seed), fresh, report, stop)
 
 
 def evaluation_of(
