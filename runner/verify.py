@@ -104,7 +104,11 @@ def refuse_foreign(path: Path) -> None:
             start = stream.read(4096)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
-    if not start.startswith(MCAP0_MAGIC[: max(len(start), 1)]):
+    if not start:
+        raise RecordingError(
+            f"{path}: found an empty file, expected a recording; `dualtaxi resume` begins it."
+        )
+    if not start.startswith(MCAP0_MAGIC[: len(start)]):
         raise RecordingError(
             f"{path}: found {start[:8]!r} at its start, expected an MCAP file: not a dualtaxi recording."
         )

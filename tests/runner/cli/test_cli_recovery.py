@@ -1,0 +1,327 @@
+"""The commands for runs that stopped, were damaged, or are looked at more closely."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from runner.analysis.tables import tables_at
+from runner.recording import open as open_recording
+from runner.recording import schema
+from runner.recording.contents import survey
+from runner.runs import Run, list_runs
+from tests.runner.altering import altered
+
+COMMANDS = ("resume", "rerecord", "evaluate", "verify", "repair", "qtable")
+
+
+@pytest.fixture
+def copied(recorded_run, command) -> Run:
+    """A copy of the recorded run, alone in the command's folder, to be changed."""
+    shutil.copytree(recorded_run.folder, command.recordings / recorded_run.run_id)
+    (run,) = list_runs(command.recordings)
+    return run
+
+
+def cut(run: Run, share: float = 0.95) -> Run:
+    """Return a run as a kill leaves it."""
+    os.truncate(run.recording, int(share * run.recording.stat().st_size))
+    return run.update(status="running", owner={"host": "gone"}, summary={}) and _aged(run)
+
+
+def _aged(run: Run) -> Run:
+    os.utime(run.folder / "run.json", (0, 0))
+    return run
+
+
+def flip(path: Path) -> None:
+    """Turn a byte around in the first chunk of training steps."""
+    index = next(one.index for one in survey(path).chunks if one.channel == schema.TRAIN_STEP.channel)
+    data = bytearray(path.read_bytes())
+    data[index.chunk_start_offset + index.chunk_length // 2] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_what_is_not_there(command, name):
+    for missing in ("nothing", "nothing.mcap", "@latest", "some/where"):
+        result = command(name, missing)
+        assert result.exit_code == 2
+        assert result.stderr.startswith("Error: ")
+        assert not result.stdout
+
+
+@pytest.mark.parametrize("name", ["verify", "repair", "qtable"])
+def test_another_writers_file(command, tmp_path, name):
+    path = tmp_path / "other.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.finish()
+    before = path.read_bytes()
+    result = command(name, path)
+    assert result.exit_code == 2
+    assert "not a dualtaxi recording" in result.stderr
+    assert path.read_bytes() == before
+
+
+# --- resume -----------------------------------------------------------------------------------------------
+
+
+def test_resume(command, copied, recorded_run):
+    cut(copied)
+    assert command.json("ls")[0]["status"] == "interrupted"
+    told = command.json("resume", "@latest")
+    assert told["status"] == "finished"
+    assert told["content_digest"] == recorded_run.summary["content_digest"]
+    assert command.json("ls")[0]["status"] == "finished"
+
+
+def test_resume_in_words(command, copied):
+    cut(copied)
+    result = command("resume", copied.run_id[:4])
+    assert result.exit_code == 0
+    assert "finished" in result.stdout
+    assert f"dualtaxi show {copied.run_id}" in result.stdout
+    assert not result.stderr
+
+
+def test_nothing_to_resume(command, copied):
+    before = copied.recording.read_bytes()
+    result = command("resume", "@latest")
+    assert result.exit_code == 0
+    assert "there is nothing to do" in result.stderr
+    assert not result.stdout
+    assert command.json("resume", "@latest")["status"] == "finished"
+    assert copied.recording.read_bytes() == before
+
+
+def test_resume_refuses_a_living_run(command, copied):
+    from runner.runs import owner
+
+    copied.update(status="running", owner=owner())
+    for name in ("resume", "verify", "repair", "rerecord"):
+        result = command(name, "@latest")
+        assert result.exit_code == 2
+        assert "is running" in result.stderr
+
+
+def test_accepted_changes(command, copied, monkeypatch):
+    from runner import verify
+
+    here = verify.provenance()
+    monkeypatch.setattr(verify, "provenance", lambda: here | {"dualtaxi": "9.9"})
+    cut(copied)
+    result = command("resume", "@latest")
+    assert result.exit_code == 2
+    assert "9.9 now" in result.stderr
+    assert "--accept-changes" in result.stderr
+    assert command.json("ls")[0]["status"] == "interrupted"
+    assert command("resume", "@latest", "--accept-changes").exit_code == 0
+
+
+# --- verify -----------------------------------------------------------------------------------------------
+
+
+def test_verify(recorded, recorded_run):
+    for name in ("@latest", recorded_run.name, recorded_run.folder, recorded_run.recording):
+        told = recorded.json("verify", name)
+        assert told["verdict"] == "sound"
+        assert told["content_digest"] == recorded_run.summary["content_digest"]
+    result = recorded("verify", "@latest", "--rerun")
+    assert result.exit_code == 0
+    assert "identical" in result.stdout
+    assert not result.stderr
+
+
+def test_verify_names_what_is_wrong(command, copied, tmp_path):
+    def change(records):
+        records["rewards"][50] = 12.5
+        return records
+
+    path = altered(copied.recording, tmp_path / "x.mcap", schema.TRAIN_STEP, change)
+    result = command("verify", path, "--json")
+    assert result.exit_code == 1
+    told = json.loads(result.stdout)
+    assert told["verdict"] == "wrong"
+    assert told["difference"] | {"expected": None} == {
+        "topic": "/train/step",
+        "episode": 1,
+        "step": 50,
+        "field": "rewards",
+        "found": [12.5, 12.5],
+        "expected": None,
+    }
+    result = command("verify", path, "--rerun")
+    assert result.exit_code == 1
+    assert "diverged at step 50" in result.stdout
+    assert "/train/step, episode 1, step 50: rewards: found [12.5, 12.5], expected [" in result.stdout
+
+
+# --- repair -----------------------------------------------------------------------------------------------
+
+
+def test_repair_of_a_killed_run(command, copied):
+    cut(copied)
+    result = command("repair", "@latest", "--json")
+    assert result.exit_code == 1  # what was being written is gone
+    told = json.loads(result.stdout)
+    assert not told["lossless"]
+    assert not told["lost"]
+    assert told["lost_bytes"] > 0
+    with copied.recording.open("rb") as stream:
+        summary = make_reader(stream, validate_crcs=True).get_summary()
+    assert sum(told["kept"].values()) == summary.statistics.message_count
+    assert command("repair", "@latest").exit_code == 0
+    assert "nothing to do" in command("repair", "@latest").stdout
+    assert command("verify", "@latest").exit_code == 0
+    assert command("resume", "@latest").exit_code == 0
+
+
+def test_repair_tells_what_was_lost_and_resume_brings_it_back(command, copied, recorded_run):
+    flip(copied.recording)
+    damaged = copied.recording.read_bytes()
+    result = command("repair", copied.run_id)
+    assert result.exit_code == 1
+    assert "training steps 0 to " in result.stdout
+    assert f"dualtaxi resume {copied.run_id}" in result.stdout
+    (kept,) = copied.folder.glob("*.damaged-1.mcap")
+    assert kept.read_bytes() == damaged
+    assert command.json("ls")[0]["status"] == "interrupted"
+    assert command("show", copied.run_id).exit_code == 0
+    assert command("verify", copied.run_id).exit_code == 1
+    assert command("qtable", copied.run_id, "--step", 5).exit_code == 2
+    told = command.json("resume", copied.run_id)
+    assert told["content_digest"] == recorded_run.summary["content_digest"]
+    assert command("verify", copied.run_id).exit_code == 0
+
+
+def test_repair_by_path_when_nothing_opens(command, copied, tmp_path):
+    path = tmp_path / "alone.mcap"
+    data = bytearray(copied.recording.read_bytes())
+    data[-40] ^= 1  # the summary's checksum
+    path.write_bytes(data)
+    assert command("qtable", path).exit_code == 2
+    assert command("verify", path).exit_code == 1
+    told = command.json("repair", path)
+    assert told["lossless"]
+    assert command("verify", path).exit_code == 0
+    assert {one.name for one in tmp_path.iterdir()} == {"alone.mcap", "recordings"}
+    (copied.folder / "run.json").unlink()
+    copied.recording.write_bytes(data)
+    assert command("repair", copied.run_id).exit_code == 0
+    assert command("verify", copied.run_id).exit_code == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"hello"])
+def test_what_cannot_be_repaired_stays(command, tmp_path, content):
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    result = command("repair", path)
+    assert result.exit_code == 2
+    assert result.stderr.startswith("Error: ")
+    assert path.read_bytes() == content
+    assert [one.name for one in tmp_path.iterdir()] == ["x.mcap"]
+
+
+# --- qtable -----------------------------------------------------------------------------------------------
+
+
+def test_qtable(recorded, recorded_run, tmp_path):
+    out = tmp_path / "table.npy"
+    result = recorded("qtable", recorded_run.recording, "--step", 300, "--out", out)
+    assert result.exit_code == 0
+    assert "after 300 training steps" in result.stdout
+    with open_recording(recorded_run.recording) as recording:
+        expected = tables_at(recording, 300)
+        assert np.load(out).tobytes() == np.array(expected).tobytes()
+        ended = int(recording.episodes("train", 9, 10)[0]["last_step"]) + 1
+    assert recorded.json("qtable", "@latest", "--episode", 10)["step"] == ended
+    assert recorded.json("qtable", "@latest")["step"] == recorded_run.summary["train_steps"]
+
+
+def test_qtable_of_a_state(recorded, recorded_run):
+    with open_recording(recorded_run.recording) as recording:
+        step = next(recording.blocks(schema.TRAIN_STEP))[0]
+        state, action = int(step["state"]), int(step["action"])
+    told = recorded.json("qtable", "@latest", "--state", state, "--step", 1)
+    assert told["visits"] == 1
+    assert "taxi 1" in told["state_in_words"]
+    assert [one["agent"] for one in told["values"]] == ["taxi_1"] * 6 + ["taxi_2"] * 6
+    visited = [one for one in told["values"] if one["visits"]]
+    assert [one["action"] for one in visited] == [action // 6, action % 6]
+    assert all(one["changed_step"] in (0, None) for one in told["values"])
+    assert sum(one["greedy"] for one in told["values"]) == 2
+    result = recorded("qtable", "@latest", "--state", state)
+    assert "drop-off" in result.stdout
+    assert "greedy" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--step", 10**9), "expected at least 1000000000"),
+        (("--episode", 31), "found 30 training episodes"),
+        (("--state", 10**7), "--state: found 10000000"),
+        (("--step", 1, "--episode", 1), "choose one"),
+        (("--step", -1), "-1"),
+        (("--out", "/nowhere/table.npy"), "cannot be written"),
+    ],
+)
+def test_qtable_of_what_is_not_there(recorded, words, told):
+    result = recorded("qtable", "@latest", *words)
+    assert result.exit_code == (1 if "--out" in words else 2)
+    assert told in result.stderr
+    assert not result.stdout
+
+
+# --- evaluate and rerecord ---------------------------------------------------------------------------------
+
+
+def test_evaluate(command, copied):
+    told = command.json("evaluate", copied.run_id, "--step", 200, "--trials", 7, "--seed", 5)
+    assert told["origin"] == {"run": copied.run_id, "step": 200}
+    assert told["episodes"] == 0
+    assert told["seed"] == 5
+    assert command.json("verify", told["run_id"])["verdict"] == "sound"
+    assert command("play", told["run_id"], "--eval", "0:6").exit_code == 0
+    result = command("evaluate", copied.run_id, "--trials", 3)
+    assert f"of run {copied.run_id} after {copied.summary['train_steps']:,} training steps" in result.stdout
+    assert len(list_runs(command.recordings)) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--all", "--trials", 3), "--all plays each start state once"),
+        (("--step", 10**9), "expected at least"),
+        (("--start", 10**7), "evaluation.start"),
+        (("--seed", -1), "-1"),
+    ],
+)
+def test_what_cannot_be_evaluated(command, copied, words, told):
+    result = command("evaluate", copied.run_id, *words)
+    assert result.exit_code == 2
+    assert told in result.stderr
+    assert len(list_runs(command.recordings)) == 1
+
+
+def test_rerecord(command, tiny):
+    before = command.json("run", tiny, "--set", "recording.steps=none")
+    refused = command("qtable", "@latest", "--step", 5)
+    assert refused.exit_code == 2
+    assert "`dualtaxi rerecord`" in refused.stderr
+    told = command.json("rerecord", "@latest")
+    assert told["content_digest"] == before["content_digest"]
+    assert told["bytes"] > before["bytes"]
+    assert command("play", "@latest").exit_code == 0
+    again = command("rerecord", "@latest")
+    assert again.exit_code == 0
+    assert "nothing to do" in again.stderr
