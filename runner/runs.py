@@ -81,6 +81,12 @@ class Run:
         said = str(self.facts["status"])
         return "interrupted" if said == "running" and not self._owner_lives() else said
 
+    def _repr_html_(self) -> str:
+        """Return how the run shows itself in a notebook."""
+        from runner.notebook import run_html
+
+        return run_html(self)
+
     def _owner_lives(self) -> bool:
         owner = self.facts.get("owner", {})
         if owner.get("host") == socket.gethostname() and owner.get("boot_id") == boot_id():
