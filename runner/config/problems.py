@@ -16,6 +16,8 @@ from runner.errors import ConfigError, nearest
 _LONGEST = 60
 _MOST = 200
 _UNKNOWN = "extra_forbidden"
+_FOLLOWS = "default_factory_not_called"
+"""A default that depends on another value, which is wrong: that one is told."""
 _BRANCHES = frozenset(
     ("number", "array", "Linear", "Exponential", "Piecewise", "RandomTable", "RunTable", "SeedRange")
 )
@@ -29,6 +31,8 @@ def problems_in(error: ValidationError, value: object) -> list[Problem]:
     unknown = [path for path, detail in zip(paths, details, strict=True) if detail["type"] == _UNKNOWN]
     problems = []
     for path, detail in zip(paths, details, strict=True):
+        if detail["type"] == _FOLLOWS:
+            continue
         if detail["type"] == "missing" and any(_meant(path, other) for other in unknown):
             continue
         if detail["type"] == "too_short" and any(other[:-1] == path for other in paths if other):

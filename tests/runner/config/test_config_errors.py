@@ -384,3 +384,9 @@ def test_a_flood_of_problems_is_counted_instead_of_listed(told):
 def test_trials_start_at_random_in_each_or_in_one_state(told, value):
     (line,) = told(f"episodes: 1\nevaluation: {{every: 1, trials: 1, start: {value}}}")
     assert line.endswith("expected 'random', 'each', or a state's number from 0")
+
+
+def test_a_wrong_value_is_told_though_a_default_depends_on_it(told):
+    assert told("episodes: 1\nrecording: {compression: brotli}") == [
+        "2:13: recording.compression: found 'brotli', expected 'zstd', 'lz4' or 'none'"
+    ]
