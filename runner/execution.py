@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runner import runs
 from runner.config.model import RunTable
@@ -19,6 +20,7 @@ from runner.errors import Diverged, RunnerError, StorageError
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import Mdp, description_bytes, load_mdp
+from runner.observer import Observer
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.arrays import pack_array
@@ -50,7 +52,13 @@ Report = Callable[[Progress], None]
 Stop = Callable[[], bool]
 
 
-def run_job(job: Job, run: Run, report: Report = lambda _: None, stop: Stop = lambda: False) -> Run:
+def run_job(
+    job: Job,
+    run: Run,
+    report: Report = lambda _: None,
+    stop: Stop = lambda: False,
+    observer: Observer | None = None,
+) -> Run:
     """Train, evaluate and record a job; return its run, finished or interrupted.
 
     Args:
@@ -59,6 +67,7 @@ def run_job(job: Job, run: Run, report: Report = lambda _: None, stop: Stop = la
         report: called with the progress a few times a second, and after every evaluation.
         stop: asked every few milliseconds; when it says True the recording is closed properly and the
             run is marked interrupted.
+        observer: shown every step and metric as they come.
 
     Raises:
         RunnerError: the environment cannot be used, or the disk is full; the run is then marked failed.
@@ -72,7 +81,7 @@ def run_job(job: Job, run: Run, report: Report = lambda _: None, stop: Stop = la
         with _failing(run):
             describe(file, job, run, learner)
         recorder = recorder_for(job, learner, file, beat=run.beat)
-        return execute(Session(job, learner, recorder, report, stop), file, run, started)
+        return execute(Session(job, learner, recorder, report, stop, observer), file, run, started)
 
 
 def execute(session: Session, file: RecordingFile, run: Run, started: float) -> Run:
@@ -131,8 +140,10 @@ class Session:
         recorder: Recorder,
         report: Report = lambda _: None,
         stop: Stop = lambda: False,
+        observer: Observer | None = None,
     ) -> None:
         self._config = job.config
+        self._observer = observer
         self._learner = learner
         self.recorder = recorder
         self._report = report
@@ -190,16 +201,12 @@ class Session:
             if self._stop():
                 return False
             next_log = (learner.step // every + 1) * every
-            steps, episodes = learner.train(
-                recorder.block(schema.TRAIN_STEP),
-                recorder.block(schema.TRAIN_EPISODE),
-                until_episode,
-                next_log,
-            )
+            records, ends = recorder.block(schema.TRAIN_STEP), recorder.block(schema.TRAIN_EPISODE)
+            steps, episodes = learner.train(records, ends, until_episode, next_log)
+            self._show("train", records[:steps])
             recorder.commit("train", steps, episodes)
             if learner.step == next_log:
-                metrics = encode(schema.TRAIN_METRICS, learner.training_side())
-                recorder.message(schema.TRAIN_METRICS_TOPIC, metrics)
+                self._measure("train", schema.TRAIN_METRICS_TOPIC, learner.training_side())
             self._tell()
         return True
 
@@ -216,18 +223,31 @@ class Session:
             if self._stop():
                 return False
             records = recorder.block(schema.EVAL_EPISODE)
-            steps, ended = learner.evaluate(recorder.block(schema.EVAL_STEP), records, first + plan.trials)
+            played = recorder.block(schema.EVAL_STEP)
+            steps, ended = learner.evaluate(played, records, first + plan.trials)
+            self._show("eval", played[:steps])
             trials.append(records[:ended].copy())
             recorder.commit("eval", steps, ended)
             done += ended
             self._tell()
         metrics = evaluation_metrics(learner, self._evaluated, np.concatenate(trials))
-        recorder.message(schema.EVAL_METRICS_TOPIC, encode(schema.EVAL_METRICS, metrics))
+        self._measure("eval", schema.EVAL_METRICS_TOPIC, metrics)
         self._evaluated += 1
         self._progress.evaluations.append(metrics)
         self._log(f"evaluation after {episode} episodes: {metrics['finish_percent']:.1f} % finished")
         self._tell(now=True)
         return True
+
+    def _show(self, phase: str, steps: NDArray[np.void]) -> None:
+        """Show the observer steps that are not committed yet."""
+        if self._observer is not None:
+            self._observer.steps(phase, sum(self.recorder.steps.values()), steps)
+
+    def _measure(self, phase: str, topic: schema.Topic, metrics: dict[str, Any]) -> None:
+        """Record metrics, and show them to the observer."""
+        self.recorder.message(topic, encode(topic.message, metrics))
+        if self._observer is not None:
+            self._observer.metrics(phase, sum(self.recorder.steps.values()), metrics)
 
     def _snapshot_is_due(self, episode: int) -> bool:
         every = self._config.snapshots.every

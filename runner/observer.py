@@ -1,0 +1,18 @@
+"""Who sees what a run does while it does it."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Observer(Protocol):
+    """Is shown every step and metric as they come; must return at once, and copy what it keeps."""
+
+    def steps(self, phase: str, before: int, steps: NDArray[np.void]) -> None:
+        """See new steps of a phase; `before` steps of both phases were executed before the first."""
+
+    def metrics(self, phase: str, time: int, metrics: dict[str, Any]) -> None:
+        """See new metrics of a phase, after `time` steps of both."""
