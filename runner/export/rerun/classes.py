@@ -14,7 +14,16 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.export.rerun.scene import BAD_COLOUR, INK, MOVER_COLOURS, PASSENGER_COLOUR, Marks, agent_label
+from runner.export.rerun.scene import (
+    BAD_COLOUR,
+    INK,
+    MOVER_COLOURS,
+    PASSENGER_COLOUR,
+    Marks,
+    Scene,
+    agent_label,
+)
+from runner.mdp import Mdp
 
 MOST_CLASSES: Final = 60_000
 MOST_REWARDS: Final = 2_000
@@ -92,42 +101,34 @@ class Levels:
         return np.asarray(self.first + level.clip(0, self.count - 1), np.uint16)
 
 
-def vocabulary(
+def vocabulary_of(
+    mdp: Mdp,
+    scene: Scene | None,
     marks: Marks | None,
-    passengers: Sequence[str],
-    step_limit: int,
     learners: Sequence[str],
-    rewards: Sequence[NDArray[np.float64]],
     value_range: tuple[float, float],
 ) -> Vocabulary:
-    """Return every label of a run.
-
-    Args:
-        marks: of the scene's movers, if there is a scene.
-        passengers: labels of the things drawn after the movers.
-        step_limit: of the environment; 0 for none.
-        learners: whose rewards they are.
-        rewards: all rewards that each of them can get.
-        value_range: of the tables.
-    """
+    """Return every label of a run; `value_range` is that of its tables."""
     classes = Classes()
     mark = classes.add(marks.labels, marks.colours) if marks else 0
-    passenger = classes.add(passengers, PASSENGER_COLOUR)
+    things = scene.description["things"] if scene else []
+    waiting = [things[thing]["label"] for thing in scene.passengers] if scene else []
+    passenger = classes.add(waiting, PASSENGER_COLOUR)
     riding = classes.add([""], PASSENGER_COLOUR)
-    longest = min(step_limit or MOST_T, MOST_T)
+    longest = min(mdp.step_limit or MOST_T, MOST_T)
     t = classes.add([f"t = {k}" for k in range(longest)] + [f"t ≥ {longest}"])
+    rewards = mdp.rewards_of(len(learners))
     told = []
-    for i, (learner, known) in enumerate(zip(learners, rewards, strict=True)):
-        distinct = np.unique(known)
+    for i, learner in enumerate(learners):
+        distinct = np.unique(rewards[..., i])
         whose = f" of {agent_label(learner)}" if len(learners) > 1 else ""
         if len(distinct) <= MOST_REWARDS:
             colour = MOVER_COLOURS[i % len(MOVER_COLOURS)] if whose else INK
             told.append((classes.add([f"reward{whose} {_signed(r)}" for r in distinct], colour), distinct))
     greedy = classes.add([""], INK)
     chosen = classes.add(["greedy", "explored", "explored"], ["#009E73", BAD_COLOUR, BAD_COLOUR])
-    return Vocabulary(
-        classes, mark, passenger, riding, t, tuple(told), _levels(classes, value_range), greedy, chosen
-    )
+    levels = _levels(classes, value_range)
+    return Vocabulary(classes, mark, passenger, riding, t, tuple(told), levels, greedy, chosen)
 
 
 def _levels(classes: Classes, value_range: tuple[float, float]) -> Levels:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -39,12 +39,14 @@ class Shown:
     steps: bool
     """Whether any steps are exported."""
     last: int
-    """Steps executed in the whole run."""
-    paths: frozenset[str]
-    """Metrics that there are."""
+    """Steps executed in the whole run; 0 if that is not known yet."""
+    paths: frozenset[str] | None
+    """Metrics that there are; None if that is not known yet."""
+    values: bool = True
+    """Whether values of the tables are exported."""
 
 
-def blueprint(runs: Sequence[Shown]) -> rrb.Blueprint:
+def blueprint(runs: Sequence[Shown], play_state: Literal["paused", "following"] = "paused") -> rrb.Blueprint:
     """Return the arrangement for one run, or for several side by side."""
     last = max(run.last for run in runs)
     plots = _plots(runs, last)
@@ -52,7 +54,7 @@ def blueprint(runs: Sequence[Shown]) -> rrb.Blueprint:
     body: Any
     if len(runs) == 1:
         parts = [*(_single(with_steps[0]) if with_steps else ()), rrb.Grid(*plots, grid_columns=2)]
-        shares = [4, 3, 4] if len(parts) == 3 else [1] * len(parts)
+        shares = {3: [4, 3, 4], 2: [4, 5]}.get(len(parts), [1])
         body = rrb.Horizontal(*parts, column_shares=shares)
     else:
         halves = [rrb.Horizontal(*_half(run), name=run.title) for run in with_steps]
@@ -61,7 +63,7 @@ def blueprint(runs: Sequence[Shown]) -> rrb.Blueprint:
         body = rrb.Vertical(rrb.Horizontal(*halves), below, row_shares=[7, 3]) if halves else below
     return rrb.Blueprint(
         body,
-        rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_A_SECOND),
+        rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_A_SECOND, play_state=play_state),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
@@ -70,6 +72,8 @@ def blueprint(runs: Sequence[Shown]) -> rrb.Blueprint:
 
 def _single(run: Shown) -> list[Any]:
     left = rrb.Vertical(_grid(run), _events(run), row_shares=[3, 1])
+    if not run.values:
+        return [left]
     maps = _maps(run)
     if not maps:
         return [left, _values(run)]
@@ -144,14 +148,16 @@ def _events(run: Shown) -> Any:
 
 
 def _plots(runs: Sequence[Shown], last: int) -> list[Any]:
-    axis = rrb.TimeAxis(
-        view_range=rr.TimeRange(
-            start=rr.TimeRangeBoundary.absolute(seq=0), end=rr.TimeRangeBoundary.absolute(seq=last)
-        )
+    whole = rr.TimeRange(
+        start=rr.TimeRangeBoundary.absolute(seq=0),
+        end=rr.TimeRangeBoundary.absolute(seq=last) if last else rr.TimeRangeBoundary.cursor_relative(seq=0),
     )
+    axis = rrb.TimeAxis(view_range=whole)
     views = []
     for name, paths in _PLOTS:
-        contents = [f"{run.root}/{path}" for run in runs for path in paths if path in run.paths]
+        contents = [
+            f"{run.root}/{path}" for run in runs for path in paths if run.paths is None or path in run.paths
+        ]
         if contents:
             views.append(
                 rrb.TimeSeriesView(
@@ -167,7 +173,7 @@ def _plots(runs: Sequence[Shown], last: int) -> list[Any]:
 
 def draw_background(stream: rr.RecordingStream, run: Shown) -> None:
     """Log what never changes: cells, walls, landmarks, and the frame of the table of values."""
-    if run.steps:
+    if run.steps and run.values:
         draw_table(stream, f"{run.root}/table/words", run.mdp)
     if run.scene is not None and run.steps:
         _draw_scene(stream, f"{run.root}/scene", run.scene)

@@ -42,6 +42,14 @@ class Thoughts:
     """[k, learners, pixels]: the learner's greedy action there; -1 where there is none."""
 
 
+def no_thoughts() -> Thoughts:
+    """Return the thoughts of who was not asked."""
+    none = np.empty(0, np.int64)
+    return Thoughts(
+        np.empty((0, 0)), none[:, None], none, np.empty((0, 0, 0), np.float32), np.empty((0, 0, 0), np.int32)
+    )
+
+
 class Thinker:
     """Follows the tables of a recorded run."""
 

@@ -13,8 +13,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.errors import StorageError
-from runner.export.rerun.classes import Vocabulary, vocabulary
-from runner.export.rerun.columns import Batch
+from runner.export.rerun.classes import Vocabulary, vocabulary_of
+from runner.export.rerun.columns import Batch, Sender, ink, instances, place, texts
 from runner.export.rerun.layout import Shown, blueprint, draw_background
 from runner.export.rerun.metrics import MetricWriter, send_metrics
 from runner.export.rerun.scene import TRAIL_STEPS, Marks, Scene, marks_of, scene_of
@@ -53,13 +53,7 @@ def export(sources: Sequence[Source], request: Request, path: Path) -> list[Sele
     """
     selections = [select(source.recording, request) for source in sources]
     fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    stream = rr.RecordingStream(
-        APPLICATION,
-        recording_id="-".join(source.recording.run["run_id"] for source in sources),
-        send_properties=True,
-    )
-    stream.set_log_time_enabled(False)
-    stream.set_log_tick_enabled(False)
+    stream = new_stream("-".join(source.recording.run["run_id"] for source in sources))
     exporters = [
         RunExporter(stream, source, selection) for source, selection in zip(sources, selections, strict=True)
     ]
@@ -76,6 +70,14 @@ def export(sources: Sequence[Source], request: Request, path: Path) -> list[Sele
     finally:
         fresh.unlink(missing_ok=True)
     return selections
+
+
+def new_stream(recording_id: str) -> rr.RecordingStream:
+    """Return a stream that has no other timelines than ours."""
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    return stream
 
 
 class RunExporter:
@@ -120,28 +122,26 @@ class RunExporter:
         self._stream.log(f"{source.root}/", rr.AnnotationContext(words.classes.context()), static=True)
         draw_background(self._stream, self.shown)
         thinker = Thinker(self._recording, self._scene.placements if self._scene else None)
-        ends = {phase: self._send_phase(phase, words, thinker) for phase in ("train", "eval")}
-        self._send_notice(ends)
+        covered = {phase: self._send_phase(phase, words, thinker) for phase in ("train", "eval")}
+        self._send_notice(sorted(covered["train"] + covered["eval"]))
 
     def _send_phase(self, phase: str, words: Vocabulary, thinker: Thinker) -> list[tuple[int, int]]:
         """Send the steps of a phase; return the stretches of time that they cover."""
         pieces = self._training(thinker) if phase == "train" else self._evaluating(thinker)
-        mdp = self._recording.mdp
         path = f"{self._source.root}/{phase}"
+        mdp, covered = self._recording.mdp, list[tuple[int, int]]()
         writer = StepWriter(self._stream, path, phase, mdp, self._scene, self._marks, words, self._learners)
-        dressed = False
-        covered: list[tuple[int, int]] = []
         for batch in _batches(pieces):
-            if not dressed:
+            if not covered:
                 writer.dress()
-                dressed = True
             writer.write(batch)
             self._sent += 1
             if self._sent % BATCHES_WAITING == 0:
                 self._stream.flush()
             _cover(covered, batch.time)
-        if covered:
-            writer.end(stop for _, stop in covered)
+        ends = [stop for _, stop in covered if stop <= self.shown.last]  # the run's last step stays in view
+        if ends:
+            writer.end(ends)
         return covered
 
     def _training(self, thinker: Thinker) -> Iterator[Piece]:
@@ -158,55 +158,35 @@ class RunExporter:
                     yield part, thinker.evaluating(part), np.full(len(part), evaluation.after, np.int64)
 
     def _vocabulary(self) -> Vocabulary:
-        mdp, scene = self._recording.mdp, self._scene
-        described = scene.description["things"] if scene else []
-        learners = len(self._learners)
-        rewards = mdp.rewards_of(learners)
+        """Return the labels of the run; numbers as fine as its tables ask for."""
         low = high = 0.0
         for snapshot in self._recording.snapshots():
             low, high = min(low, float(snapshot.values.min())), max(high, float(snapshot.values.max()))
-        return vocabulary(
-            self._marks,
-            [described[thing]["label"] for thing in scene.passengers] if scene else [],
-            mdp.step_limit,
-            self._learners,
-            [rewards[..., i] for i in range(learners)],
-            (low, high),
-        )
+        return vocabulary_of(self._recording.mdp, self._scene, self._marks, self._learners, (low, high))
 
-    def _send_notice(self, ends: dict[str, list[tuple[int, int]]]) -> None:
+    def _send_notice(self, covered: list[tuple[int, int]]) -> None:
         """Say in the grid, wherever no steps were exported, that there are none."""
         if self._scene is None:
             return
-        covered = sorted(ends["train"] + ends["eval"])
-        gaps, at = [], 0
-        for start, stop in covered:
-            if start > at + 1:
-                gaps.append((at, start))
-            at = max(at, stop)
-        gaps.append((at, 0))
-        place = [self._scene.columns / 2, self._scene.rows / 2]
-        labels = ["no steps exported here: see --episodes, --eval and --all"] * len(gaps)
-        path = f"{self._source.root}/notice"
-        self._stream.send_columns(
-            path,
-            [rr.TimeColumn("step", sequence=[start for start, _ in gaps])],
-            [
-                *rr.Points2D.columns(
-                    positions=[place] * len(gaps),
-                    labels=labels,
-                    radii=[0.0] * len(gaps),
-                    colors=[0x808080FF] * len(gaps),
-                )
-            ],
+        starts = [0, *(stop for _, stop in covered)]
+        stops = [*(start for start, _ in covered), self.shown.last + 1]
+        gaps = [
+            (start, stop) for start, stop in zip(starts, stops, strict=True) if start + (start == 0) < stop
+        ]
+        if not gaps:
+            return
+        n, path = len(gaps), f"{self._source.root}/notice"
+        columns = instances(
+            rr.Points2D,
+            n,
+            positions=place(n, self._scene.columns / 2, self._scene.rows / 2),
+            labels=texts(["no steps exported here: see --episodes, --eval and --all"] * n),
+            radii=np.zeros((n, 1), np.float32),
+            colors=ink(n),
         )
-        ends_of_gaps = [stop for _, stop in gaps if stop]
-        if ends_of_gaps:
-            self._stream.send_columns(
-                path,
-                [rr.TimeColumn("step", sequence=ends_of_gaps)],
-                rr.Clear.columns(is_recursive=[True] * len(ends_of_gaps)),
-            )
+        sender = Sender(self._stream, path)
+        sender.send("text", [rr.TimeColumn("step", sequence=[start for start, _ in gaps])], columns)
+        sender.clear("text", [stop for _, stop in gaps if stop <= self.shown.last])
 
 
 Piece = tuple[NDArray[np.void], Thoughts, NDArray[np.int64]]
