@@ -224,7 +224,8 @@ def _honest_axes(axes: Axes, panel: Panel) -> None:
 
     axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], integer=True))
     axes.xaxis.set_major_formatter(_number)
-    axes.yaxis.set_major_formatter(_brief_number)
+    largest = max(float(np.abs([curve.low, curve.high]).max()) for curve in panel.curves)
+    axes.yaxis.set_major_formatter(_thousands if largest >= 10_000 else _number)
     axes.set_xlim(left=0)
     if panel.percent:
         axes.set_ylim(0, 100 if panel.metric == SHARES else 103)
@@ -240,14 +241,15 @@ def _honest_axes(axes: Axes, panel: Panel) -> None:
 
 def _number(value: float, _: object = None) -> str:
     """Return a number as an axis shows it: `20,000`, `0.5`, `2.5M`."""
+    text = f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}"
     if abs(value) >= 1e6:
-        return f"{value / 1e6:g}M"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}".replace("-", "\N{MINUS SIGN}")
+        text = f"{value / 1e6:g}M"
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
-def _brief_number(value: float, _: object = None) -> str:
-    """Return a number where there is little room: `20k`."""
-    return f"{value / 1e3:g}k" if 1e4 <= abs(value) < 1e6 else _number(value)
+def _thousands(value: float, _: object = None) -> str:
+    """Return a large number where there is little room: `20k`."""
+    return f"{_number(value / 1e3)}k" if 0 < abs(value) < 1e6 else _number(value)
 
 
 def _has_legend(panel: Panel) -> bool:
