@@ -36,7 +36,7 @@ from typing import Any
 from mcap.reader import make_reader
 
 from runner.config import ExperimentConfig
-from runner.errors import RecordingError
+from runner.errors import RecordingError, RunnerError
 from runner.execution import run_job
 from runner.job import Job
 from runner.recording import open as open_recording
@@ -70,7 +70,7 @@ CONFIGS: dict[str, dict[str, Any]] = {
     },
 }
 SEEDS = (0, 1, 2)
-PAUSES = (0.0, 0.0, 0.004)
+PAUSES = (0.0, 0.01, 0.02)
 """Seconds that a process sleeps after each block: none, and enough that blocks are flushed by the clock."""
 MAX_KILLS_A_RUN = 4
 _COMMITTED = struct.Struct("<dq")
@@ -84,7 +84,13 @@ class Whole:
     seed: int
     digest: str
     seconds: float
+    commits: int
+    """How often blocks were committed: what a pause after each of them is multiplied by."""
     messages: dict[str, bytes]
+
+    def takes(self, pause: float) -> float:
+        """Return about how many seconds a run takes with this pause."""
+        return self.seconds + self.commits * pause
 
 
 @dataclass
@@ -142,13 +148,13 @@ def kill_one(folder: Path, rng: random.Random, tally: Tally) -> None:
     whole = whole_run(rng.choice(sorted(CONFIGS)), rng.choice(SEEDS))
     pause = rng.choice(PAUSES)
     tally.runs += 1
-    killed = kill(folder, lambda: begin(folder, whole), pause, whole.seconds, rng)
+    killed = kill(folder, lambda: begin(folder, whole), pause, whole.takes(pause), rng)
     for _ in range(rng.choice((0, 0, 0, 1, MAX_KILLS_A_RUN - 1))):
         look(folder, whole, tally, killed)
         runs = list_runs(folder)
         if not runs or runs[0].status == "finished":
             return _finish(folder, whole, tally, rng)
-        killed = kill(folder, lambda: resume(list_runs(folder)[0], True), pause, whole.seconds, rng)
+        killed = kill(folder, lambda: resume_soon(list_runs(folder)[0]), pause, whole.takes(pause), rng)
     look(folder, whole, tally, killed)
     return _finish(folder, whole, tally, rng)
 
@@ -158,8 +164,7 @@ def _finish(folder: Path, whole: Whole, tally: Tally, rng: random.Random) -> Non
     runs = list_runs(folder)
     if not runs:  # killed before it had said what it is
         return
-    # the code may have been committed meanwhile: every recorded step is compared all the same
-    run = runs[0] if runs[0].status == "finished" else resume(runs[0], accept_changes=True)
+    run = runs[0] if runs[0].status == "finished" else resume_soon(runs[0])
     assert find_run(run.run_id, folder).status == "finished"
     verification = verify(run.recording)
     assert verification.sound, verification.finding
@@ -171,19 +176,44 @@ def _finish(folder: Path, whole: Whole, tally: Tally, rng: random.Random) -> Non
         check_by_rerun(run.recording)
 
 
+def resume_soon(run: Run) -> Run:
+    """Resume a run, when nothing that the killed process had started holds its folder any more.
+
+    The code may have been committed meanwhile: every recorded step is compared all the same.
+    """
+    until = time.monotonic() + 10
+    while True:
+        try:
+            return resume(run, accept_changes=True)
+        except RunnerError as error:
+            if "another process" not in str(error) or time.monotonic() > until:
+                raise
+        time.sleep(0.01)
+
+
 @cache
 def whole_run(name: str, seed: int) -> Whole:
     """Return a run of a configuration and seed that nobody kills."""
     config = experiment(COMMON, {"name": "soak"}, CONFIGS[name])
+    seconds, commits = [], 0
+    original = Recorder.commit
+
+    def commit(*arguments: Any) -> None:
+        nonlocal commits
+        commits += 1
+        original(*arguments)
+
     with tempfile.TemporaryDirectory() as folder:
-        begun = time.monotonic()
-        run = run_job(Job(config, seed), create_run(Path(folder), config, seed))
-        seconds = time.monotonic() - begun
-        if run.seed == SEEDS[0]:  # the first has compiled
-            begun = time.monotonic()
-            run = run_job(Job(config, seed), create_run(Path(folder), config, seed))
-            seconds = time.monotonic() - begun
-        return Whole(config, seed, run.summary["content_digest"], seconds, our_messages(run.recording))
+        Recorder.commit = commit  # type: ignore[method-assign]
+        try:
+            for _ in range(2):  # the first may have to compile
+                commits, begun = 0, time.monotonic()
+                run = run_job(Job(config, seed), create_run(Path(folder), config, seed))
+                seconds.append(time.monotonic() - begun)
+        finally:
+            Recorder.commit = original  # type: ignore[method-assign]
+        digest = run.summary["content_digest"]
+        return Whole(config, seed, digest, min(seconds), commits, our_messages(run.recording))
 
 
 def begin(folder: Path, whole: Whole) -> Run:
@@ -205,7 +235,7 @@ def kill(
     """Do the work in a process of its own, and kill it at a random moment up to a little after its end."""
     folder.mkdir(parents=True, exist_ok=True)
     shared = mmap.mmap(-1, 1 << 22)
-    after = rng.uniform(0, 1.2 * (seconds + 0.05) + (1.5 if pause else 0.0))
+    after = rng.uniform(0, 1.1 * seconds + 0.02)
     child = os.fork()
     if child == 0:
         _work_and_exit(work, pause, shared)

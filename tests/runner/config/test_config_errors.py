@@ -388,5 +388,5 @@ def test_trials_start_at_random_in_each_or_in_one_state(told, value):
 
 def test_a_wrong_value_is_told_though_a_default_depends_on_it(told):
     assert told("episodes: 1\nrecording: {compression: brotli}") == [
-        "2:13: recording.compression: found 'brotli', expected 'zstd', 'lz4' or 'none'"
+        "x.yaml:2:13: recording.compression: found 'brotli', expected 'zstd', 'lz4' or 'none'"
     ]
