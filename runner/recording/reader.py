@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import stat
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
@@ -223,6 +223,34 @@ class Recording:
             first = int(firsts[k])
             yield self._block(topic, k, data)[max(start - first, 0) : stop - first]
 
+    def blocks_between(self, topic: Topic, start_time: int, stop_time: int) -> Iterator[NDArray[np.void]]:
+        """Yield the messages of a fixed-width topic logged from `start_time` up to `stop_time`, in ns."""
+        firsts, ends = self._numbers(topic)
+        if not len(firsts):
+            return
+        start, stop = np.uint64(max(start_time, 0)), np.uint64(max(stop_time, 0))
+        times = self._index.chunks.columns[self._chunks_of[topic.channel]]
+        first, behind = np.searchsorted(times["end_time"], start), np.searchsorted(times["start_time"], stop)
+        for block in self.blocks(topic, int(firsts[first]), int(ends[behind - 1])) if first < behind else ():
+            low, high = (int(np.searchsorted(block["log_time"], time)) for time in (start, stop))
+            if low < high:
+                yield block[low:high]
+
+    def blocks_of_episodes(self, phase: str, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
+        """Yield the steps of the episodes number `start` up to `stop`; None for the very end."""
+        behind = None if stop is None else self._first_step(phase, stop)
+        return self.blocks(schema.PHASES[phase][0], self._first_step(phase, start), behind)
+
+    def _first_step(self, phase: str, episode: int) -> int:
+        """Return the first step of an episode or a later one, found in the steps themselves."""
+        topic = schema.PHASES[phase][0]
+        firsts, ends = (numbers.tolist() for numbers in self._numbers(topic))
+        k = bisect_left(ends, episode, key=lambda end: next(self.blocks(topic, end - 1, end))["episode"][0])
+        if k == len(ends):
+            return self.count(topic)
+        block = next(self.blocks(topic, firsts[k], ends[k]))
+        return int(firsts[k]) + int(np.searchsorted(block["episode"], episode))
+
     def messages(self, topic: Topic, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
         """Yield (log time in nanoseconds, payload) of a topic's messages, in order."""
         for k in range(first_chunk, len(self._chunks_of[topic.channel])):
@@ -250,11 +278,8 @@ class Recording:
         Raises:
             RecordingError: the recording has no such episode, or no steps.
         """
-        topic = schema.TRAIN_STEP if phase == "train" else schema.EVAL_STEP
-        total, ended = (
-            self.count(topic),
-            self.count(schema.TRAIN_EPISODE if phase == "train" else schema.EVAL_EPISODE),
-        )
+        topic, episodes = schema.PHASES[phase]
+        total, ended = self.count(topic), self.count(episodes)
         if not total:
             raise RecordingError(f"{self.path}: has no {phase} steps.")
         start = stop = 0
