@@ -211,6 +211,9 @@ def _has_no_steps(recording: Recording) -> bool:
 
 
 def _without_steps(recording: Recording, request: Request, selection: Selection) -> None:
+    if recording.config["recording"]["steps"] != "none":
+        selection.warnings.append("No step was recorded before the run ended: only metrics are exported.")
+        return
     hint = "`dualtaxi rerecord` runs the job again and records them"
     if not request.is_default:
         raise RecordingError(f"{recording.path}: was recorded without steps; {hint}.")

@@ -36,7 +36,9 @@ class Exported:
         batches = [chunk.to_record_batch() for chunk in chunks if not chunk.is_static]
         batches = [batch for batch in batches if "Clear:is_recursive" not in batch.schema.names]
         names = [name for name in batches[0].schema.names if not name.startswith("rerun.")]
-        columns = {name: sum((batch.column(name).to_pylist() for batch in batches), []) for name in names}
+        columns = {
+            name: [cell for batch in batches for cell in batch.column(name).to_pylist()] for name in names
+        }
         order = np.argsort(columns["step"], kind="stable")
         return {name: [values[i] for i in order] for name, values in columns.items()}
 
@@ -58,12 +60,17 @@ def saw(recording, phase, steps):
     trained = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS - steps["step"] - 1
     tables = {step: tables_at(recording, int(step)) for step in np.unique(trained)}
     return np.array(
-        [[table[state] for table in tables[step]] for step, state in zip(trained, steps["state"], strict=True)]
+        [
+            [table[state] for table in tables[step]]
+            for step, state in zip(trained, steps["state"], strict=True)
+        ]
     )
 
 
 @pytest.mark.parametrize("phase", TOPICS)
 class TestSteps:
+    """Every step of a phase."""
+
     def test_every_step_is_there_at_its_time(self, exported, phase):
         steps, table = exported.steps(phase), exported.table(f"/{phase}/reward")
         assert table["step"] == (steps["log_time"] // schema.STEP_NANOSECONDS).tolist()
@@ -76,7 +83,9 @@ class TestSteps:
             assert table["episode"] == [after[k // trials] for k in steps["episode"].tolist()]
 
     def test_rewards(self, exported, phase):
-        assert exported.table(f"/{phase}/reward")["Scalars:scalars"] == exported.steps(phase)["rewards"].tolist()
+        assert (
+            exported.table(f"/{phase}/reward")["Scalars:scalars"] == exported.steps(phase)["rewards"].tolist()
+        )
 
     def test_values_are_those_of_the_step(self, exported, phase):
         steps, counts = exported.steps(phase), exported.recording.mdp.action_counts
@@ -92,8 +101,12 @@ class TestSteps:
         mdp = exported.recording.mdp
         scene, steps = scene_of(mdp), exported.steps(phase)
         if scene is None:
-            assert exported.table(f"/{phase}/state")["Scalars:scalars"] == [[s] for s in steps["state"].tolist()]
-            assert exported.table(f"/{phase}/action")["Scalars:scalars"] == [[a] for a in steps["action"].tolist()]
+            assert exported.table(f"/{phase}/state")["Scalars:scalars"] == [
+                [s] for s in steps["state"].tolist()
+            ]
+            assert exported.table(f"/{phase}/action")["Scalars:scalars"] == [
+                [a] for a in steps["action"].tolist()
+            ]
             return
         table = exported.table(f"/{phase}/grid/things")
         points = np.array(table["Points2D:positions"])
@@ -128,7 +141,7 @@ class TestSteps:
             context = pictures.context[steps["state"]]
             changed = np.append(True, context[1:] != context[:-1]) | (steps["t"] == 0)
             assert table["step"] == time[changed].tolist()
-            for k in range(0, len(table["step"]), max(1, len(table["step"]) // 7)):
+            for k in range(0, len(table["step"]), max(1, len(table["step"]) // 3)):
                 step = steps[np.searchsorted(time, table["step"][k])]
                 trained = int(step["step"]) if phase == "train" else table["step"][k] - int(step["step"]) - 1
                 q = tables_at(recording, trained)[learner].max(axis=1)
@@ -182,7 +195,9 @@ def test_every_metric_is_there(exported):
 def test_means_between_reports_are_of_the_episodes_that_ended_there(exported):
     recording = exported.recording
     episodes = recording.episodes("train")
-    reports = sorted([*recording.metrics("train"), *recording.metrics("eval")], key=lambda row: row["log_time"])
+    reports = sorted(
+        [*recording.metrics("train"), *recording.metrics("eval")], key=lambda row: row["log_time"]
+    )
     table = exported.table("/train/metrics/penalties")
     found = dict(zip(table["step"], (value for (value,) in table["Scalars:scalars"]), strict=True))
     before = 0
@@ -194,9 +209,15 @@ def test_means_between_reports_are_of_the_episodes_that_ended_there(exported):
         before = max(before, row["step"])
 
 
-def test_rerun_finds_the_file_sound(exported):
+def test_rerun_finds_the_file_sound(exported, tmp_path):
+    path = tmp_path / "some.rrd"
+    export([Source(exported.recording, "a run")], Request(episodes=((0, 2),), evaluations=(20,)), path)
     done = subprocess.run(
-        [viewer_program(), "rrd", "verify", exported.path], capture_output=True, text=True, timeout=60, check=False
+        [viewer_program(), "rrd", "verify", path],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
 

@@ -1,0 +1,141 @@
+"""Which steps are exported, what is said about it, and what is refused."""
+
+from __future__ import annotations
+
+import socket
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from runner.cli import cli
+from runner.errors import MissingExtra, RecordingError
+from runner.export.rerun.selection import Request, episodes_of, select
+from runner.export.rerun.spots import with_spot
+from runner.export.rerun.viewer import ViewerError, check_port, require_rerun
+from runner.recording import schema
+from runner.recording.reader import open_recording
+
+
+@pytest.fixture
+def rivals(pictured):
+    with open_recording(pictured("rivals").recording) as recording:
+        yield recording
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+class TestChoice:
+    """What is chosen."""
+
+    def test_default_is_a_spread_and_the_last_evaluation(self, rivals):
+        selection = select(rivals, Request())
+        episodes = [span.episode for span in selection.train]
+        assert episodes[0] == 0
+        last = selection.train[-1]
+        assert last.stop == rivals.count(schema.TRAIN_STEP)
+        assert [one.after for one, _ in selection.evaluations] == [40]
+        assert "20 of 40 training episodes, evenly spread from 0 to 39" in selection.chosen[0]
+        assert any("--all" in left and "20 training episodes" in left for left in selection.left_out)
+        assert any("--eval 20" in left for left in selection.left_out)
+        assert not selection.warnings
+
+    def test_everything(self, rivals):
+        selection = select(rivals, Request(everything=True))
+        assert selection.steps == rivals.count(schema.TRAIN_STEP) + rivals.count(schema.EVAL_STEP)
+        assert not selection.left_out
+
+    def test_ranges_every_and_evaluations_come_together(self, rivals):
+        request = Request(episodes=((0, 2), (38, None)), evaluations=(20,), every=15)
+        selection = select(rivals, request)
+        first = episodes_of(rivals, "train").first_step
+        wanted = [0, 1, 15, 30, 38, 39]
+        assert sum(s.stop - s.start for s in selection.train) == np.diff(first)[wanted].sum()
+        assert [one.after for one, _ in selection.evaluations] == [20]
+
+    @pytest.mark.parametrize("ranges", [((40, 41),), ((3, 3),), ((0, 41),), ((50, None),)])
+    def test_episodes_that_do_not_exist(self, rivals, ranges):
+        with pytest.raises(RecordingError, match=r"there are 40, from 0"):
+            select(rivals, Request(episodes=ranges))
+
+    def test_an_evaluation_that_does_not_exist(self, rivals):
+        with pytest.raises(RecordingError, match=r"no evaluation after 7 .* one of 0, 20, 40"):
+            select(rivals, Request(evaluations=(7,)))
+
+    def test_the_spot_is_exported(self, pictured):
+        run = pictured("rivals")
+        spot = with_spot(run, Request(), (7, 2))
+        with open_recording(run.recording) as recording:
+            step = recording.episode_steps("train", 7)[2]
+            spans = select(recording, spot.request).train
+        assert spot.time == step["log_time"] // schema.STEP_NANOSECONDS
+        assert any(span.start <= step["step"] < span.stop for span in spans)
+        with pytest.raises(RecordingError, match="no t = 999"):
+            with_spot(run, Request(), (7, 999))
+        with pytest.raises(RecordingError, match="no trial 6 "):
+            with_spot(run, Request(), (20, 6, 0))
+
+
+class TestWithoutSteps:
+    """A run of which only metrics were recorded."""
+
+    def test_metrics_are_exported_and_the_rest_is_named(self, pictured, tmp_path):
+        run = pictured("rivals", recording={"steps": "none"})
+        result = invoke("export", "rerun", run.folder, "-o", tmp_path / "a.rrd")
+        assert result.exit_code == 0, result.output
+        assert "rerecord" in result.output
+        result = invoke("export", "rerun", run.folder, "-o", tmp_path / "b.rrd", "--all")
+        assert result.exit_code == 2
+        assert "rerecord" in result.output
+
+
+def test_an_interrupted_run_is_exported_as_far_as_it_came(pictured, tmp_path):
+    whole = pictured("rivals", recording={"chunk_steps": 256}).recording
+    part = tmp_path / "part.mcap"
+    part.write_bytes(whole.read_bytes()[: whole.stat().st_size * 8 // 10])
+    result = invoke("export", "rerun", part, "-o", tmp_path / "part.rrd", "--all")
+    assert result.exit_code == 0, result.output
+    assert "interrupted: exported is what there is" in result.output
+
+
+class TestCommand:
+    """What the commands refuse."""
+
+    def test_a_file_that_exists_needs_force(self, pictured, tmp_path):
+        run, path = pictured("lake"), tmp_path / "a.rrd"
+        path.write_bytes(b"precious")
+        result = invoke("export", "rerun", run.folder, "-o", path)
+        assert result.exit_code != 0
+        assert "--force" in result.output
+        assert path.read_bytes() == b"precious"
+        result = invoke("export", "rerun", run.folder, "-o", path, "--force")
+        assert result.exit_code == 0, result.output
+        assert "steps, in" in result.output
+        assert path.read_bytes()[:4] == b"RRF2"
+
+    @pytest.mark.parametrize("text", ["x", "1-2", ":x", ""])
+    def test_ranges_that_are_none(self, pictured, text):
+        result = invoke("export", "rerun", pictured("lake").folder, "--episodes", text)
+        assert result.exit_code == 2
+        assert "START:STOP" in result.output
+
+    def test_rerun_is_needed(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "rerun", None)
+        with pytest.raises(MissingExtra, match=r"rerun-sdk, .* pip install"):
+            require_rerun("view")
+
+    def test_a_port_in_use(self):
+        with socket.socket() as taken:
+            taken.bind(("127.0.0.1", 0))
+            taken.listen()
+            port = taken.getsockname()[1]
+            with pytest.raises(ViewerError, match=f"port {port} cannot be used .* --port"):
+                check_port(port)
+
+    def test_more_than_two_runs(self):
+        result = invoke("view", "a", "b", "c")
+        assert result.exit_code == 2
+        assert "expected one or two" in result.output

@@ -1,0 +1,99 @@
+"""The viewer draws what is exported: without a screen, and every view without an error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from runner.errors import RunnerError
+from runner.export.rerun import viewer
+from runner.export.rerun.cache import exported
+from runner.export.rerun.live import LiveView
+from runner.export.rerun.selection import Request
+from runner.export.rerun.spots import with_spot
+from runner.recording import schema
+from runner.recording.reader import open_recording
+
+PLOTS = {
+    "Trials finished (%)",
+    "Episode length (mean)",
+    "Return of an episode (mean)",
+    "Penalties an episode",
+}
+PLOTS |= {"Q-table filled (%)", "Epsilon, step size", "Rewards (% of the last steps)"}
+TABLE = "Q-values of this state, before the move"
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+
+def drawn(path, step):
+    """Return the views of a file by name, drawn; skip where nothing can be drawn."""
+    try:
+        with viewer.headless(path, step) as client:
+            return {view.name: view for view in client.get_state().views}
+    except viewer.ViewerError as error:
+        if "finds no graphics" in str(error):
+            pytest.skip(f"no graphics to draw with: apt-get install {viewer.MESA_PACKAGES}")
+        raise
+
+
+def test_every_view_of_the_default_blueprint_is_drawn_without_an_error(pictured):
+    run = pictured("rivals")
+    spot = with_spot(run, Request(), (39, 3))
+    path, _ = exported([run], spot.request)
+    views = drawn(path, spot.time)
+    maps = {f"taxi {i}: max Q, greedy moves" for i in (1, 2)}
+    title = f"rivals, seed 1 ({run.run_id})"
+    assert set(views) == PLOTS | maps | {TABLE, title, "Events", "Collisions an episode"}
+    assert [view.reports for view in views.values()] == [[]] * len(views)
+    assert all(view.visible for view in views.values())
+
+
+def test_two_runs_are_side_by_side(pictured):
+    runs = [pictured("rivals"), pictured("taxis")]
+    path, selections = exported(runs, Request())
+    assert len(selections) == 2
+    views = drawn(path, with_spot(runs[0], Request(), None).time)
+    assert {f"rivals, seed 1 ({runs[0].run_id})", f"taxis, seed 1 ({runs[1].run_id})"} <= set(views)
+    assert all(not view.reports for view in views.values())
+
+
+def test_a_second_look_comes_from_the_cache(pictured):
+    run = pictured("lake")
+    path, _ = exported([run], Request())
+    made = path.stat().st_ino
+    again, _ = exported([run], Request())
+    assert again == path
+    assert again.stat().st_ino == made
+
+
+def test_a_viewer_that_cannot_start_says_why(monkeypatch, tmp_path):
+    monkeypatch.setattr(viewer, "viewer_program", lambda: "/bin/false")
+    with (
+        pytest.raises(RunnerError, match="does not start"),
+        viewer.viewer(viewer.free_port(), log=tmp_path / "log"),
+    ):
+        pass
+
+
+def test_a_live_view_shows_one_episode_in_so_many(pictured):
+    run = pictured("rivals")
+    with open_recording(run.recording) as recording:
+        steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
+        mdp, metrics = recording.mdp, recording.metrics("eval")
+    port = viewer.free_port()
+    with viewer.viewer(port, "--serve-grpc"):
+        live = LiveView("live", "live", mdp, ("taxi_1", "taxi_2"), 10, f"rerun+http://127.0.0.1:{port}/proxy")
+        sent = []
+        live._send_steps = lambda *piece: sent.append(piece)  # type: ignore[method-assign]
+        with live:
+            for part in np.array_split(steps, 7):
+                live.steps("train", int(part["step"][0]), part)
+            live.metrics("eval", len(steps), metrics[-1])
+    shown = np.concatenate([piece[3] for piece in sent])
+    assert shown.tobytes() == steps[steps["episode"] % 10 == 0].tobytes()
+    assert [piece[1] for piece in sent] == [int(piece[3]["step"][0]) + 1 for piece in sent]
+    assert live.dropped == 0
