@@ -1,0 +1,55 @@
+"""The Python examples in the documentation run as they stand."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import sys
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+import runner
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("README.md")])
+_EXAMPLE = re.compile(r"^```python[ \t]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+"""A block marked python; one marked `python no-test` is not run."""
+
+
+def examples(page: Path) -> list[tuple[int, str]]:
+    """Return the line and the text of each example of a page."""
+    text = page.read_text(encoding="utf-8")
+    return [(text[: found.start(1)].count("\n"), found.group(1)) for found in _EXAMPLE.finditer(text)]
+
+
+WITH_EXAMPLES = [page for page in PAGES if examples(page)]
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder as the pages take it to be: with the shipped configurations and a run of one of them."""
+    made = tmp_path_factory.mktemp("documented")
+    (made / "configs").symlink_to(ROOT / "configs", target_is_directory=True)
+    runner.run(ROOT / "configs" / "quick.yaml", recordings=made / "recordings")
+    return made
+
+
+@pytest.mark.parametrize("page", WITH_EXAMPLES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_examples_run(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv("DUALTAXI_RECORDINGS", raising=False)
+    matplotlib.use("Agg")
+    (recording,) = folder.glob("recordings/*/recording.mcap")
+    monkeypatch.setattr(sys, "argv", ["example.py", str(recording)])
+    names: dict[str, object] = {"__name__": "example"}
+    for line, text in examples(page):
+        code = compile("\n" * line + text, str(page), "exec")
+        with contextlib.redirect_stdout(io.StringIO()):
+            exec(code, names)
+
+
+def test_there_are_examples() -> None:
+    assert ROOT / "docs" / "reading.md" in WITH_EXAMPLES
