@@ -8,6 +8,8 @@ import re
 import sys
 from pathlib import Path
 
+import gymnasium
+import gymnasium.envs.registration
 import matplotlib
 import pytest
 
@@ -37,6 +39,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+@pytest.fixture
+def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forget afterwards what an example registers; other tests have environments of the same names."""
+    shipped = {name: spec for name, spec in gymnasium.registry.items() if isinstance(spec.entry_point, str)}
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", shipped)
+
+
+@pytest.mark.usefixtures("own_registry")
 @pytest.mark.parametrize("page", WITH_EXAMPLES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_examples_run(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
