@@ -37,6 +37,15 @@ def check_facts(run: Mapping[str, str], index: Index, path: str) -> None:
                 f"{path}: found channel {number} for {channel.topic!r}, "
                 f"expected {topics.get(number)!r}: not written by dualtaxi."
             )
+    check_run(run, path)
+
+
+def check_run(run: Mapping[str, str], path: str) -> None:
+    """Refuse what is not said of a run of our version.
+
+    Raises:
+        RecordingError: something is missing, or makes no sense.
+    """
     version = run.get("format_version", "?")
     if version != str(schema.FORMAT_VERSION):
         raise RecordingError(

@@ -9,35 +9,31 @@ from __future__ import annotations
 
 import contextlib
 import json
-import mmap
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
-from mcap.writer import MCAP0_MAGIC
 
-from runner.errors import RecordingError
+from runner.errors import RecordingError, StorageError
 from runner.recording import schema
-from runner.recording.chunks import MAX_CHUNK_BYTES, Chunk, message_index
+from runner.recording.chunks import Chunk, message_index
 from runner.recording.contents import asks_for_indexes, attachment_of, metadata_of, read_chunk
+from runner.recording.facts import check_run, json_object
 from runner.recording.integrity import check_integrity, places
 from runner.recording.reader import open_recording
+from runner.recording.salvage import DamagedFile
 from runner.recording.schema import BLOCK_TOPICS, TOPICS, Topic
 from runner.recording.writer import RecordingFile
+from runner.scene import is_whole
 
 _HEAD: Final = struct.Struct("<BQ")
 _CHUNK_TIMES: Final = struct.Struct("<QQ")
 _CHUNK_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
+_MOST_MESSAGES: Final = 2**62
 _NEEDED: Final = {"run", "config", "provenance"}
-_EXPECTED: Final = {
-    *(Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK),
-    *(Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT),
-}
 
 
 @dataclass
@@ -69,26 +65,42 @@ def repair(path: Path) -> Repair:
 
     Raises:
         RecordingError: it is no recording of ours, or what describes it is damaged.
+        StorageError: there is no room for the new file, or the folder cannot be written.
     """
     with contextlib.suppress(RecordingError):
         check_integrity(path)
         return Repair(path, was_whole=True)
     fresh = path.with_suffix(".repairing")
-    fresh.unlink(missing_ok=True)
     try:
-        with path.open("rb") as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            done = _Salvage(path, data).write(fresh)
-        _read_back(fresh, done)
-    except ValueError as error:  # an empty file cannot be mapped
-        raise RecordingError(f"{path}: found an empty file, expected a recording.") from error
-    except BaseException:
         fresh.unlink(missing_ok=True)
+        done = _salvaged(path, fresh)
+        _read_back(fresh, done)
+        if done.lost:
+            done.original = _free_name(path)
+            path.rename(done.original)
+        fresh.replace(path)
+    except OSError as error:
+        _remove(fresh)
+        raise StorageError(f"{fresh}: cannot be written ({error.strerror}); {path} is as it was.") from error
+    except BaseException:
+        _remove(fresh)
         raise
-    if done.lost:
-        done.original = _free_name(path)
-        path.rename(done.original)
-    fresh.replace(path)
     return done
+
+
+def _salvaged(path: Path, fresh: Path) -> Repair:
+    """Write what is good of a file into a new one."""
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+    with stream:
+        return _Salvage(path, DamagedFile(stream, path)).write(fresh)
+
+
+def _remove(fresh: Path) -> None:
+    with contextlib.suppress(OSError):
+        fresh.unlink(missing_ok=True)
 
 
 def _read_back(fresh: Path, done: Repair) -> None:
@@ -120,23 +132,23 @@ def _free_name(path: Path) -> Path:
 class _Salvage:
     """Takes the good records out of a damaged file's bytes."""
 
-    def __init__(self, path: Path, data: mmap.mmap) -> None:
-        if data[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
-            raise RecordingError(f"{path}: found {data[:8]!r} at its start, expected an MCAP file.")
+    def __init__(self, path: Path, file: DamagedFile) -> None:
         self._path = path
-        self._data = data
+        self._damaged = file
         self._done = Repair(path)
         self._indexed = True
         self._dtypes: dict[Topic, np.dtype[np.void]] = {}
         self._next = dict.fromkeys(TOPICS, 0)
         """Number of the message expected next, a topic."""
         self._result: dict[str, str] | None = None
+        self._counts: dict[str, int] = {}
+        """Messages of each topic, as the result says."""
 
     def write(self, fresh: Path) -> Repair:
         """Write a new file of what is good."""
         described = set()
         with RecordingFile(fresh) as file:
-            for opcode, offset, body in self._good_records():
+            for opcode, offset, body in self._damaged.good_records():
                 if opcode == Opcode.METADATA:
                     name, entries = metadata_of(body)
                     described.add(name)
@@ -159,13 +171,15 @@ class _Salvage:
 
     def _take_metadata(self, file: RecordingFile, name: str, entries: dict[str, str]) -> None:
         if name == "result":
-            self._result = entries
+            with contextlib.suppress(RecordingError):  # a senseless one is as good as none
+                self._counts, self._result = _recorded_counts(entries), entries
             return
         if name == "repair":
             return
         if name == "config":
             self._indexed = asks_for_indexes(entries)
         if name == "run":
+            check_run(entries, str(self._path))
             learners, events = int(entries["learners"]), int(entries["events"])
             self._dtypes = {
                 topic: schema.record_dtype(topic.message, schema.block_counts(topic, learners, events))
@@ -179,9 +193,9 @@ class _Salvage:
         topic = next(topic for topic in TOPICS if topic.channel == part.channel)
         _, times, offsets = places(records, f"{self._path}: chunk at {offset}")
         if topic in self._dtypes:
-            numbers = np.frombuffer(records, self._dtypes[topic])[schema.NUMBERED_BY[topic.message]]
-            self._note_hole(topic, int(numbers[0]))
-            self._next[topic] = int(numbers[-1]) + 1
+            first, stop = self._numbers(topic, offset, records)
+            self._note_hole(topic, first)
+            self._next[topic] = stop
         else:
             self._next[topic] += part.messages
         start, end = int(times[0]), int(times[-1])
@@ -199,6 +213,19 @@ class _Salvage:
         file.add_chunk(topic, chunk)
         self._done.kept[topic.name] = self._done.kept.get(topic.name, 0) + part.messages
 
+    def _numbers(self, topic: Topic, offset: int, records: bytes) -> tuple[int, int]:
+        """Return the number of a chunk's first message, and behind its last."""
+        dtype = self._dtypes[topic]
+        if len(records) % dtype.itemsize:
+            raise RecordingError(f"{self._path}: chunk at {offset}: found messages of another size.")
+        numbers = np.frombuffer(records, dtype)[schema.NUMBERED_BY[topic.message]]
+        first, last = int(numbers[0]), int(numbers[-1])
+        if last - first + 1 != len(numbers) or not 0 <= first <= last < _MOST_MESSAGES:
+            raise RecordingError(
+                f"{self._path}: chunk at {offset}: found {len(numbers)} messages, numbered {first} to {last}."
+            )
+        return first, last + 1
+
     def _note_hole(self, topic: Topic, number: int) -> None:
         expected = self._next[topic]
         if number < expected:
@@ -208,66 +235,38 @@ class _Salvage:
 
     def _close(self, file: RecordingFile) -> None:
         """Say what was lost, or give the result back; finish the file."""
-        result = json.loads(self._result["json"]) if self._result else {}
-        without_steps = not result.get("steps_recorded", True)
-        for topic in TOPICS:
-            count = result.get("messages", {}).get(topic.name, 0)
-            if self._next[topic] < count and not (without_steps and topic.message is schema.STEP):
-                self._done.lost.setdefault(topic.name, []).append([self._next[topic], count])
+        if self._result is not None:
+            for topic in TOPICS:
+                if self._next[topic] < (count := self._counts.get(topic.name, 0)):
+                    self._done.lost.setdefault(topic.name, []).append([self._next[topic], count])
+        self._done.lost_bytes = self._damaged.lost_bytes
+        if self._damaged.torn_chunk is not None:
+            self._done.torn_steps = self._steps_in(self._damaged.torn_chunk)
         if self._done.lost:
             file.add_metadata("repair", {"json": json.dumps({"lost": self._done.lost}, sort_keys=True)})
         elif self._result is not None:
             file.add_metadata("result", self._result)
         file.finish()
 
-    def _good_records(self) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (opcode, offset, body) of the records that can be read, past those that cannot."""
-        offset, size = len(MCAP0_MAGIC), len(self._data)
-        while offset + 9 <= size:
-            opcode, length = _HEAD.unpack(self._data[offset : offset + 9])
-            if (opcode, length) == (Opcode.DATA_END, 4):
-                return
-            if self._is_good(opcode, length, offset):
-                yield opcode, offset, self._data[offset + 9 : offset + 9 + length]
-                offset += 9 + length
-                continue
-            found = self._next_good(offset + 1)
-            if opcode == Opcode.CHUNK and found == size:
-                self._done.torn_steps = self._steps_in_torn_chunk(offset)
-            self._done.lost_bytes += found - offset
-            offset = found
-        self._done.lost_bytes += size - offset
-
-    def _is_good(self, opcode: int, length: int, offset: int) -> bool:
-        """Return whether a whole, sound record begins here."""
-        if opcode not in _EXPECTED or length > min(len(self._data) - offset - 9, MAX_CHUNK_BYTES):
-            return False
-        body = self._data[offset + 9 : offset + 9 + length]
-        try:
-            if opcode == Opcode.CHUNK:
-                read_chunk(body, offset)
-            elif opcode == Opcode.ATTACHMENT:
-                attachment_of(body, offset)
-            elif opcode == Opcode.METADATA:
-                metadata_of(body)
-        except (RecordingError, struct.error, ValueError, EndOfFile):
-            return False
-        return True
-
-    def _next_good(self, offset: int) -> int:
-        """Return where the next good chunk begins, or the end of the file."""
-        chunk = bytes([Opcode.CHUNK])
-        while 0 <= (offset := self._data.find(chunk, offset)) <= len(self._data) - 9:
-            if self._is_good(Opcode.CHUNK, _HEAD.unpack(self._data[offset : offset + 9])[1], offset):
-                return offset
-            offset += 1
-        return len(self._data)
-
-    def _steps_in_torn_chunk(self, offset: int) -> int:
+    def _steps_in(self, torn: bytes) -> int:
         """Return how many steps a chunk that was cut off held, by its head: a step spans one tick."""
-        head = self._data[offset + 9 : offset + 9 + _CHUNK_TIMES_AND_SIZE.size]
-        if len(head) < _CHUNK_TIMES_AND_SIZE.size or not self._dtypes:
+        if len(torn) < _CHUNK_TIMES_AND_SIZE.size or not self._dtypes:
             return 0
-        start, end, size = _CHUNK_TIMES_AND_SIZE.unpack(head)
+        start, end, size = _CHUNK_TIMES_AND_SIZE.unpack_from(torn)
         ticks = (end - start) // schema.STEP_NANOSECONDS + 1
         return ticks if size == ticks * self._dtypes[schema.TRAIN_STEP].itemsize else 0
+
+
+def _recorded_counts(result: dict[str, str]) -> dict[str, int]:
+    """Return how many messages of each topic a result says were recorded.
+
+    Raises:
+        RecordingError: it does not say it.
+    """
+    said = json_object(result.get("json"), "the metadata 'result'")
+    counts = said.get("messages", {})
+    if not isinstance(counts, dict) or not all(is_whole(n, 0, _MOST_MESSAGES) for n in counts.values()):
+        raise RecordingError("the metadata 'result' does not say how many messages there were")
+    steps = {topic.name for topic in TOPICS if topic.message is schema.STEP}
+    left_out = set() if said.get("steps_recorded", True) else steps
+    return {name: count for name, count in counts.items() if name not in left_out}
