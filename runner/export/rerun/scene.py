@@ -23,6 +23,8 @@ GOAL_COLOUR: Final = "#CC79A7"
 BAD_COLOUR: Final = "#D55E00"
 INK: Final = "#808080"
 
+BAD_SIGN: Final = "✗"
+GOOD_SIGN: Final = "✓"
 TRAIL_STEPS: Final = 5
 _APART: Final = 0.34
 """Between movers in one cell, so that both are seen."""
@@ -228,7 +230,8 @@ def marks_of(scene: Scene) -> Marks:
                 label = thing["label"] + (" + passenger" if carries else "")
                 lookup[i, carries, k] = len(labels)
                 labels.append(": ".join([label, ", ".join(happened)]) if happened else label)
-                colours.append(MOVER_COLOURS[i % len(MOVER_COLOURS)])
+                bad = any(word.startswith(BAD_SIGN) for word in happened)
+                colours.append(BAD_COLOUR if bad else MOVER_COLOURS[i % len(MOVER_COLOURS)])
     return Marks(labels, colours, lookup, masks)
 
 
@@ -239,7 +242,7 @@ def _happened(mdp: Mdp, mask: int, agent: str) -> list[str]:
         owner, _, event = name.rpartition(".")
         if mask >> bit & 1 and owner in ("", agent):
             bad = owner == "" or (name not in mdp.success_events and event not in ("pickup",))
-            words.append(("✗ " if bad else "✓ ") + spoken(event))
+            words.append(f"{BAD_SIGN if bad else GOOD_SIGN} {spoken(event)}")
     return words
 
 

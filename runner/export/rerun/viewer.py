@@ -20,6 +20,8 @@ LOOPBACK: Final = "127.0.0.1"
 START_SECONDS: Final = 20.0
 SETTLE_SECONDS: Final = 4.0
 """A viewer without a screen has drawn everything this long after it was told where to look."""
+NOTICE_SECONDS: Final = 2.5
+"""After that, what the viewer says of itself in a corner is gone."""
 MESA_PACKAGES: Final = (
     "mesa-vulkan-drivers libgl1-mesa-dri libegl1 libxkbcommon-x11-0 libxcursor1 libxi6 libxrandr2 libx11-xcb1"
 )
@@ -171,6 +173,7 @@ def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> 
         ViewerError: the viewer cannot be started, or the picture not be written.
     """
     with headless(path, step, size) as client:
+        time.sleep(NOTICE_SECONDS)
         client.save_screenshot(str(picture.absolute()))
     if not picture.exists():
         raise ViewerError(f"{picture}: the Rerun viewer has not written it.")
