@@ -46,6 +46,7 @@ from runner.recording.contents import Contents, read_chunk
 from runner.recording.integrity import checked_survey
 from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
+from runner.recording.recorder import storage_error
 from runner.recording.writer import RecordingFile
 from runner.runs import Run
 from runner.verify import differing_environment, differing_provenance, initial_tables
@@ -148,11 +149,27 @@ def _go_on(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
     learner = Learner(job.config, mdp, job.seed, _first_tables(job, run, mdp))
     proof = _proof(run)
     run = run.update(status="running", owner=runs.owner(), summary={}, proof=proof)
-    with _opened(path, contents, job, run, learner, changes) as file, open_recording(path) as recording:
-        past = Past(recording, without_steps=job.config.recording.steps == "none")
-        recorder = recorder_for(job, learner, file, past, beat=run.beat)
-        done = execute(_Continued(recording, past, job, learner, recorder, report, stop), file, run, started)
+    try:
+        with (
+            _opened(path, contents, job, run, learner, changes) as file,
+            open_recording(path) as recording,
+        ):
+            past = Past(recording, without_steps=job.config.recording.steps == "none")
+            recorder = recorder_for(job, learner, file, past, beat=run.beat)
+            session = _Continued(recording, past, job, learner, recorder, report, stop)
+            done = execute(session, file, run, started)
+    except BaseException as error:
+        _mark_failed(run, error)
+        raise
     return _put_in_place(done, path) if done.status == "finished" else done
+
+
+def _mark_failed(run: Run, error: BaseException) -> None:
+    """Say that a run failed, if `execute`, which says so itself, was not come to."""
+    with contextlib.suppress(RunnerError):
+        now = runs.find_run(os.fspath(run.folder.absolute()), run.folder.parent)
+        if now.facts["status"] == "running":
+            now.update(status="failed", summary={"error": str(error)})
 
 
 def _place(run: Run, described: bool) -> tuple[Path, Contents]:
@@ -276,8 +293,16 @@ def _opened(
             describe(file, job, run, learner)
         if described or changes:
             number = 1 + sum(entry.name.startswith("resume/") for entry in contents.metadata)
-            file.add_metadata(f"resume/{number}", _note(changes))
+            _add(file, f"resume/{number}", _note(changes))
         yield file
+
+
+def _add(file: RecordingFile, name: str, entries: dict[str, str]) -> None:
+    try:
+        file.add_metadata(name, entries)
+    except OSError as error:
+        file.cut_back()
+        raise storage_error(file, error) from error
 
 
 def _put_in_place(run: Run, path: Path) -> Run:

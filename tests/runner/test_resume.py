@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -16,13 +17,14 @@ import pytest
 from runner import runs, verify
 from runner.again import evaluate
 from runner.config import from_mapping
-from runner.errors import Diverged, RunnerError
+from runner.errors import Diverged, RunnerError, StorageError
 from runner.execution import run_job
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording.contents import survey
 from runner.recording.repair import repair
 from runner.recording.schema import BLOCK_TOPICS, EVAL_STEP, TRAIN_STEP
+from runner.recording.writer import RecordingFile
 from runner.resume import owned, resume
 from runner.runs import Run, create_run, find_run, list_runs
 from tests.runner.recording.making import SMALL_MAP, TAXIS, make_run
@@ -351,6 +353,29 @@ def test_another_seed_is_not_gone_on_with(whole, tmp_path):
     with pytest.raises(Diverged, match="metadata run: job"):
         resume(run.update(seed=0))
     assert_same(resume(run.update(seed=1)), other)  # run.json knows better
+
+
+@pytest.mark.parametrize("room", [0, 1000, 30_000, 60_000, 100_000])
+def test_after_a_full_disk(whole, tmp_path, monkeypatch, room):
+    config = from_mapping(whole.facts["config"])
+    run = create_run(tmp_path, config, 0)
+    write = RecordingFile._append
+
+    def filling(file, data):
+        if file.size + len(data) > room:
+            write(file, data[: max(room - file.size, 0)])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(file, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RecordingFile, "_append", filling)
+        with pytest.raises(StorageError, match="No space left"):
+            run_job(Job(config, 0), run)
+        assert find_run(run.run_id, tmp_path).status == "failed"
+        with pytest.raises(StorageError, match="No space left"):  # it is still full
+            resume(find_run(run.run_id, tmp_path))
+        assert find_run(run.run_id, tmp_path).status == "failed"
+    assert_same(resume(find_run(run.run_id, tmp_path)), whole)
 
 
 # --- who may go on ----------------------------------------------------------------------------------------
