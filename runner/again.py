@@ -10,7 +10,6 @@ import numpy as np
 
 from runner import runs
 from runner.analysis.tables import last_step, tables_at
-from runner.api import unless_empty
 from runner.config import ExperimentConfig, from_mapping
 from runner.errors import Diverged, RunnerError, StorageError
 from runner.execution import Report, Session, Stop, describe, recorder_for, run_job, write_result
@@ -22,7 +21,7 @@ from runner.recording.contents import survey
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
 from runner.resume import owned
-from runner.runs import Run
+from runner.runs import Run, unless_empty
 from runner.verify import initial_tables
 
 Start = int | Literal["random", "each"]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runner.config import ConfigError, ExperimentConfig, from_mapping, load
 from runner.job import Job, jobs_of
-from runner.runs import Run, create_run, recordings_folder
+from runner.runs import Run, create_run, recordings_folder, unless_empty
 
 if TYPE_CHECKING:  # both are imported late: a run is to stand on disk before NumPy and Numba are loaded
     from runner.execution import Progress
@@ -152,18 +151,6 @@ def _handle(number: int, handler: Handler) -> None:
     """Set a signal's handler; one that was not set from Python (None) cannot be set again."""
     if handler is not None:
         signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def unless_empty(run: Run) -> Iterator[None]:
-    """Remove the run's folder if what is done here fails before there is a recording; the error says so."""
-    try:
-        yield
-    except BaseException as error:
-        if not run.recording.exists():
-            shutil.rmtree(run.folder, ignore_errors=True)
-            error.add_note(f"Nothing was recorded; the empty run {run.run_id} was removed.")
-        raise
 
 
 def _run_jobs(

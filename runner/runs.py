@@ -13,6 +13,7 @@ import contextlib
 import json
 import os
 import secrets
+import shutil
 import socket
 import time
 from collections.abc import Iterator
@@ -158,6 +159,18 @@ def create_run(recordings: Path, config: ExperimentConfig, seed: int, name: str 
             f"choose another folder by --recordings or {RECORDINGS_VARIABLE}."
         ) from error
     return run
+
+
+@contextlib.contextmanager
+def unless_empty(run: Run) -> Iterator[None]:
+    """Remove the run's folder if what is done here fails before there is a recording; the error says so."""
+    try:
+        yield
+    except BaseException as error:
+        if not run.recording.exists():
+            shutil.rmtree(run.folder, ignore_errors=True)
+            error.add_note(f"Nothing was recorded; the empty run {run.run_id} was removed.")
+        raise
 
 
 def recordings_folder(chosen: str | os.PathLike[str] | None = None) -> Path:

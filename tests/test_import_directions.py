@@ -15,16 +15,18 @@ ORDER = """
     config
     job toy_text scene
     mdp
-    words learning recording
+    words learning recording observer
     provenance runs
     analysis frames
     execution export
     verify
     resume
-    again
+    again notebook
     api
     cli
 """
+SHOWN_BY = {("runs", "notebook")}
+"""A run shows itself in a notebook by a part that comes after it, imported when asked."""
 RANK = {part: rank for rank, line in enumerate(ORDER.split("\n")) for part in line.split()}
 FILES = {
     "runner": sorted((ROOT / "runner").rglob("*.py")),
@@ -60,7 +62,8 @@ def test_a_part_knows_only_what_comes_before_it(part):
         for names in imported(file)
         if names[0] == "runner" and len(names) > 1
     }
-    assert {other for other in known & set(RANK) if RANK[other] >= RANK[part]} <= {part}
+    later = {other for other in known & set(RANK) if RANK[other] >= RANK[part]}
+    assert later - {other for by, other in SHOWN_BY if by == part} <= {part}
 
 
 def test_the_environment_and_the_runner_do_not_know_each_other():

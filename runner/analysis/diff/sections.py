@@ -104,8 +104,8 @@ def _trajectory(difference: RunDiff) -> Section:
     if overlap is not None and parting is not None:
         share = overlap.equal_steps / overlap.compared_steps if overlap.compared_steps else math.nan
         sentences.append(
-            f"Of the {overlap.episodes:,} episodes of both, {overlap.equal_episodes:,} are the same; of their "
-            f"steps {share:.1%} agree at the same time of the same episode. Mean length "
+            f"Of the {overlap.episodes:,} episodes of both, {overlap.equal_episodes:,} are the same; of "
+            f"their steps {share:.1%} agree at the same time of the same episode. Mean length "
             f"{overlap.mean_length_a:.1f} in A, {overlap.mean_length_b:.1f} in B."
         )
     return Section("Training", sentences, grids)

@@ -74,9 +74,9 @@ def command(
 
 def _run_one(job: Job, folder: Path, name: str | None, number: int) -> tuple[Run, bool]:
     """Run a job; return its run, and whether it was interrupted."""
-    from runner.api import interruptible, unless_empty
+    from runner.api import interruptible
     from runner.cli.progress import progress_line
-    from runner.runs import create_run
+    from runner.runs import create_run, unless_empty
 
     run = create_run(folder, job.config, job.seed, name)
     label = f"seed {run.seed}" if len(job.config.seeds) > 1 else ""

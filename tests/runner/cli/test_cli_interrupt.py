@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import runner
-from runner.api import interruptible, unless_empty
-from runner.runs import create_run, list_runs
+from runner.api import interruptible
+from runner.runs import create_run, list_runs, unless_empty
 
 LONG = ("--set", "episodes=100000000", "--set", "evaluation=null")
 
