@@ -113,7 +113,7 @@ def _show(path: Path, place: Spot, web: bool, port: int, screenshot: Path | None
     elif web:
         with viewer.web_viewer(path, viewer.check_port(port)) as (process, address):
             click.echo(address)
-            say(f"Step {place.time:,} is the spot. Ctrl-C ends it.")
+            say(f"The spot is step {place.time:,}: type it at the lower right. Ctrl-C ends the viewer.")
             process.wait()
     else:
         viewer.open_window(path, place.time, viewer.check_port(port))

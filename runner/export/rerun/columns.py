@@ -31,6 +31,13 @@ class Batch:
     """The steps before the first, as many as its trail may show."""
     time: NDArray[np.int64]
     """[n]: steps executed, this one included."""
+    trials: int = 0
+    """Trials of an evaluation, of whose steps they are; 0 for training."""
+
+    def number(self, rows: Any = slice(None)) -> NDArray[np.int64]:
+        """Return the number of each row's episode, or of its trial within the evaluation."""
+        own = self.records["episode"][rows].astype(np.int64)
+        return np.asarray(own % self.trials) if self.trials else own
 
     def times(self, rows: Any = slice(None)) -> list[rr.TimeColumn]:
         """Return the timelines of these rows."""

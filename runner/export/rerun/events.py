@@ -45,7 +45,8 @@ class EventWriter(Sender):
 
     def _beginning(self, batch: Batch, row: int) -> str:
         record = batch.records[row]
-        named = f"episode {record['episode']:,}" if self._phase == "train" else f"trial {record['episode']:,}"
+        kind = "episode" if self._phase == "train" else "trial"
+        named = f"{kind} {batch.number([row])[0]:,}"
         return f"{named} begins: {self._states[record['state']]}"
 
     def _happening(self, record: np.void, mask: int) -> str:

@@ -101,7 +101,7 @@ class GridWriter(Sender):
     def _episodes(self, batch: Batch, rows: NDArray[np.int64], phase: str) -> None:
         """Send what changes with the episode: its title and the goals."""
         scene, records, n = self._scene, batch.records[rows], len(rows)
-        numbers = zip(batch.episode[rows].tolist(), records["episode"].tolist(), strict=True)
+        numbers = zip(batch.episode[rows].tolist(), batch.number(rows).tolist(), strict=True)
         titles = texts([_title(phase, trained, own) for trained, own in numbers])
         points = place(n, scene.columns / 2, TITLE_Y)
         columns = instances(rr.Points2D, n, positions=points, labels=titles, colors=ink(n))
@@ -137,4 +137,4 @@ def trails(scene: Scene, batch: Batch) -> NDArray[np.float32]:
 def _title(phase: str, trained: int, own: int) -> str:
     if phase == "train":
         return f"TRAINING, episode {trained:,}"
-    return f"EVALUATION after {trained:,} episodes, trial {own:,} of all"
+    return f"EVALUATION after {trained:,} episodes, trial {own:,}"

@@ -46,7 +46,9 @@ class Shown:
     """Whether values of the tables are exported."""
 
 
-def blueprint(runs: Sequence[Shown], play_state: Literal["paused", "following"] = "paused") -> rrb.Blueprint:
+def blueprint(
+    runs: Sequence[Shown], play_state: Literal["paused", "following"] = "following"
+) -> rrb.Blueprint:
     """Return the arrangement for one run, or for several side by side."""
     last = max(run.last for run in runs)
     plots = _plots(runs, last)

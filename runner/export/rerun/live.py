@@ -51,7 +51,7 @@ class LiveView:
         scene = scene_of(mdp)
         shown = Shown("", title, mdp, scene, learners, True, 0, None, values=False)
         self._stream = new_stream(run_id)
-        self._stream.connect_grpc(url, default_blueprint=blueprint([shown], play_state="following"))
+        self._stream.connect_grpc(url, default_blueprint=blueprint([shown]))
         self._stream.send_recording_name(title)
         marks = marks_of(scene) if scene else None
         words = vocabulary_of(mdp, scene, marks, learners, (0.0, 0.0))

@@ -131,7 +131,9 @@ class RunExporter:
         path = f"{self._source.root}/{phase}"
         mdp, covered = self._recording.mdp, list[tuple[int, int]]()
         writer = StepWriter(self._stream, path, phase, mdp, self._scene, self._marks, words, self._learners)
-        for batch in _batches(pieces):
+        plan = self._recording.config.get("evaluation") if phase == "eval" else None
+        trials = int(plan["trials"]) if plan else 0
+        for batch in _batches(pieces, trials):
             if not covered:
                 writer.dress()
             writer.write(batch)
@@ -193,26 +195,26 @@ Piece = tuple[NDArray[np.void], Thoughts, NDArray[np.int64]]
 """Steps, what the learners thought at them, and the training episode of each."""
 
 
-def _batches(pieces: Iterator[Piece]) -> Iterator[Batch]:
+def _batches(pieces: Iterator[Piece], trials: int) -> Iterator[Batch]:
     """Yield the pieces put together to batches that are worth sending."""
     waiting: list[Piece] = []
     before: NDArray[np.void] | None = None
     for piece in pieces:
         if waiting and sum(len(one[0]) for one in waiting) + len(piece[0]) > BATCH:
-            batch = _together(waiting, before)
+            batch = _together(waiting, before, trials)
             yield batch
             before, waiting = batch.records[-TRAIL_STEPS:], []
         waiting.append(piece)
     if waiting:
-        yield _together(waiting, before)
+        yield _together(waiting, before, trials)
 
 
-def _together(pieces: list[Piece], before: NDArray[np.void] | None) -> Batch:
+def _together(pieces: list[Piece], before: NDArray[np.void] | None, trials: int) -> Batch:
     records = np.concatenate([piece[0] for piece in pieces]) if len(pieces) > 1 else pieces[0][0]
     thoughts = _thoughts_together([piece[1] for piece in pieces])
     episode = np.concatenate([piece[2] for piece in pieces])
     time = records["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
-    return Batch(records, thoughts, episode, records[:0] if before is None else before, time)
+    return Batch(records, thoughts, episode, records[:0] if before is None else before, time, trials)
 
 
 def _thoughts_together(parts: list[Thoughts]) -> Thoughts:
