@@ -103,6 +103,8 @@ def select(recording: Recording, request: Request) -> Selection:
     selection = Selection()
     if not recording.finished or recording.result.get("status", "interrupted") != "finished":
         selection.warnings.append(_interrupted(recording))
+    if recording.mdp.scene is None or recording.mdp.scene_cells is None:
+        selection.warnings.append("The environment has no scene: state and action are shown as series.")
     if _has_no_steps(recording):
         _without_steps(recording, request, selection)
         return selection

@@ -79,6 +79,11 @@ class TestChoice:
             with_spot(run, Request(), (20, 6, 0))
 
 
+def test_an_environment_without_a_scene_is_named(pictured):
+    with open_recording(pictured("stairs").recording) as recording:
+        assert "no scene: state and action" in select(recording, Request()).warnings[0]
+
+
 class TestWithoutSteps:
     """A run of which only metrics were recorded."""
 
