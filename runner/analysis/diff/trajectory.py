@@ -133,9 +133,13 @@ def evaluation_partings(a: Recording, b: Recording) -> list[Parting]:
 
 
 def _evaluations(recording: Recording) -> list[tuple[int, int]]:
-    """Return the first trial of each evaluation and the one behind its last, counted over the run."""
+    """Return the first trial of each evaluation and the one behind its last, counted over the run.
+
+    Evaluations of which a cut-off recording does not hold every trial are left out.
+    """
+    recorded = recording.count(schema.EVAL_EPISODE)
     ends = np.cumsum([metrics["trials"] for metrics in recording.metrics("eval")], dtype=np.int64).tolist()
-    return list(zip([0, *ends[:-1]], ends, strict=True))
+    return [(first, end) for first, end in zip([0, *ends[:-1]], ends, strict=True) if end <= recorded]
 
 
 def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Block]:

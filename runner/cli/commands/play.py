@@ -104,7 +104,7 @@ def _require_steps(recording: Recording) -> None:
     if recording.config["recording"]["steps"] == "none":
         raise RecordingError(
             f"{recording.path}: was recorded without steps (recording.steps: none), so there is nothing to "
-            "play. Run it again with --set recording.steps=all: the same seed gives the same steps."
+            f"play. `dualtaxi rerecord {recording.run['run_id']}` records them."
         )
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli.options import find, json_option, recordings_option, run_argument
-from runner.cli.output import UNKNOWN, age, console, draw, duration, facts, print_json, size, title
+from runner.cli.output import UNKNOWN, age, console, draw, duration, facts, print_json, say, size, title
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -35,17 +35,25 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
       dualtaxi show k3v9m2xq --json
     """  # noqa: D301 - Click wants the backspace itself
     run = find(run_name, recordings)
-    if not run.recording.is_file():
-        told = _without_recording(run)
-    else:
-        from runner.recording.reader import open_recording
-
-        with open_recording(run.recording) as recording:
-            told = describe(run, recording)
+    told = _told(run)
     if as_json:
         print_json(told)
     else:
         _draw(run, told)
+
+
+def _told(run: Run) -> dict[str, Any]:
+    """Return all about a run; what `run.json` says where its recording is missing or cannot be read."""
+    from runner.errors import RecordingError
+    from runner.recording.reader import open_recording
+
+    if run.recording.is_file():
+        try:
+            with open_recording(run.recording) as recording:
+                return describe(run, recording)
+        except RecordingError as error:
+            say(f"Only what run.json says: {error}")
+    return _without_recording(run)
 
 
 def describe(run: Run, recording: Recording) -> dict[str, Any]:

@@ -42,7 +42,7 @@ def require_rerun(purpose: str) -> None:
     try:
         import rerun  # noqa: F401
     except ImportError as error:
-        raise MissingExtra("rerun-sdk", "rerun", purpose) from error
+        raise MissingExtra("rerun-sdk", "all", purpose) from error
 
 
 def viewer_program() -> Path:
