@@ -8,6 +8,7 @@ import signal
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from runner.config import ConfigError
 from runner.errors import EnvironmentNotUsable, RunnerError, RunNotFound
@@ -56,6 +57,16 @@ def test_without_evaluation_log_and_snapshots_only_the_first_and_last_tables_are
     taken = positions(make_run(tmp_path, LAKE, evaluation=None, log=None, snapshots={"every": None}))
     assert taken["evaluation"] == taken["log"] == []
     assert [episode for episode, _ in taken["snapshot"]] == [0, 12]
+
+
+def test_measures_of_training_are_taken_every_n_steps_and_at_no_other(tmp_path):
+    """Nor where training pauses one step before, or at, the n-th."""
+    often = {"evaluation": {"every": 1, "trials": 1}}
+    pauses = [step for _, step in positions(make_run(tmp_path, LAKE, often, log=None))["evaluation"]]
+    assert len(pauses) == 13
+    for n in {pauses[2] + 1, pauses[5], pauses[7] - 1}:
+        run = make_run(tmp_path, LAKE, often, log={"every_steps": n})
+        assert [step for _, step in positions(run)["log"]] == list(range(n, pauses[-1] + 1, n))
 
 
 def test_one_run_is_what_the_twin_does_from_beginning_to_end(tmp_path):
@@ -190,6 +201,10 @@ def test_a_run_that_is_told_to_stop_is_interrupted_and_closed_properly(asked, tm
     assert run.status == "interrupted"
     assert find_run(run.run_id, tmp_path).facts == run.facts
     check_integrity(run.recording)
+    with run.recording.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        times = [message.log_time for _, _, message in make_reader(stream).iter_messages()]
+    assert summary.statistics.message_end_time == max(times)
     with open_recording(run.recording) as recording, open_recording(whole.recording) as complete:
         assert recording.finished
         assert recording.result["status"] == recording.run_facts()["status"] == "interrupted"

@@ -16,6 +16,7 @@ from runner.learning.learner import Learner
 from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import pipeline, recorder, schema
+from runner.recording.digest import combine
 from tests.runner.learning.oracle import Twin
 from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
 
@@ -64,6 +65,11 @@ def test_the_digest_is_what_its_definition_says(made_of, tmp_path):
     assert said(run) == digest_of(run.recording)
     with open_recording(run.recording) as recording:
         assert (recording.result["content_digest"], recording.result["topic_digests"]) == said(run)
+
+
+def test_topics_have_no_order(taxis):
+    content, topics = said(taxis)
+    assert combine(dict(reversed(topics.items()))) == combine(topics) == content
 
 
 @pytest.mark.parametrize("packing", PACKINGS, ids=lambda packing: "-".join(map(str, packing.values())))

@@ -155,11 +155,13 @@ def test_a_system_that_cannot_keep_what_it_took_ends_the_run(tmp_path, monkeypat
 
     monkeypatch.setattr(RecordingFile, "sync", full)
     monkeypatch.setattr(pipeline, "SYNC_SECONDS", 0)
-    config = experiment(TAXIS, episodes=10**6)
+    config = experiment(LAKE, episodes=10**6, evaluation=None)
     run = create_run(tmp_path, config, 0)
+    told = []
     with pytest.raises(StorageError, match="No space left on device"):
-        run_job(Job(config, 0), run)
+        run_job(Job(config, 0), run, report=lambda progress: told.append(progress.episode))
     assert find_run(run.run_id, tmp_path).status == "failed"
+    assert max(told, default=0) < 900_000, "it is told soon, not when all is done"
 
 
 def test_an_error_while_packing_ends_the_run(tmp_path, monkeypatch):
