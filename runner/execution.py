@@ -27,6 +27,7 @@ from runner.recording.arrays import pack_array
 from runner.recording.chunks import Packing
 from runner.recording.messages import QTable, encode, encode_log, encode_q_table
 from runner.recording.past import Past
+from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder, storage_error
 from runner.recording.writer import RecordingFile
 from runner.runs import Run
@@ -186,12 +187,14 @@ class Session:
 
     def _boundaries(self) -> Iterator[int]:
         """Yield the episodes at which training pauses for an evaluation or a snapshot, and the last one."""
-        config = self._config
-        due = {0, config.episodes}
-        for every in (config.evaluation and config.evaluation.every, config.snapshots.every):
-            if every:
-                due.update(range(every, config.episodes, every))
-        yield from sorted(due)
+        last = self._config.episodes
+        evaluation = self._config.evaluation
+        paces = [every for every in (evaluation and evaluation.every, self._config.snapshots.every) if every]
+        episode = 0
+        while episode < last:
+            yield episode
+            episode = min([last, *(episode - episode % every + every for every in paces)])
+        yield last
 
     def _train(self, until_episode: int) -> bool:
         """Train up to an episode, reporting metrics on the way; return False if stopped."""
@@ -375,6 +378,14 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
     return _recorded_tables(start, job, run, mdp)
 
 
+def _last_step(recording: Recording) -> int:
+    """Return how many training steps a recording knows of, also one that leaves its steps out."""
+    recorded = recording.count(schema.TRAIN_STEP)
+    ended = recording.count(schema.TRAIN_EPISODE)
+    last = int(recording.episodes("train", ended - 1, ended)[0]["last_step"]) + 1 if ended else 0
+    return max(recorded, last)
+
+
 def _recorded_tables(start: RunTable, job: Job, run: Run, mdp: Mdp) -> list[Any]:
     """Return another run's tables after its last training step, or the step asked for.
 
@@ -382,12 +393,10 @@ def _recorded_tables(start: RunTable, job: Job, run: Run, mdp: Mdp) -> list[Any]
         RunnerError: there is no such run or step, or its tables have another shape.
     """
     from runner.analysis.tables import tables_at
-    from runner.recording.reader import open_recording
 
     source = runs.find_run(start.run, run.folder.parent, but=run.run_id)
     with open_recording(source.recording) as recording:
-        steps = recording.count(schema.TRAIN_STEP) or source.summary.get("train_steps", 0)
-        tables = tables_at(recording, steps if start.step is None else start.step)
+        tables = tables_at(recording, _last_step(recording) if start.step is None else start.step)
     joint = job.config.tables == "joint"
     shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
     if [table.shape for table in tables] != shapes:

@@ -10,6 +10,7 @@ knows which environment it was.
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import importlib
 import json
 import math
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.config.values import plain
-from runner.errors import EnvironmentNotUsable, nearest
+from runner.errors import EnvironmentNotUsable
 from runner.scene import is_text, is_whole, scene_mistake
 from runner.toy_text import grid_world
 
@@ -159,6 +160,23 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
         EnvironmentNotUsable: it is unknown, cannot be made, or has no transition table.
     """
     env = _make(env_id, dict(kwargs) | ({"competitive": True} if rewards == "individual" else {}))
+    try:
+        mdp = _read(env_id, kwargs, env, rewards)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise EnvironmentNotUsable(
+            f"environment {env_id!r}: what it tells of itself cannot be read "
+            f"({type(error).__name__}: {error}); docs/architecture.md says what is expected."
+        ) from error
+    finally:
+        env.close()
+    _check(mdp)
+    if rewards == "individual" and mdp.rewards.shape[-1] != len(mdp.agents):
+        raise _one_reward_only(env_id)
+    return mdp
+
+
+def _read(env_id: str, kwargs: Mapping[str, Any], env: Any, rewards: str) -> Mdp:
+    """Return what an environment tells of itself, not yet checked; a team shares the summed reward."""
     base = env.unwrapped
     limit = env.spec.max_episode_steps if env.spec is not None else None
     transitions = _transitions(env_id, base)
@@ -167,7 +185,9 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
     said: Any = described or base
     if described is not None:
         transitions["events"] = described.events
-    mdp = Mdp(
+    if rewards == "team":
+        transitions["rewards"] = transitions["rewards"].sum(axis=-1, keepdims=True)
+    return Mdp(
         env_id=env_id,
         kwargs=plain(kwargs),
         **transitions,
@@ -182,11 +202,6 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
         scene_cells=getattr(said, "scene_cells", None),
         scene_carriers=getattr(said, "scene_carriers", None),
     )
-    env.close()
-    _check(mdp)
-    if rewards == "individual" and mdp.rewards.shape[-1] != len(mdp.agents):
-        raise _one_reward_only(env_id)
-    return mdp
 
 
 def _one_reward_only(env_id: str) -> EnvironmentNotUsable:
@@ -209,15 +224,21 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
                 f"environment {env_id!r}: there is no module {error.name!r}; "
                 "install the package that brings it, or mend `env.id`."
             ) from error
+        except (ImportError, SyntaxError, TypeError, ValueError) as error:
+            raise EnvironmentNotUsable(
+                f"environment {env_id!r}: the module {module!r} cannot be imported ({error})."
+            ) from error
     if name not in gymnasium.registry:
-        newest = [
-            known for known in gymnasium.registry if known.rpartition("-v")[0] == name.rpartition("-v")[0]
-        ]
-        hint = f" Did you mean {newest[-1]!r}?" if newest else nearest(name, gymnasium.registry)
+        stems = {known.rpartition("-v")[0]: known for known in gymnasium.registry}  # the newest comes last
+        near = difflib.get_close_matches(name.rpartition("-v")[0], stems, n=1, cutoff=0.6)
+        before = (
+            f"{module}:" if module and near and stems[near[0]].startswith(name.rpartition("-v")[0]) else ""
+        )
+        hint = f" Did you mean '{before}{stems[near[0]]}'?" if near else ""
         raise EnvironmentNotUsable(f"environment {env_id!r}: Gymnasium knows no such id.{hint}")
     try:
         return gymnasium.make(name, disable_env_checker=True, **kwargs)
-    except (TypeError, ValueError, KeyError, gymnasium.error.Error, ImportError) as error:
+    except (AssertionError, LookupError, TypeError, ValueError, gymnasium.error.Error, ImportError) as error:
         if "competitive" in kwargs and "'competitive'" in str(error):
             raise _one_reward_only(env_id) from error
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
@@ -309,6 +330,8 @@ def _arrays_right(mdp: Mdp) -> Iterator[tuple[str, bool]]:
     yield "next_state must have three axes", mdp.next_state.ndim == 3 and mdp.next_state.size > 0
     yield "next_state must name states", _within(mdp.next_state, 0, shape[0])
     yield "shapes must agree", mdp.probability.shape == mdp.terminated.shape == mdp.events.shape == shape
+    stray = mdp.events >> np.uint32(len(mdp.event_names))
+    yield "events must have no other bits than there are names", not stray.any()
     yield "rewards must add one axis", mdp.rewards.ndim == 4 and mdp.rewards.shape[:-1] == shape
     yield "rewards must be one, or one an agent", mdp.rewards.shape[-1] in (1, len(mdp.agents))
     yield "rewards must be finite", bool(np.isfinite(mdp.rewards).all())

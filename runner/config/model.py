@@ -196,8 +196,8 @@ class Recording(Section):
         default="zstd", description="How the chunks of a recording are compressed."
     )
     level: Annotated[int, Field(ge=-7, le=19)] | None = Field(
-        default_factory=lambda chosen: 1 if chosen.get("compression") == "zstd" else None,
-        description="The level of zstd, from -7 (fast) to 19 (small); 1 unless given. Only with zstd.",
+        default_factory=lambda chosen: 3 if chosen.get("compression") == "zstd" else None,
+        description="The level of zstd, from -7 (fast) to 19 (small); 3 unless given. Only with zstd.",
     )
     index: Literal["message", "chunk"] = Field(
         default="message",

@@ -2,7 +2,7 @@
 
     with runner.recording.open("recordings/k3v9m2xq/recording.mcap") as recording:
         for block in recording.blocks(TRAIN_STEP):      # NumPy records, some thousands at a time
-            print(block["reward"].mean())
+            print(block["rewards"].mean())
 
 A block is the file's own bytes seen through the dtype of `schema.record_dtype`: no message is parsed one
 by one. It is the only way in which the rest of the project reads recordings.

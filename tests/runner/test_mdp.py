@@ -120,7 +120,7 @@ REFUSED = {
     "no such id": ("Taxy-v4", {}, r"'Taxy-v4'.*knows no such id.*'Taxi-v4'"),
     "nothing near": ("Zzzzzzzz-v0", {}, r"'Zzzzzzzz-v0'.*knows no such id\.$"),
     "an old version": ("Taxi-v3", {}, r"'Taxi-v3'.*Did you mean 'Taxi-v4'\?"),
-    "an old version of a module's": ("dualtaxi:DualTaxi-v0", {}, r"Did you mean 'DualTaxi-v1'\?"),
+    "an old version of a module's": ("dualtaxi:DualTaxi-v0", {}, r"Did you mean 'dualtaxi:DualTaxi-v1'\?"),
     "no such module": ("nosuchmodule:Taxi-v4", {}, r"no module 'nosuchmodule'.*install.*env\.id"),
     "no such part of a module": ("dualtaxi.nosuch:Taxi-v4", {}, r"no module 'dualtaxi.nosuch'"),
     "no table": ("CartPole-v1", {}, r"'CartPole-v1' offers no transition table.*Taxi-v4"),

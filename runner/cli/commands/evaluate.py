@@ -57,7 +57,7 @@ def command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    r"""Play the trained table of RUN, greedily, in new episodes.
+    """Play the trained table of RUN, greedily, in new episodes.
 
     The table of any moment can be played. The episodes are recorded as a run of its own, whose
     configuration names the run and step that the table comes from.
@@ -67,7 +67,7 @@ def command(
       dualtaxi evaluate @latest
       dualtaxi evaluate k3v9m2xq --step 50000 --trials 1000 --seed 7
       dualtaxi evaluate k3v9m2xq --all
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     if every_start and (trials is not None or start is not None):
         raise click.UsageError("--all plays each start state once: leave out --trials and --start.")
     from runner.again import evaluate

@@ -65,7 +65,7 @@ def command(
     force: bool,
     recordings: Path | None,
 ) -> None:
-    r"""Make a short film of a recorded episode of RUN, for slides and READMEs.
+    """Make a short film of a recorded episode of RUN, for slides and READMEs.
 
     Each frame has step, actions, rewards and events written below it. Without a choice it is the typical
     trial of the last evaluation: the median by success, return and length.
@@ -75,7 +75,7 @@ def command(
       dualtaxi export gif @latest
       dualtaxi export gif k3v9m2xq --eval 3000:7 -o trial.gif
       dualtaxi export gif k3v9m2xq --episode 0 --speed 8 --force
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     if episode is not None and chosen is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
     from runner.export.gif import require_packages, write_gif

@@ -123,7 +123,7 @@ def command(
     force: bool,
     recordings: Path | None,
 ) -> None:
-    r"""Export RUN for the Rerun viewer, arranged and ready to look at.
+    """Export RUN for the Rerun viewer, arranged and ready to look at.
 
     All metrics are exported. Of the steps, unless told otherwise, those of 20 training episodes spread
     from the first to the last, and the trials of the last evaluation: what is left out is said.
@@ -133,7 +133,7 @@ def command(
       dualtaxi export rerun @latest
       dualtaxi export rerun k3v9m2xq -o look.rrd --episodes 0:20,49980: --eval 49000
       dualtaxi export rerun k3v9m2xq --all --force
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     import time
 
     from runner.errors import StorageError

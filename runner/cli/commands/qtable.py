@@ -43,7 +43,7 @@ def command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    r"""Tell the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
+    """Tell the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
 
     With --state: its values, the greedy action (ties go to the first), how often each action was taken
     there so far, and which step last changed each value. In Python: runner.analysis.tables.tables_at().
@@ -53,7 +53,7 @@ def command(
       dualtaxi qtable @latest --episode 500
       dualtaxi qtable k3v9m2xq --step 50000 --state 17
       dualtaxi qtable k3v9m2xq --step 50000 --out table.npy
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     if step is not None and episode is not None:
         raise click.UsageError("--step and --episode exclude each other: choose one.")
     from runner.analysis.tables import TableReplay, last_step, step_of_episode

@@ -34,7 +34,7 @@ _WORDS: Final = {
 @json_option
 @click.pass_context
 def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json: bool) -> None:
-    r"""Make the recording of RUN, or one by its path, whole again: for every reader, with index and summary.
+    """Make the recording of RUN, or one by its path, whole again: for every reader, with index and summary.
 
     Every good chunk is copied to a new file, also those behind a damaged place; the file is read back and
     counted before it takes the place of the old one, which is not touched until then. Where something in
@@ -47,7 +47,7 @@ def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json:
     Examples:
       dualtaxi repair @latest
       dualtaxi repair backup/recording.mcap
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     from runner.recording.repair import repair
     from runner.verify import refuse_foreign
 

@@ -46,7 +46,7 @@ def command(
     force: bool,
     recordings: Path | None,
 ) -> None:
-    r"""Write one self-contained page about one or several runs.
+    """Write one self-contained page about one or several runs.
 
     It has the plots, what was learned before, in the middle of and after training, all evaluations, the
     configuration and provenance, and a replay of the best and the worst trial of the last evaluation and
@@ -57,7 +57,7 @@ def command(
       dualtaxi report @latest
       dualtaxi report cooperative competitive -o comparison.html
       dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     from runner.export.report import require_packages, write_report
     from runner.export.report_runs import find_runs, parse_trial, write_new
     from runner.runs import recordings_folder

@@ -16,7 +16,7 @@ from runner.cli.working import at_work, refuse_running, run_as_json, run_in_word
 @recordings_option
 @json_option
 def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
-    r"""Record the steps of RUN, which was run with recording.steps: none.
+    """Record the steps of RUN, which was run with recording.steps: none.
 
     The job is done again. The full recording takes the place of the old one when it is complete and has
     the content digest that the run had: that proves that these are its steps. A run that holds its steps
@@ -26,7 +26,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     Example:
       dualtaxi run configs/quick.yaml --set recording.steps=none
       dualtaxi rerecord @latest
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     from runner.again import holds_steps, rerecord
 
     run = find(run_name, recordings)

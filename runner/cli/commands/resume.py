@@ -25,7 +25,7 @@ from runner.cli.working import at_work, run_as_json, run_in_words
 def command(
     ctx: click.Context, run_name: str, accept_changes: bool, recordings: Path | None, as_json: bool
 ) -> None:
-    r"""Go on with RUN, interrupted or failed, to its end: as if it had never stopped.
+    """Go on with RUN, interrupted or failed, to its end: as if it had never stopped.
 
     Its job is done again without recording, which is quick, and compared with what is recorded, byte for
     byte; what is missing is then recorded. The content digest is that of an uninterrupted run. A recording
@@ -39,7 +39,7 @@ def command(
     Examples:
       dualtaxi resume @latest
       dualtaxi resume k3v9m2xq --json
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     from runner.resume import is_finished, resume
 
     run = find(run_name, recordings)

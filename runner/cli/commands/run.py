@@ -92,13 +92,15 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int) -> tuple[Run
 
             with announced(lambda: say("Compiling the learning kernel, this once: a few seconds.")):
                 run = run_job(job, run, report, interrupt)
-    return run, interrupt.came and run.status == "interrupted"
+    return run, interrupt.came
 
 
 def _tell_interrupted(run: Run, config: ExperimentConfig, begun: int) -> None:
     """Say what is kept, and what was not begun."""
     done, left = run.summary["episodes"], len(config.seeds) - begun
     say(f"Interrupted: {done:,} of {config.episodes:,} episodes are kept in {run.recording}.")
+    if run.status == "interrupted":
+        say(f"`dualtaxi resume {run.run_id}` goes on from there.")
     if left:
         say(f"Not begun: {left} of {len(config.seeds)} seeds, from {config.seeds[begun]} on.")
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @json_option
 @click.pass_context
 def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | None, as_json: bool) -> None:
-    r"""Check RUN, or a recording by its path: every byte, step, episode, figure and table.
+    """Check RUN, or a recording by its path: every byte, step, episode, figure and table.
 
     The job is done again, in memory, by the environment that the recording holds, and compared. The first
     thing that is wrong is named: topic, episode, step, field, what was found and what was expected. With
@@ -38,7 +38,7 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
       dualtaxi verify @latest
       dualtaxi verify k3v9m2xq --rerun
       dualtaxi verify backup/recording.mcap --json
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     from runner.verify import verify
 
     path, run = recording_of(run_name, recordings)

@@ -74,7 +74,7 @@ def command(
     everything: bool,
     recordings: Path | None,
 ) -> None:
-    r"""Look at RUN in the Rerun viewer, at the right spot; at two runs side by side.
+    """Look at RUN in the Rerun viewer, at the right spot; at two runs side by side.
 
     The run is exported first, unless it was before; which steps, is chosen as for `export rerun`, and the
     episode of --at is among them. It ends when the viewer is closed, or by Ctrl-C.
@@ -85,7 +85,7 @@ def command(
       dualtaxi view @latest --at 2999:3
       dualtaxi view first second --web
       dualtaxi view @latest --at eval:3000:0:4 --screenshot step.png
-    """
+    """  # noqa: D301 - Click wants the backspace itself
     if len(run_names) > 2:
         raise click.UsageError(f"found {len(run_names)} runs, expected one or two.")
     from runner.export.rerun.viewer import require_rerun
