@@ -47,7 +47,7 @@ def test_one_line_is_a_whole_experiment(write):
     assert (config.log.every_steps, config.log.window, config.log.episodes) == (50_000, 50_000, 50)
     assert config.snapshots.every is None
     recording = config.recording
-    assert (recording.steps, recording.compression, recording.level) == ("all", "zstd", 1)
+    assert (recording.steps, recording.compression, recording.level) == ("all", "zstd", 3)
     assert (recording.index, recording.chunk_steps) == ("message", 16_384)
     assert set(dict(config.quirks).values()) == {False}
 
