@@ -100,7 +100,7 @@ def test_without_steps_there_is_nothing_to_play(command, tiny):
     command("run", tiny, "--set", "recording.steps=none")
     result = command("play", "@latest")
     assert result.exit_code == 2
-    assert "recording.steps=all" in result.stderr
+    assert "dualtaxi rerecord" in result.stderr
 
 
 def test_the_environment_need_not_be_installed(recorded_run, command, tmp_path, monkeypatch):
