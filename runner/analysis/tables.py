@@ -248,7 +248,7 @@ def _snapshot_before(recording: Recording, step: int) -> list[QTable]:
     learners = int(recording.run["learners"])
     nearest: list[QTable] = []
     group: list[QTable] = []
-    for snapshot in recording.snapshots():
+    for snapshot in recording.snapshots(step):
         if snapshot.step > step:
             break
         group = [*group, snapshot] if group and group[0].step == snapshot.step else [snapshot]

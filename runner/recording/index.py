@@ -29,7 +29,7 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES
+from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES, MESSAGE_HEAD
 from runner.recording.schema import PROFILE, TOPICS
 
 K = TypeVar("K")
@@ -102,8 +102,8 @@ class ChunkTable:
         if entry.length > MAX_CHUNK_BYTES or entry.uncompressed_size > MAX_CHUNK_BYTES:
             size = max(entry.length, entry.uncompressed_size)
             raise RecordingError(f"{where} declares {size:,} bytes, expected at most {MAX_CHUNK_BYTES:,}.")
-        if entry.length < 9 + CHUNK_HEAD.size + 8:
-            raise RecordingError(f"{where} declares {entry.length} bytes, fewer than any chunk has.")
+        if entry.length < 9 + CHUNK_HEAD.size + 8 or entry.uncompressed_size < MESSAGE_HEAD.size:
+            raise RecordingError(f"{where} declares fewer bytes than a chunk with a message has.")
         if len(self) and entry.offset < sum(self[len(self) - 1][:2]):
             raise RecordingError(f"{where} overlaps the one before it in the index.")
         if len(self) == MAX_CHUNKS:

@@ -26,6 +26,7 @@ from runner.recording.contents import UNREADABLE, attachment_of, metadata_of
 HEADER, SCHEMA, CHANNEL, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 3, 4, 6, 7, 8
 ATTACHMENT, ATTACHMENT_INDEX, METADATA, METADATA_INDEX, DATA_END, FOOTER = 9, 10, 12, 13, 15, 2
 
+_MOST_CONTENT = 4 << 20
 Bytes = Callable[[bytes], bytes]
 """Changes some bytes, somehow."""
 
@@ -199,6 +200,7 @@ def _chunk(body: bytes, rng: random.Random, change: Bytes) -> bytes:
         content *= rng.choice((2, 3, 100))
     else:
         content = bytes(rng.choice((1, 31, 1000, 1 << 20)))
+    content = content[:_MOST_CONTENT]  # who makes it is measured as well as who reads it
     compression = head.compression if rng.random() < 0.5 else rng.choice(("zstd", "lz4", ""))
     return chunk_body(content, compression, body[:16])
 

@@ -106,6 +106,13 @@ def read_episodes(recording: Recording) -> None:
         for episode in (0, recording.count(schema.PHASES[phase][1])):
             with contextlib.suppress(RunnerError):
                 recording.episode_steps(phase, episode)
+        for blocks in (
+            recording.blocks_of_episodes(phase, 0, 1),
+            recording.blocks_between(schema.PHASES[phase][0], 10**9, 10**12),
+        ):
+            with contextlib.suppress(RunnerError):
+                for _ in blocks:
+                    pass
 
 
 def read_snapshots(recording: Recording) -> None:

@@ -1,0 +1,95 @@
+"""The reader: a full read against the official library, and one episode out of the middle of a recording."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from benchmarks.figures import Figure, figure, seconds
+from benchmarks.processes import run, run_command
+from runner.recording import open as open_recording
+from runner.recording import schema
+
+STEP_TOPICS = (schema.TRAIN_STEP, schema.EVAL_STEP)
+FIELDS = tuple(field.name for field in schema.STEP.fields)
+
+
+def measure(quick: bool) -> list[Figure]:
+    """Return steps a second of both, their ratio, and milliseconds for an episode."""
+    repetitions, theirs = (3, 20_000) if quick else (7, 100_000)
+    with tempfile.TemporaryDirectory() as folder:
+        path = tutorial(folder)
+        rates, official, episodes = [], [], []
+        steps = read_all(path)
+        for _ in range(repetitions):
+            official.append(theirs / seconds(lambda: read_officially(path, theirs)))
+            rates.append(steps / seconds(lambda: read_all(path)))
+            episodes.append(1e3 * seconds(lambda: read_episode(path)))
+        size = path.stat().st_size
+    ratios = [fast / slow for fast, slow in zip(rates, official, strict=True)]
+    return [
+        figure(
+            "full read against the official reader",
+            ratios,
+            "x",
+            (50, 100),
+            detail="every field of every step summed; theirs decodes protobuf, with checksums, as ours",
+        ),
+        figure(
+            "  full read, every field summed",
+            [rate / 1e6 for rate in rates],
+            "M steps/s",
+            (8, 15),
+            detail=f"{steps / 1e6:.2f} M steps, {size / 1e6:.0f} MB, in the system's cache",
+        ),
+        figure("  official reader", [rate / 1e6 for rate in official], "M steps/s"),
+        figure(
+            "open, and read an episode in the middle",
+            episodes,
+            "ms",
+            (50, 10),
+            higher_is_better=False,
+            detail=f"of {steps / 1e6:.1f} M steps; nothing kept from before",
+        ),
+    ]
+
+
+def tutorial(folder: str) -> Path:
+    """Return the recording of the cooperative tutorial, made anew."""
+    run(run_command("tutorial_cooperative", folder))
+    (path,) = Path(folder).glob("*/recording.mcap")
+    return path
+
+
+def read_all(path: Path) -> int:
+    """Sum every field of every step, block by block; return how many steps there are."""
+    steps, total = 0, 0.0
+    with open_recording(path) as recording:
+        for topic in STEP_TOPICS:
+            for block in recording.blocks(topic):
+                steps += len(block)
+                for name in FIELDS:
+                    total += block[name].sum()
+    return steps
+
+
+def read_officially(path: Path, steps: int) -> None:
+    """Sum every field of the first steps, by the official library."""
+    total = 0.0
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        topics = [topic.name for topic in STEP_TOPICS]
+        messages = reader.iter_decoded_messages(topics=topics, log_time_order=False)
+        for (_, _, _, step), _ in zip(messages, range(steps), strict=False):
+            for name in FIELDS:
+                value = getattr(step, name)
+                total += sum(value) if name == "rewards" else value
+
+
+def read_episode(path: Path) -> None:
+    """Open the recording and read one episode in its middle."""
+    with open_recording(path) as recording:
+        recording.episode_steps("train", recording.count(schema.TRAIN_EPISODE) // 2)
