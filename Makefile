@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help run test lint bench clean
+.PHONY: help run test lint bench soak fuzz damage clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-8s %s\n", $$1, $$2}'
@@ -26,6 +26,16 @@ lint: $(VENV)/.installed-dev  ## formatting, style and strict types
 
 bench: $(VENV)/.installed-dev  ## measure what docs/performance.md states
 	$(BIN)/python -m benchmarks
+
+soak: $(VENV)/.installed-dev  ## kill 200 runs at random moments, and resume each
+	$(BIN)/python -m tests.reliability.soak --kills 200
+
+fuzz: $(VENV)/.installed-dev  ## feed the reader a million mutated recordings (Linux)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt atheris
+	$(BIN)/python -W ignore -m tests.reliability.fuzz --runs 1000000
+
+damage: $(VENV)/.installed-dev  ## change 10,000 single bytes, each to be found by verify
+	$(BIN)/python -m tests.reliability.damage
 
 clean:  ## remove the environment and caches; recordings stay
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
