@@ -1,7 +1,7 @@
 """What differs between two runs: one object, which text, JSON, Markdown and HTML are made of.
 
 with open_recording(path_a) as a, open_recording(path_b) as b:
-difference = diff(a, b)
+    difference = diff(a, b)
 print(difference.parting, difference.cause)
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from runner.analysis.diff.causes import Cause, Update, cause_of
+from runner.analysis.diff.causes import Cause, Row, Update, cause_of
 from runner.analysis.diff.metrics import MetricDiff, metric_diffs
 from runner.analysis.diff.settings import (
     Change,
@@ -27,7 +27,7 @@ from runner.analysis.diff.trajectory import (
     evaluation_partings,
     training_overlap,
     training_parting,
-    visits,
+    unbroken,
 )
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -40,6 +40,7 @@ __all__ = [
     "MetricDiff",
     "Overlap",
     "Parting",
+    "Row",
     "RunDiff",
     "TableDiff",
     "TransitionChange",
@@ -66,7 +67,7 @@ class RunDiff:
     cause: Cause | None = None
     overlap: Overlap | None = None
     evaluations: list[tuple[Parting, Cause]] = field(default_factory=list)
-    """For each evaluation that parts: where, and why."""
+    """The first evaluation that parts: where, and why; empty if none does."""
     tables: list[TableDiff] = field(default_factory=list)
     metrics: list[MetricDiff] = field(default_factory=list)
     costs: list[Change] = field(default_factory=list)
@@ -101,22 +102,30 @@ def diff(
     }
     if same:
         return RunDiff(**facts)
-    with_steps = all(recording.count(schema.TRAIN_STEP) for recording in (a, b))
-    comparable = a.mdp.next_state.shape[:2] == b.mdp.next_state.shape[:2]
-    if with_steps and comparable:
+    seen = None
+    if _can_compare_steps(a, b):
         parting = training_parting(a, b)
-        facts["parting"] = parting
-        facts["cause"] = parting and cause_of(parting, a, b)
-        if first:
-            return RunDiff(**facts)
-        facts["overlap"] = training_overlap(a, b)
-        facts["evaluations"] = [(part, cause_of(part, a, b)) for part in evaluation_partings(a, b)[:1]]
+        cause = None if parting is None else cause_of(parting, a, b)
+        facts |= {"parting": parting, "cause": cause}
+        if not first:
+            facts["overlap"], seen = training_overlap(a, b)
+            known = None if parting is None or cause is None else (parting, cause)
+            parted = next(evaluation_partings(a, b), None)
+            facts["evaluations"] = [] if parted is None else [(parted, cause_of(parted, a, b, known))]
     if first:
         return RunDiff(**facts)
-    seen = visits(a) + visits(b) if with_steps and comparable else None
-    facts["tables"] = list(table_diffs(a, b, seen)) if comparable else []
+    facts["tables"] = list(table_diffs(a, b, seen)) if _same_sizes(a, b) else []
     facts["metrics"] = metric_diffs(a, b, targets or {})
     return RunDiff(**facts)
+
+
+def _same_sizes(a: Recording, b: Recording) -> bool:
+    """Return whether states and actions of both can be the same."""
+    return a.mdp.next_state.shape[:2] == b.mdp.next_state.shape[:2]
+
+
+def _can_compare_steps(a: Recording, b: Recording) -> bool:
+    return _same_sizes(a, b) and all(recording.count(schema.TRAIN_STEP) for recording in (a, b))
 
 
 def _who(recording: Recording) -> dict[str, Any]:
@@ -148,7 +157,10 @@ def _notes(a: Recording, b: Recording) -> list[str]:
         if not recording.count(schema.TRAIN_STEP):
             again = f"`dualtaxi rerecord {recording.run['run_id']}` records them"
             notes.append(f"{name} holds no steps, so no trajectory is compared; {again}")
-    if a.mdp.next_state.shape[:2] != b.mdp.next_state.shape[:2]:
+        whole = unbroken(recording, "train")[0]
+        if whole < recording.count(schema.TRAIN_STEP):
+            notes.append(f"{name} lost steps from step {whole:,} on: training is compared up to there")
+    if not _same_sizes(a, b):
         notes.append("the environments have other states or actions: neither steps nor tables are compared")
     elif a.run["learners"] != b.run["learners"]:
         notes.append("other modes: rewards are compared summed, and Q-tables not at all")

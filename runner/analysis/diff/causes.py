@@ -8,17 +8,22 @@ runs up to there side by side.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.diff.tables import own_actions_in_words
 from runner.analysis.diff.trajectory import Parting
-from runner.analysis.tables import TableReplay
+from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.words import actions_in_words, states_in_words
+
+if TYPE_CHECKING:
+    from runner.analysis.tables import TableReplay
 
 _STEPS_AT_ONCE = 1 << 16
 
@@ -37,6 +42,19 @@ class Update:
     """The value after the update, in each run."""
     rewards_a: list[float]
     rewards_b: list[float]
+    reasons: list[str] = field(default_factory=list)
+    """What went into the update and differs, in words."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """The Q-values of one agent in a state, in both runs."""
+
+    agent: str
+    actions: list[str]
+    """What each value is of, in words."""
+    a: list[float]
+    b: list[float]
 
 
 @dataclass(frozen=True)
@@ -46,73 +64,148 @@ class Cause:
     kind: str
     """start, exploration, random_action, greedy_action, transition, or end."""
     text: str
-    rows: dict[str, dict[str, list[float]]] = field(default_factory=dict)
-    """Agent to its Q-values in that state, in run a and b."""
+    rows: list[Row] = field(default_factory=list)
+    """The Q-values of each agent in the state in which the greedy actions differ."""
     update: Update | None = None
 
 
-def cause_of(parting: Parting, a: Recording, b: Recording) -> Cause:
-    """Return why two runs part where they do."""
+def cause_of(
+    parting: Parting, a: Recording, b: Recording, training: tuple[Parting, Cause] | None = None
+) -> Cause:
+    """Return why two runs part where they do.
+
+    Args:
+        parting: where.
+        a: one run.
+        b: the other.
+        training: where and why their training parts, if that is known; it spares finding it again.
+    """
     left, right = parting.a_step, parting.b_step
     if left is None or right is None:
         longer = "B" if left is None else "A"
         return Cause("end", f"the same as far as the shorter goes; only {longer} goes on")
+    for recording, step in ((a, left), (b, right)):
+        _check(recording, step)
+    if parting.field in ("episode", "t"):
+        return Cause("transition", f"an episode ended in one of them: {_outcome_text(parting)}")
     if parting.t == 0 and left["state"] != right["state"]:
         states = [states_in_words(r.mdp)[s["state"]] for r, s in ((a, left), (b, right))]
         return Cause("start", f"other start state: {states[0]} in A, {states[1]} in B")
     if bool(left["explored"]) != bool(right["explored"]):
-        explorer = "A" if left["explored"] else "B"
-        return Cause("exploration", f"{explorer} explored there, the other took its greedy action")
+        explorer, other = ("A", "B") if left["explored"] else ("B", "A")
+        return Cause("exploration", f"{explorer} explored there, {other} took its greedy action")
+    return _action_or_outcome(parting, a, b, training)
+
+
+def _action_or_outcome(
+    parting: Parting, a: Recording, b: Recording, training: tuple[Parting, Cause] | None
+) -> Cause:
+    """Return why two runs part that were in the same state, and explored alike."""
+    left, right = parting.a_step, parting.b_step
+    assert left is not None
+    assert right is not None
     actions = [actions_in_words(r.mdp)[s["action"]] for r, s in ((a, left), (b, right))]
-    if left["action"] != right["action"]:
-        text = f"{actions[0]} in A, {actions[1]} in B"
-        if left["explored"]:
-            return Cause("random_action", f"both explored, and drew another action: {text}")
-        return _greedy(parting, a, b, text)
-    return Cause(
-        "transition", f"the same action ({actions[0]}) led to something else: {_outcome_text(parting)}"
-    )
+    if left["action"] == right["action"]:
+        told = _outcome_text(parting, a, b)
+        return Cause("transition", f"the same action ({actions[0]}) led to something else: {told}")
+    text = f"{actions[0]} in A, {actions[1]} in B"
+    if left["explored"]:
+        return Cause("random_action", f"both explored, and drew another action: {text}")
+    return _greedy(parting, a, b, text, training)
 
 
-def _outcome_text(parting: Parting) -> str:
-    return f"{parting.field.replace('_', ' ')} {parting.a} in A, {parting.b} in B"
+def _check(recording: Recording, step: np.void) -> None:
+    """Refuse a step that the environment cannot have.
+
+    Raises:
+        RecordingError: it is one.
+    """
+    mdp = recording.mdp
+    bounds = {"state": mdp.states, "next_state": mdp.states, "action": mdp.joint_actions}
+    for name, bound in bounds.items():
+        if step[name] >= bound:
+            raise RecordingError(
+                f"{recording.path}: found {name} {step[name]} in step {step['step']} of its phase, expected "
+                f"less than {bound}; `dualtaxi verify` tells what else is wrong."
+            )
 
 
-def _greedy(parting: Parting, a: Recording, b: Recording, text: str) -> Cause:
+def _outcome_text(parting: Parting, *recordings: Recording) -> str:
+    """Return what differs in words: `rewards [-10.0] in A, [-7.0] in B`."""
+    values = [parting.a, parting.b]
+    if parting.field in ("state", "next_state") and recordings:
+        values = [states_in_words(r.mdp)[v] for r, v in zip(recordings, values, strict=True)]
+    elif parting.field == "rewards":
+        values = [_reward_text(value) for value in values]
+    name = "reward" if parting.field == "rewards" else parting.field.replace("_", " ")
+    return f"{name} {values[0]} in A, {values[1]} in B"
+
+
+def _reward_text(rewards: list[float]) -> str:
+    return " and ".join(f"{reward:g}" for reward in rewards)
+
+
+def _greedy(
+    parting: Parting, a: Recording, b: Recording, text: str, training: tuple[Parting, Cause] | None
+) -> Cause:
     """Return the cause of another greedy action, with both Q-rows, and the first update that differs."""
-    step = _training_step(parting, a)
-    replays = [TableReplay(recording, step) for recording in (a, b)]
+    from runner.analysis.tables import TableReplay
+
+    cause = Cause("greedy_action", f"other greedy action: {text}")
+    steps = [_training_step(parting, recording) for recording in (a, b)]
+    known = training is not None and training[0].step < min(steps)
+    try:
+        if known or steps[0] != steps[1] or a.run["agents"] != b.run["agents"]:
+            replays = [TableReplay(recording, step) for recording, step in zip((a, b), steps, strict=True)]
+            update = training[1].update if training is not None and known else None
+        else:
+            replays, update = _replayed(a, b, steps[0])
+    except RecordingError as error:
+        return dataclasses.replace(cause, text=f"{cause.text}; the tables there cannot be had ({error})")
     assert parting.a_step is not None
-    state = int(parting.a_step["state"])
-    rows = {
-        agent: {name: replay.tables[i][state].tolist() for name, replay in zip("ab", replays, strict=True)}
-        for i, agent in enumerate(replays[0].agents)
-        if replays[0].agents == replays[1].agents
-    }
-    return Cause("greedy_action", f"other greedy action: {text}", rows, first_update(a, b, step))
+    return dataclasses.replace(cause, rows=_rows(replays, a, int(parting.a_step["state"])), update=update)
 
 
-def _training_step(parting: Parting, a: Recording) -> int:
-    """Return how many training steps were taken when the parting step was chosen."""
+def _rows(replays: list[TableReplay], a: Recording, state: int) -> list[Row]:
+    """Return the Q-values in a state; none if the runs have other agents."""
+    left, right = replays
+    if left.agents != right.agents:
+        return []
+    return [
+        Row(
+            agent, own_actions_in_words(a.mdp, i, ours.shape[1]), ours[state].tolist(), theirs[state].tolist()
+        )
+        for i, (agent, ours, theirs) in enumerate(zip(left.agents, left.tables, right.tables, strict=True))
+    ]
+
+
+def _training_step(parting: Parting, recording: Recording) -> int:
+    """Return how many training steps a run had taken when the parting step was chosen."""
     if parting.evaluation is None:
         return parting.step
-    return int(a.metrics("eval")[parting.evaluation]["step"])
+    return int(recording.metrics("eval")[parting.evaluation]["step"])
 
 
-def first_update(a: Recording, b: Recording, stop: int) -> Update | None:
-    """Return the first update within `stop` steps after which two runs' tables differ; None if none does.
+def _replayed(a: Recording, b: Recording, stop: int) -> tuple[list[TableReplay], Update | None]:
+    """Return both runs' tables at a step up to which they went alike, and the first update that differs.
 
-    Both runs are replayed from their beginning, so this takes the time of reading that many steps twice.
+    Raises:
+        RecordingError: the tables cannot be had.
     """
+    from runner.analysis.tables import TableReplay
+
     start = _last_equal_snapshot(a, b, stop)
     left, right = TableReplay(a, start), TableReplay(b, start)
-    if left.agents != right.agents or not _same(left, right):
-        return None
-    for step in range(start, stop, _STEPS_AT_ONCE):
-        k = _first_difference(left, right, step, min(step + _STEPS_AT_ONCE, stop))
-        if k is not None:
-            return _update_at(a, b, k)
-    return None
+    update = None
+    if _same(left, right):
+        for step in range(start, stop, _STEPS_AT_ONCE):
+            k = _first_difference(left, right, step, min(step + _STEPS_AT_ONCE, stop))
+            if k is not None:
+                update = _update_at(a, b, k, left, right)
+                break
+    for replay in (left, right):
+        replay.advance(stop)
+    return [left, right], update
 
 
 def _last_equal_snapshot(a: Recording, b: Recording, stop: int) -> int:
@@ -131,21 +224,26 @@ def _last_equal_snapshot(a: Recording, b: Recording, stop: int) -> int:
 
 
 def _first_difference(left: TableReplay, right: TableReplay, start: int, stop: int) -> int | None:
-    """Replay both up to `stop`; return the step whose update made them differ first, by bisection."""
-    before = [[table.copy() for table in replay.tables] for replay in (left, right)]
+    """Replay both up to `stop`; return the step whose update made them differ first, by bisection.
+
+    If there is one, both are left before that step.
+    """
+    before = [table.copy() for table in left.tables]
     left.advance(stop)
     right.advance(stop)
     if _same(left, right):
         return None
     while stop - start > 1:
         middle = (start + stop) // 2
-        for replay, tables in zip((left, right), before, strict=True):
-            replay.rewind(start, tables)
+        for replay in (left, right):
+            replay.rewind(start, before)
             replay.advance(middle)
         if _same(left, right):
-            start, before = middle, [[table.copy() for table in replay.tables] for replay in (left, right)]
+            start, before = middle, [table.copy() for table in left.tables]
         else:
             stop = middle
+    for replay in (left, right):
+        replay.rewind(start, before)
     return start
 
 
@@ -153,30 +251,64 @@ def _same(left: TableReplay, right: TableReplay) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(left.tables, right.tables, strict=True))
 
 
-def _update_at(a: Recording, b: Recording, step: int) -> Update:
-    """Return the update of a step, with its value in both runs."""
+def _update_at(a: Recording, b: Recording, step: int, left: TableReplay, right: TableReplay) -> Update:
+    """Return the update of a step that makes the tables differ; both replays stand before it."""
     records = [next(recording.blocks(schema.TRAIN_STEP, step, step + 1))[0] for recording in (a, b)]
-    after = [TableReplay(recording, step + 1) for recording in (a, b)]
+    left.advance(step + 1)
+    right.advance(step + 1)
     state = int(records[0]["state"])
-    learner, action = _changed_cell([replay.tables for replay in after], state)
-    words = actions_in_words(a.mdp)[int(records[0]["action"])]
+    learner, action = _changed_cell(left.tables, right.tables, state)
+    names = own_actions_in_words(a.mdp, learner, left.tables[learner].shape[1])
     return Update(
         step=step,
         episode=int(records[0]["episode"]),
         state=str(states_in_words(a.mdp)[state]),
-        action=str(words),
-        agent=after[0].agents[learner],
-        a=float(after[0].tables[learner][state, action]),
-        b=float(after[1].tables[learner][state, action]),
+        action=names[action],
+        agent=left.agents[learner],
+        a=float(left.tables[learner][state, action]),
+        b=float(right.tables[learner][state, action]),
         rewards_a=records[0]["rewards"].tolist(),
         rewards_b=records[1]["rewards"].tolist(),
+        reasons=_reasons(a, b, records),
     )
 
 
-def _changed_cell(tables: list[list[NDArray[Any]]], state: int) -> tuple[int, int]:
+def _changed_cell(ours: list[NDArray[Any]], theirs: list[NDArray[Any]], state: int) -> tuple[int, int]:
     """Return the learner and own action in which two sets of tables differ in a state."""
-    for learner, (left, right) in enumerate(zip(*tables, strict=True)):
+    for learner, (left, right) in enumerate(zip(ours, theirs, strict=True)):
         differs = np.flatnonzero(left[state] != right[state])
         if len(differs):
             return learner, int(differs[0])
     return 0, 0
+
+
+def _reasons(a: Recording, b: Recording, records: list[np.void]) -> list[str]:
+    """Return what went into an update of both runs and differs, in words."""
+    from runner.config import from_mapping
+    from runner.learning.schedules import compile_schedule, schedule_value
+
+    left, right = (from_mapping(recording.config) for recording in (a, b))
+    episode, step = int(records[0]["episode"]), int(records[0]["step"])
+    said = []
+    rewards = [record["rewards"].tolist() for record in records]
+    if rewards[0] != rewards[1]:
+        said.append(f"the reward was {_reward_text(rewards[0])} in A, {_reward_text(rewards[1])} in B")
+    for name in ("step_size", "discount"):
+        schedules = [compile_schedule(getattr(config, name)) for config in (left, right)]
+        x, y = (float(schedule_value(schedule, episode, step)) for schedule in schedules)
+        if x != y:
+            said.append(f"the {name.replace('_', ' ')} was {x:g} in A, {y:g} in B")
+    if left.quirks.second_table_uses_first_action != right.quirks.second_table_uses_first_action:
+        quirky = "A" if left.quirks.second_table_uses_first_action else "B"
+        said.append(
+            f"{quirky} updated the second agent's table at the first agent's action "
+            "(quirks.second_table_uses_first_action)"
+        )
+    if left.quirks.bootstrap_after_termination != right.quirks.bootstrap_after_termination:
+        quirky = "A" if left.quirks.bootstrap_after_termination else "B"
+        if records[0]["terminated"]:
+            said.append(
+                f"{quirky} added the value of the next state although the episode had ended "
+                "(quirks.bootstrap_after_termination)"
+            )
+    return said

@@ -7,7 +7,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from runner.analysis.diff import Cause, Change, Parting, RunDiff, Update
+from runner.analysis.diff import NOT_CONTENT, Cause, Change, Parting, RunDiff
+from runner.words import spoken
+
+MOST_NAMED = 4
+"""So many settings are named in the first sentences."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +63,28 @@ def _runs(difference: RunDiff) -> Section:
         (name, who["run_id"], who["name"], str(who["seed"]), who["status"])
         for name, who in (("A", difference.a), ("B", difference.b))
     ]
-    verdict = "The content is the same." if difference.same_content else "The content differs."
     grid = Grid(("", "id", "name", "seed", "status"), rows)
-    return Section("Runs", [verdict, *(f"Note: {note}." for note in difference.notes)], [grid])
+    return Section("Runs", [in_short(difference), *(f"Note: {note}." for note in difference.notes)], [grid])
+
+
+def in_short(difference: RunDiff) -> str:
+    """Return the outcome in a few sentences: whether they differ, in which settings, from where on."""
+    if difference.same_content:
+        return "The content is the same, to the last byte."
+    settings = [change for change in difference.config if change.path.split(".")[0] not in NOT_CONTENT]
+    said = ["The content differs."]
+    if settings:
+        told = "; ".join(f"{c.path} ({_text(c.a)} in A, {_text(c.b)} in B)" for c in settings[:MOST_NAMED])
+        more = f"; and {len(settings) - MOST_NAMED} more" if len(settings) > MOST_NAMED else ""
+        said.append(f"Of the settings, {told}{more} {'differ' if len(settings) > 1 else 'differs'}.")
+    else:
+        said.append("The settings are the same.")
+    parting = difference.parting
+    if parting is not None and parting.step:
+        said.append(f"Training is the same for {parting.step:,} steps.")
+    elif parting is not None:
+        said.append("Training differs from the first step on.")
+    return " ".join(said)
 
 
 def _changes(title: str, changes: list[Change]) -> Section:
@@ -120,35 +143,41 @@ def _evaluations(difference: RunDiff) -> Section:
 
 
 def _told(parting: Parting, cause: Cause) -> list[str]:
-    where = f"episode {parting.episode:,}, t {parting.t}"
-    if parting.evaluation is not None:
-        where = f"evaluation {parting.evaluation}, trial {parting.episode:,}, t {parting.t}"
-    said = [
-        f"They part at {where} (step {parting.step:,}) in {parting.field.replace('_', ' ')}: {cause.text}."
-    ]
-    if cause.update is not None:
-        said.append(_update_told(cause.update))
-    return said
+    return [f"They part {where_in_words(parting)}: {cause.text}.", *updates_in_words(cause)]
 
 
-def _update_told(update: Update) -> str:
-    rewards = ""
-    if update.rewards_a != update.rewards_b:
-        rewards = f" (rewards {update.rewards_a} and {update.rewards_b})"
+def where_in_words(parting: Parting) -> str:
+    """Return where two runs part: `in training episode 70, at its step 360 (training step 46,202)`."""
+    if parting.after is None:
+        return f"in training episode {parting.episode:,}, at t = {parting.t} (training step {parting.step:,})"
     return (
-        f"The tables came to differ at step {update.step:,}, in episode {update.episode:,}: {update.agent}'s "
-        f"value of {update.action} in {update.state} became {update.a:.6g} in A and {update.b:.6g} in B"
-        f"{rewards}."
+        f"in the evaluation after {parting.after:,} training episodes, in trial {parting.episode:,}, "
+        f"at t = {parting.t} (evaluation step {parting.step:,} of A)"
     )
+
+
+def updates_in_words(cause: Cause) -> list[str]:
+    """Return how the tables came to differ, in a sentence or two; none if that is not the cause."""
+    update = cause.update
+    if update is None:
+        return []
+    said = [
+        f"The tables came to differ before, by the update of training step {update.step:,} in episode "
+        f"{update.episode:,}: {spoken(update.agent)}'s value of {update.action} in the state "
+        f"({update.state}) became {update.a:.6g} in A and {update.b:.6g} in B."
+    ]
+    if update.reasons:
+        said.append(f"Why that update differs: {'; '.join(update.reasons)}.")
+    return said
 
 
 def _q_rows(cause: Cause) -> list[Grid]:
     """Return the Q-values of the state in which the greedy actions differ, the best of each agent."""
     grids = []
-    for agent, rows in cause.rows.items():
-        best = sorted({_argmax(rows["a"]), _argmax(rows["b"])})
-        cells = [(f"action {j}", f"{rows['a'][j]:.6g}", f"{rows['b'][j]:.6g}") for j in best]
-        grids.append(Grid((f"Q of {agent}, the greedy ones", "A", "B"), cells))
+    for row in cause.rows:
+        best = dict.fromkeys((_argmax(row.a), _argmax(row.b)))
+        cells = [(row.actions[j], f"{row.a[j]:.6g}", f"{row.b[j]:.6g}") for j in best]
+        grids.append(Grid((f"Q-values of {spoken(row.agent)} there, of the greedy actions", "A", "B"), cells))
     return grids
 
 

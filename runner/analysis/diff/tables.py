@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.errors import RecordingError
 from runner.mdp import Mdp
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
@@ -52,10 +53,13 @@ def table_diffs(a: Recording, b: Recording, visits: NDArray[np.int64] | None) ->
         b: another, whose tables have the same shape.
         visits: how often each state was acted in, [S], both runs together.
     """
-    theirs = _by_moment(b)
+    theirs = b.snapshots()
+    right = next(theirs, None)
     for left in a.snapshots():
-        right = next((table for table in theirs if _moment(table) >= _moment(left)), None)
+        while right is not None and _moment(right) < _moment(left):
+            right = next(theirs, None)
         if right is not None and _moment(right) == _moment(left) and right.values.shape == left.values.shape:
+            _check_shape(a, left)
             yield _table_diff(a.mdp, left, right, visits)
 
 
@@ -63,8 +67,14 @@ def _moment(table: QTable) -> tuple[int, int]:
     return table.episode, table.table
 
 
-def _by_moment(recording: Recording) -> Iterator[QTable]:
-    return recording.snapshots()
+def _check_shape(recording: Recording, table: QTable) -> None:
+    mdp = recording.mdp
+    widths = (mdp.joint_actions, *mdp.action_counts)
+    if table.values.shape[0] != mdp.states or table.values.shape[1] not in widths:
+        raise RecordingError(
+            f"{recording.path}: found a Q-table of shape {table.values.shape}, expected {mdp.states} states "
+            f"and one of {sorted(set(widths))} actions."
+        )
 
 
 def _table_diff(mdp: Mdp, a: QTable, b: QTable, visits: NDArray[np.int64] | None) -> TableDiff:
@@ -83,19 +93,22 @@ def _table_diff(mdp: Mdp, a: QTable, b: QTable, visits: NDArray[np.int64] | None
 
 
 def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: NDArray[np.float64]) -> list[Cell]:
-    order = np.argsort(-apart, axis=None, kind="stable")[:LARGEST]
-    states, actions = states_in_words(mdp), _own_actions(mdp, a)
+    flat = apart.reshape(-1)
+    least = np.partition(flat, -LARGEST)[-LARGEST] if flat.size > LARGEST else 0.0
+    candidates = np.flatnonzero(flat >= least)
+    order = candidates[np.argsort(-flat[candidates], kind="stable")][:LARGEST]
+    states, actions = states_in_words(mdp), own_actions_in_words(mdp, a.table, apart.shape[1])
     cells = []
-    for flat in order.tolist():
-        s, j = divmod(flat, apart.shape[1])
+    for cell in order.tolist():
+        s, j = divmod(cell, apart.shape[1])
         if apart[s, j] > 0:
             cells.append(Cell(str(states[s]), actions[j], float(a.values[s, j]), float(b.values[s, j])))
     return cells
 
 
-def _own_actions(mdp: Mdp, table: QTable) -> list[str]:
-    """Return the words of a table's columns: joint actions, or one agent's."""
-    if table.values.shape[1] == mdp.joint_actions:
+def own_actions_in_words(mdp: Mdp, table: int, width: int) -> list[str]:
+    """Return the words of the columns of table number `table`: joint actions, or one agent's own."""
+    if width == mdp.joint_actions:
         return [str(words) for words in actions_in_words(mdp)]
     names = action_names(mdp)
-    return names[table.table] if names else [f"action {j}" for j in range(table.values.shape[1])]
+    return names[table] if names else [f"action {j}" for j in range(width)]

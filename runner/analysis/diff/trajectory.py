@@ -2,6 +2,8 @@
 
 Steps are compared in blocks: first by position until the first difference, then episode by episode,
 aligned by their time in it. Memory does not grow with the runs.
+
+Where a repair lost steps, a run is compared up to the first of them.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
 
@@ -21,7 +24,8 @@ Block = NDArray[np.void]
 FIELDS = ("episode", "t", "state", "explored", "action", "next_state", "rewards", "terminated", "truncated")
 """What is compared of a step, in the order in which a step comes about."""
 _IN_AN_EVALUATION = tuple(name for name in FIELDS if name != "episode")
-_EPISODES_AT_ONCE = 512
+_EPISODES_AT_ONCE = 4096
+_STEPS_AT_ONCE = 1 << 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +35,8 @@ class Parting:
     phase: str
     evaluation: int | None
     """Which evaluation, in the order made; None in training."""
+    after: int | None
+    """Training episodes before that evaluation; None in training."""
     step: int
     """The step's number in its phase, in run A."""
     episode: int
@@ -91,8 +97,10 @@ def _head(block: Block | None) -> Block | None:
 
 def rows_that_differ(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> NDArray[np.bool_]:
     """Return which of two equally long blocks of steps differ in any of the fields."""
-    if a.dtype == b.dtype and fields is FIELDS:
-        left, right = (np.ascontiguousarray(block).view(np.uint8).reshape(len(block), -1) for block in (a, b))
+    if a.dtype == b.dtype:
+        left, right = (
+            np.ascontiguousarray(block).view(np.uint8).reshape(-1, block.itemsize) for block in (a, b)
+        )
         if left[:, schema.HEADER_BYTES :].tobytes() == right[:, schema.HEADER_BYTES :].tobytes():
             return np.zeros(len(a), np.bool_)
     differs = np.zeros(len(a), np.bool_)
@@ -104,42 +112,67 @@ def rows_that_differ(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> ND
 def _differs(a: Block, b: Block, name: str) -> NDArray[np.bool_]:
     """Return where one field differs; rewards of other numbers of learners are compared summed."""
     left, right = a[name], b[name]
-    other_learners = a["rewards"].shape != b["rewards"].shape
-    if name == "explored" and other_learners:
-        left, right = left != 0, right != 0
-    if name == "rewards":
-        left, right = (left.sum(1), right.sum(1)) if other_learners else (left, right)
+    if name in ("explored", "rewards") and a["rewards"].shape != b["rewards"].shape:
+        left, right = (left != 0, right != 0) if name == "explored" else (left.sum(1), right.sum(1))
     differs: NDArray[np.bool_] = np.not_equal(left, right).reshape(len(a), -1)
     return np.asarray(differs.any(axis=1))
 
 
 def training_parting(a: Recording, b: Recording) -> Parting | None:
     """Return where the training of two runs parts; None if one goes as far as the other, the same way."""
-    found = first_difference(a.blocks(schema.TRAIN_STEP), b.blocks(schema.TRAIN_STEP))
-    return None if found is None else _parting("train", None, found, 0)
+    streams = [
+        recording.blocks(schema.TRAIN_STEP, 0, unbroken(recording, "train")[0]) for recording in (a, b)
+    ]
+    found = first_difference(streams[0], streams[1])
+    return None if found is None else _parting("train", found)
 
 
-def evaluation_partings(a: Recording, b: Recording) -> list[Parting]:
-    """Return, for each evaluation that both runs made of as many trials, where it parts, if it does."""
-    partings = []
+def evaluation_partings(a: Recording, b: Recording) -> Iterator[Parting]:
+    """Yield, for each evaluation that both runs made after as much training, where it parts, if it does."""
     for k, (left, right) in enumerate(zip(_evaluations(a), _evaluations(b), strict=False)):
-        trials = min(left[1] - left[0], right[1] - right[0])
+        if left.after != right.after:
+            continue
+        trials = min(left.trials, right.trials)
         found = first_difference(
-            _trial_steps(a, left[0], trials), _trial_steps(b, right[0], trials), _IN_AN_EVALUATION
+            _trial_steps(a, left.first, trials), _trial_steps(b, right.first, trials), _IN_AN_EVALUATION
         )
         if found is not None:
-            partings.append(_parting("eval", k, found, left[0]))
-    return partings
+            yield _parting("eval", found, k, left)
 
 
-def _evaluations(recording: Recording) -> list[tuple[int, int]]:
-    """Return the first trial of each evaluation and the one behind its last, counted over the run.
+@dataclass(frozen=True)
+class _Evaluation:
+    """Trials of one evaluation: which is the first over the run, how many, after how many episodes."""
 
-    Evaluations of which a cut-off recording does not hold every trial are left out.
-    """
-    recorded = recording.count(schema.EVAL_EPISODE)
-    ends = np.cumsum([metrics["trials"] for metrics in recording.metrics("eval")], dtype=np.int64).tolist()
-    return [(first, end) for first, end in zip([0, *ends[:-1]], ends, strict=True) if end <= recorded]
+    first: int
+    trials: int
+    after: int
+
+
+def unbroken(recording: Recording, phase: str) -> tuple[int, int]:
+    """Return how many steps and episodes of a phase are there before the first that were lost, if any."""
+    steps, episodes = schema.PHASES[phase]
+    ends = [
+        min([recording.count(topic), *(start for start, _ in recording.lost.get(topic.name, []))])
+        for topic in (steps, episodes)
+    ]
+    return ends[0], ends[1]
+
+
+def _evaluations(recording: Recording) -> Iterator[_Evaluation]:
+    """Yield the evaluations of which the recording holds every trial, in order."""
+    steps, episodes = unbroken(recording, "eval")
+    first = 0
+    for metrics in recording.iter_metrics("eval"):
+        one = _Evaluation(first, int(metrics["trials"]), int(metrics["episode"]))
+        first += one.trials
+        if (
+            first > episodes
+            or not one.trials
+            or recording.episodes("eval", first - 1, first)["last_step"][0] >= steps
+        ):
+            return
+        yield one
 
 
 def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Block]:
@@ -150,7 +183,10 @@ def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Bloc
 
 
 def _parting(
-    phase: str, evaluation: int | None, found: tuple[int, Block | None, Block | None], first_trial: int
+    phase: str,
+    found: tuple[int, Block | None, Block | None],
+    number: int | None = None,
+    evaluation: _Evaluation | None = None,
 ) -> Parting:
     _, left, right = found
     step = left if left is not None else right
@@ -161,9 +197,10 @@ def _parting(
         a, b = left[name][0].tolist(), right[name][0].tolist()
     return Parting(
         phase,
-        evaluation,
+        number,
+        None if evaluation is None else evaluation.after,
         int(step["step"][0]),
-        int(step["episode"][0]) - first_trial,
+        int(step["episode"][0]) - (0 if evaluation is None else evaluation.first),
         int(step["t"][0]),
         name,
         a,
@@ -173,24 +210,29 @@ def _parting(
     )
 
 
-def training_overlap(a: Recording, b: Recording) -> Overlap:
-    """Return how far the training of two runs is the same, aligned by episode and time in it."""
-    totals = [recording.count(schema.TRAIN_STEP) for recording in (a, b)]
-    episodes = min(recording.count(schema.TRAIN_EPISODE) for recording in (a, b))
-    equal_episodes = equal_steps = compared = 0
-    lengths = np.zeros(2)
-    for first in range(0, episodes, _EPISODES_AT_ONCE):
-        last = min(first + _EPISODES_AT_ONCE, episodes)
-        left, right = (_Episodes(recording, first, last) for recording in (a, b))
-        agree = left.agreement(right)
+def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, NDArray[np.int64]]:
+    """Return how far the training of two runs is the same, aligned by episode and time in it.
+
+    Returns:
+        the overlap; and how often each state was acted in, [S], both runs together.
+
+    Raises:
+        RecordingError: steps and episodes of a recording contradict each other.
+    """
+    left, right = _Steps(a), _Steps(b)
+    episodes = equal_episodes = equal_steps = compared = 0
+    lengths = np.zeros(2, np.int64)
+    for ours, theirs in _lengths_of_both(a, b):
+        agree = _agreement(left, right, ours, theirs)
+        episodes += len(ours)
         equal_steps += int(agree.sum())
-        compared += int(np.maximum(left.lengths, right.lengths).sum())
-        equal_episodes += int(((left.lengths == right.lengths) & (agree == left.lengths)).sum())
-        lengths += left.lengths.sum(), right.lengths.sum()
+        compared += int(np.maximum(ours, theirs).sum())
+        equal_episodes += int(((ours == theirs) & (agree == ours)).sum())
+        lengths += ours.sum(), theirs.sum()
     mean = lengths / max(episodes, 1)
-    return Overlap(
-        steps_a=totals[0],
-        steps_b=totals[1],
+    overlap = Overlap(
+        steps_a=a.count(schema.TRAIN_STEP),
+        steps_b=b.count(schema.TRAIN_STEP),
         episodes=episodes,
         equal_episodes=equal_episodes,
         equal_steps=equal_steps,
@@ -198,33 +240,126 @@ def training_overlap(a: Recording, b: Recording) -> Overlap:
         mean_length_a=float(mean[0]),
         mean_length_b=float(mean[1]),
     )
+    return overlap, left.all_visits() + right.all_visits()
 
 
-class _Episodes:
-    """The steps of some successive training episodes of a run."""
+def _lengths_of_both(a: Recording, b: Recording) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Yield the lengths of the same successive episodes in both runs, of some 100,000 steps together.
 
-    def __init__(self, recording: Recording, first: int, last: int) -> None:
-        records = recording.episodes("train", first, last)
-        self.lengths = records["length"].astype(np.int64)
-        self.starts = np.cumsum(self.lengths) - self.lengths
-        start = int(records[0]["last_step"]) + 1 - int(self.lengths[0])
-        blocks = list(recording.blocks(schema.TRAIN_STEP, start, int(records[-1]["last_step"]) + 1))
-        self.steps = np.concatenate(blocks)
+    An episode longer than that comes alone.
+    """
+    known = [unbroken(recording, "train") for recording in (a, b)]
+    episodes = min(count for _, count in known)
+    for first in range(0, episodes, _EPISODES_AT_ONCE):
+        last = min(first + _EPISODES_AT_ONCE, episodes)
+        records = [recording.episodes("train", first, last) for recording in (a, b)]
+        whole = min(
+            int(np.searchsorted(one["last_step"], steps))
+            for one, (steps, _) in zip(records, known, strict=True)
+        )
+        ours, theirs = (one["length"][:whole].astype(np.int64) for one in records)
+        longer = np.maximum(ours, theirs)
+        apart = np.diff(np.cumsum(longer) // _STEPS_AT_ONCE) > 0
+        apart |= (longer[:-1] > _STEPS_AT_ONCE) | (longer[1:] > _STEPS_AT_ONCE)
+        cuts = np.flatnonzero(apart) + 1
+        if whole:
+            yield from zip(np.split(ours, cuts), np.split(theirs, cuts), strict=True)
+        if whole < last - first:
+            return
 
-    def agreement(self, other: _Episodes) -> NDArray[np.int64]:
-        """Return, for each episode, how many steps agree with the other's of the same time."""
-        common = np.minimum(self.lengths, other.lengths)
-        episode = np.repeat(np.arange(len(common)), common)
-        t = np.arange(len(episode)) - np.repeat(np.cumsum(common) - common, common)
-        left = self.steps[self.starts[episode] + t]
-        right = other.steps[other.starts[episode] + t]
-        same = ~rows_that_differ(left, right, FIELDS[2:])
-        return np.bincount(episode, weights=same, minlength=len(common)).astype(np.int64)
+
+class _Steps:
+    """A run's training steps, taken in order; the visits to each state are counted on the way."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._path = recording.path
+        self._blocks = recording.blocks(schema.TRAIN_STEP)
+        self._rest: Block = np.empty(0, recording.dtypes[schema.TRAIN_STEP])
+        self._visits = np.zeros(recording.mdp.states, np.int64)
+
+    def take(self, count: int) -> Block:
+        """Return the next steps."""
+        parts = [self._rest[:0]]
+        while count > 0:
+            if not len(self._rest) and not self._next():
+                raise RecordingError(f"{self._path}: found fewer training steps than its episodes are long.")
+            parts.append(self._rest[:count])
+            self._rest = self._rest[count:]
+            count -= len(parts[-1])
+        if len(parts) == 2:
+            return parts[1]
+        whole = np.concatenate([_opaque(part) for part in parts])
+        return whole.view(self._rest.dtype)
+
+    def skip(self, count: int) -> None:
+        """Go on behind the next steps."""
+        for first in range(0, count, _STEPS_AT_ONCE):
+            self.take(min(_STEPS_AT_ONCE, count - first))
+
+    def all_visits(self) -> NDArray[np.int64]:
+        """Read what is left, and return how often each state was acted in, [S]."""
+        while self._next():
+            pass
+        return self._visits
+
+    def _next(self) -> bool:
+        """Go to the next block, if there is one."""
+        block = next(self._blocks, None)
+        if block is None:
+            return False
+        states = len(self._visits)
+        if (found := int(block["state"].max())) >= states:
+            raise RecordingError(
+                f"{self._path}: found state {found} in training step {block['step'][0]} or soon after, "
+                f"expected less than {states}; `dualtaxi verify` names the step."
+            )
+        self._visits += np.bincount(block["state"], minlength=states)
+        self._rest = block
+        return True
 
 
-def visits(recording: Recording) -> NDArray[np.int64]:
-    """Return how often each state was acted in while training, [S]."""
-    counts = np.zeros(recording.mdp.states, np.int64)
-    for block in recording.blocks(schema.TRAIN_STEP):
-        counts += np.bincount(block["state"], minlength=len(counts))
-    return counts
+def _agreement(
+    left: _Steps, right: _Steps, ours: NDArray[np.int64], theirs: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return, for each of the next episodes, how many steps agree with the other's of the same time.
+
+    Args:
+        left: the steps of one run, at the first of these episodes.
+        right: those of the other.
+        ours: the lengths of the episodes in the one.
+        theirs: in the other.
+    """
+    if len(ours) == 1:
+        return _agreement_of_one(left, right, int(ours[0]), int(theirs[0]))
+    common = np.minimum(ours, theirs)
+    episode = np.repeat(np.arange(len(common)), common)
+    t = np.arange(len(episode)) - np.repeat(np.cumsum(common) - common, common)
+    at = [(np.cumsum(lengths) - lengths)[episode] + t for lengths in (ours, theirs)]
+    agree = _that_agree(left.take(int(ours.sum())), right.take(int(theirs.sum())), at[0], at[1])
+    return np.bincount(episode[agree], minlength=len(common))
+
+
+def _that_agree(
+    left: Block, right: Block, ours: NDArray[np.int64], theirs: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return which of the pairs of steps (`ours` in `left`, `theirs` in `right`) agree in all but number."""
+    if len(left) == len(right) == len(ours):
+        return np.flatnonzero(~rows_that_differ(left, right, FIELDS[2:]))
+    agree = np.flatnonzero(left["state"][ours] == right["state"][theirs])  # most that differ do so there
+    chosen = [_opaque(steps)[at[agree]].view(steps.dtype) for steps, at in ((left, ours), (right, theirs))]
+    return agree[~rows_that_differ(chosen[0], chosen[1], FIELDS[2:])]
+
+
+def _opaque(steps: Block) -> NDArray[np.void]:
+    """Return steps without their fields: NumPy copies those one by one, and this ten times as fast."""
+    return steps.view(f"V{steps.itemsize}")
+
+
+def _agreement_of_one(left: _Steps, right: _Steps, ours: int, theirs: int) -> NDArray[np.int64]:
+    common, agree = min(ours, theirs), 0
+    for first in range(0, common, _STEPS_AT_ONCE):
+        n = min(_STEPS_AT_ONCE, common - first)
+        agree += n - int(rows_that_differ(left.take(n), right.take(n), FIELDS[2:]).sum())
+    left.skip(ours - common)
+    right.skip(theirs - common)
+    return np.array([agree])

@@ -111,7 +111,7 @@ def test_another_reward_is_an_other_environment(compare):
     assert difference.environment.transitions > 1000
     assert "reward -7" in " ".join(change.b for change in difference.environment.examples)
     assert (difference.cause.kind, difference.parting.field) == ("transition", "rewards")
-    assert "-7.0" in difference.cause.text
+    assert "reward -2 and -10 in A, -2 and -7 in B" in difference.cause.text
 
 
 def test_other_modes_are_compared_as_far_as_they_can_be(compare):
@@ -189,8 +189,9 @@ def test_the_command_says_what_differs_and_ends_with_1(record, folder):
     run = CliRunner().invoke
     told = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder)])
     assert told.exit_code == 1
-    assert "They part at" in told.stdout
-    assert "discount" in told.stdout
+    assert "They part in training episode" in told.stdout
+    assert "discount (0.8 in A, 0.9 in B) differs" in told.stdout
+    assert "Why that update differs: the discount was 0.8 in A, 0.9 in B." in told.stdout
     as_json = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--json", "--ignore", "disc*"])
     assert json.loads(as_json.stdout)["config"] == []
     assert json.loads(as_json.stdout)["cause"]["kind"] == "greedy_action"
