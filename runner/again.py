@@ -20,8 +20,7 @@ from runner.provenance import provenance
 from runner.recording.contents import survey
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
-from runner.resume import owned
-from runner.runs import Run, unless_empty
+from runner.runs import Run, owned, unless_empty
 from runner.verify import initial_tables
 
 Start = int | Literal["random", "each"]

@@ -19,7 +19,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from filelock import FileLock, Timeout
 from mcap.opcode import Opcode
 
 from runner import runs
@@ -39,6 +38,7 @@ from runner.execution import (
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import Mdp, load_mdp
+from runner.owner import owner
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES
@@ -48,7 +48,7 @@ from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import storage_error
 from runner.recording.writer import RecordingFile
-from runner.runs import Run
+from runner.runs import Run, owned
 from runner.verify import differing_environment, differing_provenance, initial_tables
 
 DECISIVE: Final = (
@@ -57,39 +57,10 @@ DECISIVE: Final = (
 )
 """Provenance that a continued run must share with its beginning, unless told otherwise."""
 _NEEDED: Final = {"run", "config", "provenance"}
-_LOCK: Final = "owner.lock"
 _ANEW: Final = ".anew"
 _HEAD: Final = struct.Struct("<BQ")
 
 Changes = dict[str, tuple[str, str]]
-
-
-@contextlib.contextmanager
-def owned(run: Run) -> Iterator[Run]:
-    """Give a run as it is now, its folder kept from every other process that would write to it.
-
-    Raises:
-        RunnerError: it is running, or another process has it in this way.
-        StorageError: the folder cannot be written.
-    """
-    lock = FileLock(run.folder / _LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout as error:
-        raise RunnerError(f"run {run.run_id} is being worked on by another process; let it.") from error
-    except OSError as error:
-        raise StorageError(f"{run.folder}: cannot be written ({error.strerror}).") from error
-    try:
-        if run.facts.get("recording", runs.RECORDING_FILE) == runs.RECORDING_FILE:
-            run = runs.find_run(os.fspath(run.folder.absolute()), run.folder.parent)
-        if run.status == "running":
-            owner = run.facts.get("owner", {})
-            raise RunnerError(
-                f"run {run.run_id} is running (process {owner.get('pid')} on {owner.get('host')}); let it."
-            )
-        yield run
-    finally:
-        lock.release()
 
 
 def is_finished(run: Run) -> bool:
@@ -148,7 +119,7 @@ def _go_on(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
         raise RunnerError(_refusal(run, changes))
     learner = Learner(job.config, mdp, job.seed, _first_tables(job, run, mdp))
     proof = _proof(run)
-    run = run.update(status="running", owner=runs.owner(), summary={}, proof=proof)
+    run = run.update(status="running", owner=owner(), summary={}, proof=proof)
     try:
         with (
             _opened(path, contents, job, run, learner, changes) as file,

@@ -1,6 +1,7 @@
 """The recordings folder: a folder a run, with its recording and a small file that says what it is.
 
     recordings/k3v9m2xq/run.json         id, name, configuration, owner, status, summary
+    recordings/k3v9m2xq/labels.json      what people say of it: another name, tags, a note
     recordings/k3v9m2xq/recording.mcap   the truth
 
 `run.json` stands before anything heavy is imported and is only ever replaced whole. Its status is what
@@ -10,32 +11,37 @@ the owner last said; whether a `running` run still has a living owner is looked 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
+import re
 import secrets
 import shutil
-import socket
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
-from runner.errors import RecordingError, RunNotFound, StorageError, nearest
+from runner.documents import read_object, write_whole
+from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError, nearest
+from runner.labels import Labels, read_labels
+from runner.owner import lives, owner
 
 if TYPE_CHECKING:  # listing runs is to be quick
     from runner.config import ExperimentConfig
 
 RUN_FILE: Final = "run.json"
+OWNER_LOCK: Final = "owner.lock"
 RECORDING_FILE: Final = "recording.mcap"
-HEARTBEAT_SECONDS: Final = 15.0
-"""On another host, a run without a heartbeat for this long counts as interrupted."""
+MAX_RUN_FILE_BYTES: Final = 8 << 20
 RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"
 
 _ALPHABET: Final = "abcdefghjkmnpqrstvwxyz23456789"
 _ID_LENGTH: Final = 8
 _LATEST: Final = "@latest"
+_TOLD: Final = 20
+"""Runs that an error names."""
+_RUN_ID: Final = re.compile(r"[\w.-]{1,100}")
 
 
 @dataclass(frozen=True)
@@ -53,8 +59,24 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Its name, not unique."""
-        return str(self.facts["name"])
+        """What it is called now, not unique."""
+        return self.labels.name or str(self.facts["name"])
+
+    @property
+    def tags(self) -> tuple[str, ...]:
+        """The tags it was given, in alphabetical order."""
+        return self.labels.tags
+
+    @property
+    def note(self) -> str:
+        """The note that was written on it, or nothing."""
+        return self.labels.note
+
+    @cached_property
+    def labels(self) -> Labels:
+        """What people say of it, read when first asked."""
+        stands_alone = self.recording.name != RECORDING_FILE
+        return Labels() if stands_alone else read_labels(self.folder)
 
     @property
     def seed(self) -> int:
@@ -64,7 +86,7 @@ class Run:
     @property
     def recording(self) -> Path:
         """The MCAP file."""
-        return self.folder / str(self.facts.get("recording", RECORDING_FILE))
+        return self.folder / Path(str(self.facts.get("recording", RECORDING_FILE))).name
 
     @property
     def created(self) -> datetime:
@@ -78,24 +100,26 @@ class Run:
 
     @property
     def status(self) -> str:
-        """`running`, `finished`, `interrupted` or `failed`; a dead owner's run is interrupted."""
+        """`running`, `finished`, `interrupted` or `failed`; a dead owner's run is interrupted.
+
+        `archived` if its recording is in an archive alone.
+        """
         said = str(self.facts["status"])
-        return "interrupted" if said == "running" and not self._owner_lives() else said
+        if said == "running" and not lives(self.facts.get("owner", {}), self.folder / RUN_FILE):
+            return "interrupted"
+        return "archived" if self.archive and not self.recording.exists() else said
+
+    @property
+    def archive(self) -> dict[str, Any]:
+        """Where else its recording is kept; empty if nowhere."""
+        said = self.facts.get("archive")
+        return dict(said) if isinstance(said, dict) else {}
 
     def _repr_html_(self) -> str:
         """Return how the run shows itself in a notebook."""
         from runner.notebook import run_html
 
         return run_html(self)
-
-    def _owner_lives(self) -> bool:
-        owner = self.facts.get("owner", {})
-        if owner.get("host") == socket.gethostname() and owner.get("boot_id") == boot_id():
-            started = process_start(owner.get("pid", 0))
-            return started is not None and started == owner.get("process_started")
-        with contextlib.suppress(OSError):
-            return time.time() - (self.folder / RUN_FILE).stat().st_mtime < HEARTBEAT_SECONDS
-        return False
 
     def beat(self) -> None:
         """Say that the owner lives."""
@@ -110,7 +134,7 @@ class Run:
         """
         changed = Run(self.folder, self.facts | facts)
         try:
-            _write_whole(self.folder / RUN_FILE, changed.facts)
+            write_whole(self.folder / RUN_FILE, changed.facts)
         except OSError as error:
             raise StorageError(
                 f"{self.folder / RUN_FILE}: cannot be written ({error.strerror}); free some disk."
@@ -152,7 +176,7 @@ def create_run(recordings: Path, config: ExperimentConfig, seed: int, name: str 
                 "config": config.to_mapping(),
             },
         )
-        _write_whole(folder / RUN_FILE, run.facts)
+        write_whole(folder / RUN_FILE, run.facts)
     except OSError as error:
         raise StorageError(
             f"{recordings}: cannot be written ({error.strerror}); "
@@ -184,14 +208,76 @@ def list_runs(recordings: Path) -> list[Run]:
     Raises:
         StorageError: the folder is there and cannot be read.
     """
+    runs = [run for folder in run_folders(recordings) for run in runs_in(folder)]
+    return sorted(runs, key=lambda run: (run.created, run.run_id), reverse=True)
+
+
+def run_folders(recordings: Path) -> list[Path]:
+    """Return the folders in which there may be a run: all but the hidden ones.
+
+    Raises:
+        StorageError: the recordings folder is there and cannot be read.
+    """
     try:
-        folders = [Path(entry.path) for entry in os.scandir(recordings) if entry.is_dir()]
+        with os.scandir(recordings) as entries:
+            return [Path(entry.path) for entry in entries if entry.name[0] != "." and entry.is_dir()]
     except FileNotFoundError:
         return []
     except OSError as error:
         raise StorageError(f"{recordings}: cannot be read as a folder of runs ({error.strerror}).") from error
-    runs = [run for folder in folders for run in _runs_in(folder)]
-    return sorted(runs, key=lambda run: (run.facts["created"], run.run_id), reverse=True)
+
+
+@contextlib.contextmanager
+def owned(run: Run) -> Iterator[Run]:
+    """Give a run as it is now, its folder kept from every other process that would write to it.
+
+    Raises:
+        RunnerError: it is running, or another process has it in this way.
+        StorageError: the folder cannot be written.
+    """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(run.folder / OWNER_LOCK)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise RunnerError(f"run {run.run_id} is being worked on by another process; let it.") from error
+    except OSError as error:
+        raise StorageError(f"{run.folder}: cannot be written ({error.strerror}).") from error
+    try:
+        if run.facts.get("recording", RECORDING_FILE) == RECORDING_FILE:
+            run = find_run(os.fspath(run.folder.absolute()), run.folder.parent)
+        if run.status == "running":
+            owner = run.facts.get("owner", {})
+            raise RunnerError(
+                f"run {run.run_id} is running (process {owner.get('pid')} on {owner.get('host')}); let it."
+            )
+        yield run
+    finally:
+        lock.release()
+
+
+class Named(Protocol):
+    """What a run can be named by."""
+
+    @property
+    def run_id(self) -> str:
+        """Its id."""
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+
+    @property
+    def seed(self) -> int:
+        """Its job's seed."""
+
+    @property
+    def created(self) -> datetime:
+        """When it began."""
+
+
+AnyNamed = TypeVar("AnyNamed", bound=Named)
 
 
 def find_run(name: str, recordings: Path, but: str = "") -> Run:
@@ -207,9 +293,37 @@ def find_run(name: str, recordings: Path, but: str = "") -> Run:
     Raises:
         RunNotFound: none does, or several do.
     """
+    known = run_at_once(name, recordings)
+    if known is not None and known.run_id != but:
+        return known
+    return the_one(name, [run for run in list_runs(recordings) if run.run_id != but], recordings)
+
+
+def run_at_once(name: str, recordings: Path) -> Run | None:
+    """Return the run at a path, or in the folder called like its id; None if others must be looked at.
+
+    Raises:
+        RunNotFound: it is a path, and there is no run.
+    """
     if os.sep in name or name.endswith(".mcap") or (os.altsep and os.altsep in name):
         return _run_at(Path(name))
-    runs = [run for run in list_runs(recordings) if run.run_id != but]
+    if _RUN_ID.fullmatch(name) and name.strip("."):
+        return next((run for run in runs_in(recordings / name) if run.run_id == name), None)
+    return None
+
+
+def the_one(name: str, runs: Sequence[AnyNamed], recordings: Path) -> AnyNamed:
+    """Return the one of these runs, the newest first, that answers to a name, but no path.
+
+    Raises:
+        RunNotFound: none does, or several do.
+    """
+    if not runs:
+        raise RunNotFound(
+            f"no run {name!r}: there are no runs in {recordings} yet. `dualtaxi run` makes one."
+        )
+    if not name:
+        raise RunNotFound("found an empty name, expected an id, the beginning of one, a name or @latest.")
     if name.endswith(_LATEST):
         stem = name.removesuffix(_LATEST)
         newest = next((run for run in runs if stem in ("", run.name)), None)
@@ -221,23 +335,21 @@ def find_run(name: str, recordings: Path, but: str = "") -> Run:
         return found[0]
     if found:
         several = "\n".join(
-            f"  {run.run_id}  {run.name}  seed {run.seed}  {run.created:%Y-%m-%d %H:%M}" for run in found
+            f"  {run.run_id}  {run.name}  seed {run.seed}  {run.created:%Y-%m-%d %H:%M}"
+            for run in found[:_TOLD]
         )
-        raise RunNotFound(f"{name!r} answers to {len(found)} runs; name one by its id:\n{several}")
-    if not runs:
-        raise RunNotFound(
-            f"no run {name!r}: there are no runs in {recordings} yet. `dualtaxi run` makes one."
-        )
-    hint = nearest(name, [run.name for run in runs] + [run.run_id for run in runs])
+        more = f"\n  and {len(found) - _TOLD:,} more" if len(found) > _TOLD else ""
+        raise RunNotFound(f"{name!r} answers to {len(found)} runs; name one by its id:\n{several}{more}")
+    hint = nearest(name, {run.name for run in runs} | {run.run_id for run in runs})
     raise RunNotFound(
-        f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {len(runs)} there are."
+        f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {len(runs):,} there are."
     )
 
 
 def _run_at(path: Path) -> Run:
     """Return the run in a folder, or of a recording that may stand alone."""
     if path.is_dir():
-        for run in _runs_in(path):
+        for run in runs_in(path):
             return run
         raise RunNotFound(f"{path}: found a folder without {RUN_FILE} or {RECORDING_FILE}, expected a run.")
     if not path.is_file():
@@ -247,10 +359,10 @@ def _run_at(path: Path) -> Run:
     return _from_recording(path)
 
 
-def _runs_in(folder: Path) -> Iterator[Run]:
+def runs_in(folder: Path) -> Iterator[Run]:
     """Yield the run in a folder, if there is one; from its recording when `run.json` is gone."""
     try:
-        facts = json.loads((folder / RUN_FILE).read_bytes())
+        facts = read_object(folder / RUN_FILE, MAX_RUN_FILE_BYTES)
         if _is_run(facts):
             yield Run(folder, facts)
             return
@@ -261,14 +373,16 @@ def _runs_in(folder: Path) -> Iterator[Run]:
             yield _from_recording(folder / RECORDING_FILE)
 
 
-def _is_run(facts: Any) -> bool:
+def _is_run(facts: dict[str, Any]) -> bool:
     """Return whether these are the facts of a run: a file may hold anything."""
-    if not isinstance(facts, dict):
-        return False
     kinds = {"run_id": str, "name": str, "seed": int, "status": str, "created": str}
     sound = all(isinstance(facts.get(key), kind) for key, kind in kinds.items())
     parts = all(isinstance(facts.get(key, {}), dict) for key in ("owner", "config", "summary"))
-    return sound and parts and bool(datetime.fromisoformat(facts["created"]))
+    if not (sound and parts and _RUN_ID.fullmatch(facts["run_id"]) and 0 <= facts["seed"] < 2**64):
+        return False
+    with contextlib.suppress(OverflowError):  # of a date at the end of time
+        return bool(datetime.fromisoformat(facts["created"]).astimezone(UTC))
+    return False
 
 
 def _from_recording(path: Path) -> Run:
@@ -276,59 +390,7 @@ def _from_recording(path: Path) -> Run:
     from runner.recording.reader import open_recording
 
     with open_recording(path) as recording:
-        return Run(path.parent, {**recording.run_facts(), "recording": path.name})
-
-
-def owner() -> dict[str, Any]:
-    """Return who this process is: host, boot, process id and its start."""
-    pid = os.getpid()
-    return {
-        "host": socket.gethostname(),
-        "boot_id": boot_id(),
-        "pid": pid,
-        "process_started": process_start(pid),
-    }
-
-
-def boot_id() -> str:
-    """Return what tells this start of the machine from any other."""
-    with contextlib.suppress(OSError):
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    import psutil
-
-    return f"{psutil.boot_time():.0f}"
-
-
-def process_start(pid: int) -> float | None:
-    """Return when a process began; None if there is none. To be compared within one start of the machine.
-
-    On Linux it is counted in ticks since the machine started, so that setting the clock changes nothing.
-    """
-    if not isinstance(pid, int) or isinstance(pid, bool):
-        return None  # a file may say anything
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        return None if fields[0] == "Z" else float(fields[19])
-    except (OSError, ValueError, IndexError):
-        return None if Path("/proc/self/stat").exists() else _process_start_elsewhere(pid)
-
-
-def _process_start_elsewhere(pid: int) -> float | None:
-    import psutil
-
-    try:
-        process = psutil.Process(pid)
-        return None if process.status() == psutil.STATUS_ZOMBIE else process.create_time()
-    except (psutil.Error, ValueError, TypeError, OverflowError):
-        return None
-
-
-def _write_whole(path: Path, facts: dict[str, Any]) -> None:
-    """Replace a file whole: a reader sees the old one or the new one."""
-    fresh = path.with_suffix(f".{secrets.token_hex(4)}.tmp")
-    try:
-        fresh.write_text(json.dumps(facts, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        fresh.replace(path)
-    except OSError:
-        fresh.unlink(missing_ok=True)
-        raise
+        facts = {**recording.run_facts(), "recording": path.name}
+    if not _is_run(facts):
+        raise RecordingError(f"{path}: is damaged: what it says of its run makes no sense.")
+    return Run(path.parent, facts)

@@ -12,7 +12,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 ORDER = """
     errors
-    config
+    cache documents
+    config owner labels
     job toy_text scene
     mdp
     words learning recording observer

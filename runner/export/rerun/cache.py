@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from runner import __version__
+from runner.cache import CACHE_VARIABLE, EXPORTS
+from runner.cache import cache_folder as users_cache
 from runner.errors import StorageError
 from runner.export.rerun.selection import Request, Selection, select
 from runner.export.rerun.writing import Source, export
@@ -18,7 +19,6 @@ from runner.runs import Run
 KEPT: Final = 20
 """Exports in the cache; the ones that were not looked at for longest are removed."""
 TINTS: Final = ("#0072B2", "#E69F00")
-CACHE_VARIABLE: Final = "XDG_CACHE_HOME"
 
 
 def exported(runs: Sequence[Run], request: Request) -> tuple[Path, list[Selection]]:
@@ -54,8 +54,7 @@ def exported(runs: Sequence[Run], request: Request) -> tuple[Path, list[Selectio
 
 def cache_folder() -> Path:
     """Return the folder of kept exports."""
-    base = os.environ.get(CACHE_VARIABLE)
-    return (Path(base) if base else Path.home() / ".cache") / "dualtaxi" / "rerun"
+    return users_cache() / EXPORTS
 
 
 def _titles(runs: Sequence[Run]) -> list[str]:

@@ -1,0 +1,54 @@
+"""Small JSON files beside a recording: read within bounds, replaced whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import stat
+from pathlib import Path
+from typing import Any
+
+_WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+def read_object(path: str | os.PathLike[str], most: int) -> dict[str, Any]:
+    """Return the JSON object in a file; what JSON has no word for (NaN) as None.
+
+    Args:
+        path: the file; a link is followed.
+        most: the most bytes that are read.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no file, too long, or holds no JSON object.
+    """
+    descriptor = os.open(path, os.O_RDONLY | _WITHOUT_WAITING)  # to open a pipe would wait for its writer
+    with os.fdopen(descriptor, "rb") as stream:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise ValueError("it is no file")
+        data = stream.read(most + 1)
+    if len(data) > most:
+        raise ValueError(f"it is longer than {most:,} bytes")
+    try:
+        found = json.loads(data, parse_constant=lambda _: None)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+    if not isinstance(found, dict):
+        raise ValueError("it holds no JSON object")
+    return found
+
+
+def write_whole(path: Path, value: dict[str, Any]) -> None:
+    """Replace a file whole: a reader sees the old one or the new one.
+
+    Raises:
+        OSError: it cannot be written; it is as before.
+    """
+    fresh = path.with_suffix(f".{secrets.token_hex(4)}.tmp")
+    try:
+        fresh.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        fresh.replace(path)
+    except OSError:
+        fresh.unlink(missing_ok=True)
+        raise
