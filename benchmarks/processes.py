@@ -47,6 +47,8 @@ class JobRun:
     """A job run by the command line, and what it left behind."""
 
     process: Process
+    seconds: float
+    """From the making of its folder to its end, as the run itself says."""
     steps: int
     """Training and evaluation steps, all of them recorded."""
     file_bytes: int
@@ -74,15 +76,20 @@ def run(command: Sequence[str], environment: Mapping[str, str] | None = None) ->
     return Process(elapsed, cpu, peak / 1e6)
 
 
-def run_config(config: str, *overrides: str, environment: Mapping[str, str] | None = None) -> JobRun:
+def run_config(
+    config: str,
+    *overrides: str,
+    options: Sequence[str] = (),
+    environment: Mapping[str, str] | None = None,
+) -> JobRun:
     """Run a shipped configuration as a user would, into a folder that is removed, and return what it took."""
     with tempfile.TemporaryDirectory() as recordings:
-        process = run(run_command(config, recordings, *overrides), environment)
+        process = run([*run_command(config, recordings, *overrides), *options], environment)
         (facts_file,) = Path(recordings).glob("*/run.json")
         facts: dict[str, Any] = json.loads(facts_file.read_bytes())
         summary = facts["summary"]
         size = (facts_file.parent / "recording.mcap").stat().st_size
-        return JobRun(process, summary["train_steps"] + summary["eval_steps"], size)
+        return JobRun(process, summary["seconds"], summary["train_steps"] + summary["eval_steps"], size)
 
 
 def run_command(config: str, recordings: str, *overrides: str) -> list[str]:

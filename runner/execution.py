@@ -155,6 +155,8 @@ class Session:
 
     def run(self) -> bool:
         """Do the whole job; return False if it was stopped before the end."""
+        if self._observer is not None:
+            self._observer.begin(self._learner.mdp, self._learner.agents)
         self._log(f"training {self._config.episodes} episodes with {self._config.algorithm}")
         for episode in self._boundaries():
             if not self._train(episode):

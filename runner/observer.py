@@ -7,9 +7,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.mdp import Mdp
+
 
 class Observer(Protocol):
     """Is shown every step and metric as they come; must return at once, and copy what it keeps."""
+
+    def begin(self, mdp: Mdp, learners: tuple[str, ...]) -> None:
+        """See the environment, and whose tables are learned, before the first step."""
 
     def steps(self, phase: str, before: int, steps: NDArray[np.void]) -> None:
         """See new steps of a phase; `before` steps of both phases were executed before the first."""

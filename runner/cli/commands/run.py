@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -17,8 +19,14 @@ if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
     from rich.console import RenderableType
 
     from runner.config import ExperimentConfig
+    from runner.export.rerun.live import LiveView
     from runner.job import Job
     from runner.runs import Run
+
+    Watch = Callable[[Run], LiveView]
+
+LIVE_EPISODES: Final = 200
+"""About so many training episodes are shown live, unless asked otherwise."""
 
 
 @click.command("run")
@@ -26,6 +34,18 @@ if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
 @click.option("--seed", type=click.IntRange(0), metavar="N", help="The seed, instead of the configuration's.")
 @set_option
 @click.option("--name", help="What the run is called.  [default: the configuration's name]")
+@click.option("--live", is_flag=True, help="Open the Rerun viewer and watch the training in it.")
+@click.option(
+    "--live-every",
+    type=click.IntRange(1),
+    metavar="N",
+    help="Show every N-th episode, step by step.  [default: some 200 of them]",
+)
+@click.option(
+    "--live-url",
+    metavar="URL",
+    help="Of a viewer that runs already, here or elsewhere, instead of a new one.",
+)
 @recordings_option
 @json_option
 @click.pass_context
@@ -35,6 +55,9 @@ def command(
     seed: int | None,
     overrides: tuple[str, ...],
     name: str | None,
+    live: bool,
+    live_every: int | None,
+    live_url: str | None,
     recordings: Path | None,
     as_json: bool,
 ) -> None:
@@ -46,6 +69,8 @@ def command(
     Steps and disk are estimated first. The estimate takes it that evaluation trials and the first 500
     training episodes last half the step limit, and later ones a tenth; "at most" is all of the limit.
 
+    With --live the training is watched while it goes on: all metrics, and one episode in every so many.
+
     With --json: a line for each run.
 
     \b
@@ -53,6 +78,7 @@ def command(
       dualtaxi run configs/quick.yaml
       dualtaxi run configs/cooperative.yaml --seed 7 --set discount=0.9 --name patient
       dualtaxi run configs/quick.yaml --set 'seeds={count: 3}' --json
+      dualtaxi run configs/cooperative.yaml --live --live-every 100
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import checked_name, experiment_of
     from runner.job import jobs_of
@@ -60,8 +86,9 @@ def command(
 
     experiment = experiment_of(config, overrides, seed)
     called, folder = checked_name(name), recordings_folder(recordings)
+    watch = _watcher(experiment, live, live_every, live_url)
     for number, job in enumerate(jobs_of(experiment)):
-        run, interrupted = _run_one(job, folder, called, number)
+        run, interrupted = _run_one(job, folder, called, number, watch)
         if as_json:
             print_json(_as_json(run), indent=None)
         else:
@@ -72,7 +99,21 @@ def command(
             ctx.exit(INTERRUPTED)
 
 
-def _run_one(job: Job, folder: Path, name: str | None, number: int) -> tuple[Run, bool]:
+def _watcher(config: ExperimentConfig, live: bool, every: int | None, url: str | None) -> Watch | None:
+    """Return what makes a live view of a run; None if none is asked for. A viewer is opened if need be."""
+    if not (live or every or url):
+        return None
+    from runner.export.rerun import viewer
+    from runner.export.rerun.live import LiveView
+
+    viewer.require_rerun("run --live")
+    address = viewer.check_address(url) if url else viewer.live_window(viewer.free_port())
+    one_in = every or max(1, config.episodes // LIVE_EPISODES)
+    say(f"Live: every metric, and the steps of one episode in {one_in:,}, at {address}")
+    return lambda run: LiveView(f"{run.name}, seed {run.seed} ({run.run_id})", run.run_id, one_in, address)
+
+
+def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch | None) -> tuple[Run, bool]:
     """Run a job; return its run, and whether it was interrupted."""
     from runner.api import interruptible
     from runner.cli.progress import progress_line
@@ -86,12 +127,15 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int) -> tuple[Run
         with (
             interruptible(second=signal.SIG_DFL) as interrupt,
             progress_line(label, job.config.episodes) as report,
+            contextlib.nullcontext() if watch is None else watch(run) as view,
         ):
             from runner.execution import run_job
             from runner.learning.compilation import announced
 
             with announced(lambda: say("Compiling the learning kernel, this once: a few seconds.")):
-                run = run_job(job, run, report, interrupt)
+                run = run_job(job, run, report, interrupt, view)
+    if view is not None and (view.dropped or view.failure):
+        say(f"Recorded in full, but not all was shown live: {view.failure or 'the viewer was too slow'}.")
     return run, interrupt.came
 
 

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 LOOPBACK: Final = "127.0.0.1"
 START_SECONDS: Final = 20.0
+SCREEN_SECONDS: Final = 0.5
+"""A viewer that finds no screen has ended this long after it began to listen."""
+ANSWER_SECONDS: Final = 5.0
 SETTLE_SECONDS: Final = 4.0
 """A viewer without a screen has drawn everything this long after it was told where to look."""
 NOTICE_SECONDS: Final = 2.5
@@ -135,6 +138,8 @@ def _reason(log: Path | None) -> str:
     text = log.read_text(errors="replace") if log and log.exists() else ""
     if "graphics adapter" in text or "libEGL" in text or "Vulkan" in text or "libxkbcommon" in text:
         return f": it finds no graphics. On Debian: apt-get install {MESA_PACKAGES}"
+    if "DISPLAY is set" in text:
+        return ": there is no screen here. Start one where there is, by `rerun`, and name its address."
     last = [line for line in text.splitlines() if line.strip()][-1:]
     return f": {last[0]}" if last else "."
 
@@ -177,6 +182,54 @@ def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> 
         client.save_screenshot(str(picture.absolute()))
     if not picture.exists():
         raise ViewerError(f"{picture}: the Rerun viewer has not written it.")
+
+
+def live_window(port: int) -> str:
+    """Open a window that stays when this program ends; return the address that runs can be sent to.
+
+    Raises:
+        ViewerError: it cannot be started.
+    """
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "viewer.log"
+        arguments = [str(viewer_program()), "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
+        with log.open("wb") as output:
+            process = subprocess.Popen(
+                arguments, env=environment(), stdout=output, stderr=output, start_new_session=True
+            )
+        wait_for(process, port, log)
+        with contextlib.suppress(subprocess.TimeoutExpired):  # it listens before it looks for a screen
+            process.wait(SCREEN_SECONDS)
+            raise ViewerError(f"the Rerun viewer does not start{_reason(log)}")
+    return f"rerun+http://{LOOPBACK}:{port}/proxy"
+
+
+def check_address(url: str) -> str:
+    """Return the address of a viewer if something listens there.
+
+    Raises:
+        ViewerError: it is none, or nothing does.
+    """
+    from urllib.parse import urlsplit
+
+    parts = urlsplit(url)
+    try:
+        if not parts.scheme.startswith("rerun") or parts.hostname is None:
+            raise ValueError
+        place = (parts.hostname, parts.port or (443 if parts.scheme.endswith("https") else 80))
+    except ValueError:
+        raise ViewerError(
+            f"found {url!r}, expected a viewer's address such as rerun+http://127.0.0.1:9876/proxy"
+        ) from None
+    try:
+        socket.create_connection(place, timeout=ANSWER_SECONDS).close()
+    except OSError as error:
+        raise ViewerError(
+            f"{url}: nothing answers there ({error.strerror or error}); start a viewer by `rerun`."
+        ) from error
+    return url
 
 
 def open_window(path: Path, step: int, port: int) -> None:

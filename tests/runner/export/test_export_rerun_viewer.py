@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 
 from runner.errors import RunnerError
 from runner.export.rerun import viewer
@@ -79,21 +82,48 @@ def test_a_viewer_that_cannot_start_says_why(monkeypatch, tmp_path):
         pass
 
 
-def test_a_live_view_shows_one_episode_in_so_many(pictured):
+def test_a_live_view_takes_one_episode_in_so_many(pictured, monkeypatch):
     run = pictured("rivals")
     with open_recording(run.recording) as recording:
         steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
-        mdp, metrics = recording.mdp, recording.metrics("eval")
-    port = viewer.free_port()
-    with viewer.viewer(port, "--serve-grpc"):
-        live = LiveView("live", "live", mdp, ("taxi_1", "taxi_2"), 10, f"rerun+http://127.0.0.1:{port}/proxy")
-        sent = []
-        live._send_steps = lambda *piece: sent.append(piece)  # type: ignore[method-assign]
-        with live:
-            for part in np.array_split(steps, 7):
-                live.steps("train", int(part["step"][0]), part)
-            live.metrics("eval", len(steps), metrics[-1])
-    shown = np.concatenate([piece[3] for piece in sent])
+    taken = []
+    live = LiveView("live", "live", 10, "rerun+http://127.0.0.1:9/proxy")
+    monkeypatch.setattr(live, "_put", taken.append)
+    for part in np.array_split(steps, 7):
+        live.steps("train", int(part["step"][0]), part)
+    shown = np.concatenate([piece.content for piece in taken])
     assert shown.tobytes() == steps[steps["episode"] % 10 == 0].tobytes()
-    assert [piece[1] for piece in sent] == [int(piece[3]["step"][0]) + 1 for piece in sent]
-    assert live.dropped == 0
+    assert [piece.time for piece in taken] == [int(piece.content["step"][0]) + 1 for piece in taken]
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the viewer is ended, and writes none
+def test_a_viewer_gets_what_a_live_view_is_shown(pictured, tmp_path):
+    run = pictured("rivals")
+    with open_recording(run.recording) as recording:
+        (steps, *_), mdp = recording.blocks(schema.TRAIN_STEP), recording.mdp
+        metrics = recording.metrics("eval")[-1]
+    port, path = viewer.free_port(), tmp_path / "live.rrd"
+    live = LiveView("live", "live", 10, f"rerun+http://127.0.0.1:{port}/proxy")
+    with viewer.viewer(port, "--save", str(path)), live:
+        live.begin(mdp, ("taxi_1", "taxi_2"))
+        live.steps("train", 0, steps)
+        live.metrics("eval", len(steps), metrics)
+    assert (live.dropped, live.failure) == (0, "")
+    shown = steps[steps["episode"] % 10 == 0]
+    chunks = RrdReader(str(path)).stream().filter(content="/train/grid/things").to_chunks()
+    moving = [chunk.to_record_batch() for chunk in chunks if not chunk.is_static]
+    times = [step for batch in moving for step in batch.column("step").to_pylist()]
+    assert sorted(set(times)) == (shown["step"] + 1).tolist()
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("127.0.0.1:9876", "expected a viewer's address such as rerun+http://127.0.0.1:9876/proxy"),
+        ("rerun+http://127.0.0.1:9/proxy", "nothing answers there"),
+        ("rerun+http://127.0.0.1:port/proxy", "expected a viewer's address"),
+    ],
+)
+def test_an_address_without_a_viewer_is_refused_before_the_run(url, said):
+    with pytest.raises(RunnerError, match=re.escape(said)):
+        viewer.check_address(url)
