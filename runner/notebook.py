@@ -70,7 +70,8 @@ def plot(*runs: Run) -> Shown:
         MissingExtra: Matplotlib is not installed.
         RecordingError: a recording cannot be read.
     """
-    from runner.export.plots import groups_of, panels_of, read_series
+    from runner.analysis.series import groups_of, read_series
+    from runner.export.plots import panels_of
     from runner.export.plots_figure import draw_figure
     from runner.recording.reader import open_recording
 

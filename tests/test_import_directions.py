@@ -18,7 +18,8 @@ ORDER = """
     mdp
     words learning recording observer
     provenance runs
-    analysis frames
+    frames
+    analysis
     execution export
     verify
     resume

@@ -41,6 +41,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     },
     "Compare": {
         "diff": ("runner.cli.commands.diff", "Tell what differs between two runs, and where they part."),
+        "compare": ("runner.cli.commands.compare", "Compare groups of runs, with statistics over seeds."),
     },
     "Check": {
         "verify": ("runner.cli.commands.verify", "Check every step of a run by doing it again."),

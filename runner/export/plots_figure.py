@@ -11,13 +11,15 @@ import io
 import math
 import re
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from runner.analysis.series import SHARES, Group
 from runner.errors import MissingExtra, RunnerError
-from runner.export.plots import SHARES, Curve, Group, Panel
+from runner.export.plots import Curve, Panel
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,11 +28,11 @@ if TYPE_CHECKING:
 SUFFIXES: Final = (".png", ".svg", ".pdf")
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
-_MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
+MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
 _DASHES: Final = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
 _BAND_OPACITY: Final = 0.2
-_INK: Final = "#1b1f24"
-_STYLE: Final = {
+INK: Final = "#1b1f24"
+STYLE: Final = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 8.5,
@@ -40,18 +42,18 @@ _STYLE: Final = {
     "axes.labelsize": 8.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.edgecolor": _INK,
-    "axes.labelcolor": _INK,
-    "text.color": _INK,
-    "xtick.color": _INK,
-    "ytick.color": _INK,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
     "legend.fontsize": 7.5,
     "legend.frameon": False,
     "lines.linewidth": 1.5,
     "grid.linewidth": 0.5,
-    "grid.color": _INK,
+    "grid.color": INK,
     "grid.alpha": 0.15,
     "svg.fonttype": "none",
     "svg.hashsalt": "dualtaxi",
@@ -70,6 +72,7 @@ def matplotlib_of(purpose: str) -> Any:
         import matplotlib as mpl
         import matplotlib.figure
         import matplotlib.layout_engine
+        import matplotlib.ticker
     except ImportError as error:
         raise MissingExtra("matplotlib", "plots", purpose) from error
     return mpl
@@ -94,7 +97,7 @@ def save_figure(path: Path, groups: Sequence[Group], panels: Sequence[Panel]) ->
     """
     mpl = matplotlib_of("a plot")
     stamp = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower(), {})
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         draw_figure(groups, panels).savefig(path, metadata=stamp)
 
 
@@ -107,7 +110,7 @@ def draw_figure(groups: Sequence[Group], panels: Sequence[Panel]) -> Figure:
     rows = math.ceil(len(narrow) / columns) + len(wide)
     head, foot = 0.55 + 0.19 * len(groups), 0.22
     height = head + 2.2 * rows + foot
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         room = (0, foot / height, 1, 1 - (head + foot) / height)
         figure: Figure = mpl.figure.Figure(
             figsize=(max(3.4 * columns, 6.8), height),
@@ -133,14 +136,14 @@ def panel_svg(panel: Panel, groups: int) -> str:
     """Return one panel as an SVG element for a page: its ink is the page's text colour."""
     mpl = matplotlib_of("a report")
     width = 8.0 if is_wide(panel) else 4.0
-    with mpl.rc_context(_STYLE | {"savefig.transparent": True}):
+    with mpl.rc_context(STYLE | {"savefig.transparent": True}):
         figure = mpl.figure.Figure(figsize=(width, 2.5))
         right = 0.8 if is_wide(panel) else 0.97
         axes = figure.add_axes((0.68 / width, 0.19, right - 0.68 / width, 0.63))
         draw_panel(axes, panel, groups)
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return _for_page(buffer.getvalue(), panel)
+    return svg_for_page(buffer.getvalue(), panel.metric, f"{panel.title} over training episodes")
 
 
 def draw_panel(axes: Axes, panel: Panel, groups: int) -> None:
@@ -173,7 +176,7 @@ def _draw_curve(axes: Axes, panel: Panel, curve: Curve, groups: int) -> None:
     line = panel.lines.index(curve.line)
     by_line = groups == 1 and len(panel.lines) > 1
     colour = COLOURS[(line if by_line else curve.group) % len(COLOURS)]
-    marker = _MARKERS[(line if by_line else curve.group) % len(_MARKERS)]
+    marker = MARKERS[(line if by_line else curve.group) % len(MARKERS)]
     axes.plot(
         curve.episodes,
         curve.median,
@@ -223,9 +226,9 @@ def _honest_axes(axes: Axes, panel: Panel) -> None:
     from matplotlib.ticker import MaxNLocator
 
     axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], integer=True))
-    axes.xaxis.set_major_formatter(_number)
+    axes.xaxis.set_major_formatter(number_on_axis)
     largest = max(float(np.abs([curve.low, curve.high]).max()) for curve in panel.curves)
-    axes.yaxis.set_major_formatter(_thousands if largest >= 10_000 else _number)
+    axes.yaxis.set_major_formatter(_thousands if largest >= 10_000 else number_on_axis)
     axes.set_xlim(left=0)
     if panel.percent:
         axes.set_ylim(0, 100 if panel.metric == SHARES else 103)
@@ -236,10 +239,10 @@ def _honest_axes(axes: Axes, panel: Panel) -> None:
         top = max(float(np.max(curve.high)) for curve in panel.curves)
         axes.set_ylim(0, top * 1.06 or 1.0)
     else:
-        axes.axhline(0, color=_INK, linewidth=0.6)
+        axes.axhline(0, color=INK, linewidth=0.6)
 
 
-def _number(value: float, _: object = None) -> str:
+def number_on_axis(value: float, _: object = None) -> str:
     """Return a number as an axis shows it: `20,000`, `0.5`, `2.5M`."""
     text = f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}"
     if abs(value) >= 1e6:
@@ -249,7 +252,7 @@ def _number(value: float, _: object = None) -> str:
 
 def _thousands(value: float, _: object = None) -> str:
     """Return a large number where there is little room: `20k`."""
-    return f"{_number(value / 1e3)}k" if 0 < abs(value) < 1e6 else _number(value)
+    return f"{number_on_axis(value / 1e3)}k" if 0 < abs(value) < 1e6 else number_on_axis(value)
 
 
 def _has_legend(panel: Panel) -> bool:
@@ -266,9 +269,9 @@ def _legend(axes: Axes, panel: Panel, groups: int) -> None:
         Line2D(
             [],
             [],
-            color=COLOURS[number % len(COLOURS)] if groups == 1 else _INK,
+            color=COLOURS[number % len(COLOURS)] if groups == 1 else INK,
             linestyle=_DASHES[number % len(_DASHES)],
-            marker=_MARKERS[number % len(_MARKERS)] if groups == 1 else "",
+            marker=MARKERS[number % len(MARKERS)] if groups == 1 else "",
             markersize=3.2,
             label=line.replace("_", " ") or "all",
         )
@@ -290,7 +293,7 @@ def _heading(figure: Figure, groups: Sequence[Group], height: float) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], color=COLOURS[i % len(COLOURS)], marker=_MARKERS[i % len(_MARKERS)], markersize=4)
+        Line2D([], [], color=COLOURS[i % len(COLOURS)], marker=MARKERS[i % len(MARKERS)], markersize=4)
         for i in range(len(groups))
     ]
     figure.text(
@@ -306,15 +309,21 @@ def _heading(figure: Figure, groups: Sequence[Group], height: float) -> None:
     )
 
 
-def _for_page(svg: str, panel: Panel) -> str:
-    """Return the `<svg>` element alone, named for readers of the page, with ink that follows the page."""
+def svg_for_page(svg: str, name: str, title: str) -> str:
+    """Return the `<svg>` element alone, its ink that of the page.
+
+    Args:
+        svg: a document of Matplotlib's.
+        name: set before its ids, so that they are the page's only ones.
+        title: what readers of the page hear.
+    """
     element = svg[svg.index("<svg") :]
     element = re.sub(r"<metadata>.*?</metadata>", "", element, flags=re.DOTALL)
-    element = element.replace(_INK, "currentColor")
+    element = element.replace(INK, "currentColor")
     for number, colour in enumerate(COLOURS):  # the page has lighter ones for the dark
         element = element.replace(colour.lower(), f"var(--line-{number}, {colour})")
     element = re.sub(r' width="[\d.]+pt" height="[\d.]+pt"', "", element, count=1)
-    name = re.sub(r"\W+", "-", panel.metric)
+    name = re.sub(r"\W+", "-", name)
     element = re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{name}-", element)
     element = re.sub(r"\s*\n\s*", " ", element)
-    return element.replace("<svg ", f'<svg role="img" aria-label="{panel.title} over training episodes" ', 1)
+    return element.replace("<svg ", f'<svg role="img" aria-label="{escape(title)}" ', 1)

@@ -13,9 +13,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from runner.analysis.series import RunSeries, groups_of, read_series
 from runner.errors import MissingExtra, RecordingError
 from runner.export import svg, svg_maps
-from runner.export.plots import RunSeries, groups_of, panels_of, read_series
+from runner.export.plots import panels_of
 from runner.export.plots_figure import footnote, is_wide, matplotlib_of, panel_svg
 from runner.export.report_maps import MapRow, maps_of, stages_of
 from runner.export.report_replay import (
@@ -68,7 +69,7 @@ def require_packages() -> None:
         MissingExtra: it is.
     """
     matplotlib_of("a report")
-    _templates()
+    templates()
 
 
 def render_report(recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> tuple[str, list[str]]:
@@ -81,7 +82,7 @@ def render_report(recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> 
             series.append(read_series(recording))
             runs.append(_run(recording, len(runs), chosen))
     page = (
-        _templates()
+        templates()
         .get_template("report.html")
         .render(
             title=_title(runs),
@@ -233,7 +234,12 @@ def _plots(series: Sequence[RunSeries]) -> dict[str, Any]:
     }
 
 
-def _templates() -> Environment:
+def templates() -> Environment:
+    """Return the templates of pages.
+
+    Raises:
+        MissingExtra: Jinja2 is not installed.
+    """
     try:
         import jinja2
     except ImportError as error:

@@ -49,6 +49,15 @@ def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
             fresh.unlink()
 
 
+def write_text_new(path: Path, force: bool, text: str) -> None:
+    """Write text to a file, as `write_new` does."""
+
+    def write(fresh: Path) -> None:
+        fresh.write_text(text, encoding="utf-8")
+
+    write_new(path, force, write)
+
+
 def state_of(recording: Recording) -> str:
     """Return `finished`, or what the run is instead."""
     return str(recording.result.get("status", "interrupted"))

@@ -1,34 +1,16 @@
-"""A `RunDiff` as sections of sentences and tables: what text, Markdown and HTML have in common."""
+"""A `RunDiff` as sections of sentences and tables."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 from runner.analysis.diff import NOT_CONTENT, Cause, Change, Parting, RunDiff
+from runner.analysis.sections import Grid, Section
 from runner.words import spoken
 
 MOST_NAMED = 4
 """So many settings are named in the first sentences."""
-
-
-@dataclass(frozen=True)
-class Grid:
-    """A small table of text."""
-
-    headings: tuple[str, ...]
-    rows: Sequence[tuple[str, ...]]
-
-
-@dataclass(frozen=True)
-class Section:
-    """A title, and what is said under it."""
-
-    title: str
-    sentences: list[str] = field(default_factory=list)
-    grids: list[Grid] = field(default_factory=list)
 
 
 def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
@@ -232,20 +214,3 @@ def _metrics(difference: RunDiff, everything: bool) -> Section:
 
 def _text(value: Any) -> str:
     return "–" if value is None else str(value)
-
-
-def markdown(made: list[Section]) -> Iterator[str]:
-    """Yield the lines of sections in Markdown."""
-    for section in made:
-        yield from (f"## {section.title}", "")
-        for sentence in section.sentences:
-            yield from (sentence, "")
-        for grid in section.grids:
-            yield _row(grid.headings)
-            yield _row(("---",) * len(grid.headings))
-            yield from (_row(row) for row in grid.rows)
-            yield ""
-
-
-def _row(cells: tuple[str, ...]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli.options import RunName, find, json_option, recordings_option
-from runner.cli.output import console, draw, print_json, table, title
+from runner.cli.output import print_json
+from runner.cli.sections import print_sections
 from runner.errors import RunnerError
 
 if TYPE_CHECKING:
     from runner.analysis.diff import Change, RunDiff
-    from runner.analysis.diff.sections import Section
 
 
 @click.command("diff")
@@ -102,22 +102,6 @@ def _as_json(difference: RunDiff) -> dict[str, Any]:
 
 
 def _print(difference: RunDiff, everything: bool, as_markdown: bool) -> None:
-    from runner.analysis.diff.sections import markdown, sections
+    from runner.analysis.diff.sections import sections
 
-    made = sections(difference, everything)
-    if as_markdown:
-        click.echo("\n".join(markdown(made)))
-        return
-    for section in made:
-        _draw(section)
-
-
-def _draw(section: Section) -> None:
-    draw(title(section.title), *section.sentences)
-    for grid in section.grids:
-        made = table(
-            *grid.headings, left=grid.headings, shrinking=grid.headings if console().is_terminal else ()
-        )
-        for row in grid.rows:
-            made.add_row(*row)
-        draw(made)
+    print_sections(sections(difference, everything), as_markdown)

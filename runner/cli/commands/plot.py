@@ -34,7 +34,8 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
       dualtaxi plot @latest
       dualtaxi plot cooperative competitive -o comparison.pdf
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.export.plots import groups_of, panels_of, read_series
+    from runner.analysis.series import groups_of, read_series
+    from runner.export.plots import panels_of
     from runner.export.plots_figure import check_suffix, matplotlib_of, save_figure
     from runner.export.report_runs import find_runs, shortcomings, state_of, write_new
     from runner.recording.reader import open_recording

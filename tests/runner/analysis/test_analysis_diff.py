@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 
 from runner import runs
 from runner.analysis.diff import RunDiff, diff
-from runner.analysis.diff.sections import markdown, sections
+from runner.analysis.diff.sections import sections
 from runner.analysis.diff.trajectory import FIELDS, first_difference
+from runner.analysis.sections import markdown
 from runner.analysis.tables import tables_at
 from runner.cli import cli
 from runner.config import from_mapping

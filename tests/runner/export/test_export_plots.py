@@ -9,9 +9,10 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.figure import Figure
 
+from runner.analysis.series import groups_of, read_series
 from runner.cli import cli
 from runner.errors import RunnerError
-from runner.export.plots import groups_of, panels_of, read_series
+from runner.export.plots import panels_of
 from runner.export.plots_figure import draw_figure, draw_panel
 from runner.frames import evaluation_records
 from runner.recording.reader import open_recording

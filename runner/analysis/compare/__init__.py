@@ -1,0 +1,239 @@
+"""Groups of runs against each other, a metric at a time: statistics over seeds.
+
+    groups, notes = grouped([read_series(recording) for recording in recordings])
+    comparison = compare(groups, [("finish_percent", "")], Moment("last"), notes)
+
+What a number means is said in `runner.analysis.compare.statistics`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from runner.analysis.compare import statistics
+from runner.analysis.compare.moments import HIGHER_IS_BETTER, Moment, value_of
+from runner.analysis.compare.statistics import Estimate, Values
+from runner.analysis.series import Group, points_of, title_of
+
+THRESHOLDS: Final = 101
+
+
+@dataclass(frozen=True)
+class GroupResult:
+    """One group's values of one metric, a seed each; those that no seed has are not here."""
+
+    label: str
+    seeds: list[int]
+    run_ids: list[str]
+    values: list[float]
+    """In the order of the seeds; infinite for a level never reached."""
+    median: float
+    iqm: Estimate
+    profile: list[float]
+    """Share of the runs that are at least as good as each of the metric's thresholds."""
+    profile_low: list[float]
+    profile_high: list[float]
+
+    @property
+    def n(self) -> int:
+        """How many runs."""
+        return len(self.values)
+
+
+@dataclass(frozen=True)
+class PairResult:
+    """Two groups at the seeds that both have."""
+
+    a: str
+    b: str
+    seeds: list[int]
+    left_out_a: list[int]
+    """Seeds that only A has."""
+    left_out_b: list[int]
+    median: float
+    """Of the differences A - B, seed by seed; nan without a common seed."""
+    iqm: Estimate
+    """Of the same differences."""
+    improvement: Estimate
+    """Probability that a run of A is better than one of B; higher, where nobody can say what is better."""
+    wins: int
+    ties: int
+    losses: int
+    """At how many seeds A is better than B, equal, worse."""
+
+
+@dataclass(frozen=True)
+class MetricResult:
+    """One metric of all groups that have it."""
+
+    metric: str
+    line: str
+    """Whose, such as taxi_1; empty if it is of the run."""
+    title: str
+    unit: str
+    higher_is_better: bool | None
+    groups: list[GroupResult]
+    pairs: list[PairResult]
+    thresholds: list[float]
+    notes: list[str]
+
+    @property
+    def name(self) -> str:
+        """Metric and line: `mean_return.taxi_1`."""
+        return f"{self.metric}.{self.line}" if self.line else self.metric
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What comes out of comparing groups."""
+
+    moment: str
+    groups: dict[str, list[str]]
+    """Label to the ids of its runs."""
+    metrics: list[MetricResult]
+    notes: list[str] = field(default_factory=list)
+
+
+def compare(
+    groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: Moment, notes: Sequence[str] = ()
+) -> Comparison:
+    """Return the statistics of some metrics of groups.
+
+    Args:
+        groups: of runs.
+        metrics: (metric, line) pairs, as `runner.analysis.series` names them.
+        moment: at which the metrics are read.
+        notes: what is to be said beside what is noted here.
+
+    Raises:
+        MissingExtra: SciPy is not installed.
+    """
+    statistics.require_scipy()
+    return Comparison(
+        moment=moment.described,
+        groups={group.label: [run.run_id for run in group.runs] for group in groups},
+        metrics=[_metric(groups, metric, line, moment) for metric, line in metrics],
+        notes=[*notes, *_few(groups)],
+    )
+
+
+def _few(groups: Sequence[Group]) -> list[str]:
+    few = [f"{group.label} ({len(group.runs)})" for group in groups if len(group.runs) < statistics.FEW_SEEDS]
+    if not few:
+        return []
+    return [
+        f"fewer than {statistics.FEW_SEEDS} seeds in {', '.join(few)}: take the intervals as a hint; "
+        "`--set 'seeds={count: 10}'` runs ten"
+    ]
+
+
+def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> MetricResult:
+    notes: list[str] = []
+    found = [(group.label, _values(group, metric, line, moment, groups, notes)) for group in groups]
+    title, unit = title_of(metric)
+    better = False if moment.level is not None else HIGHER_IS_BETTER.get(metric)
+    if moment.level is not None:
+        title, unit = f"{title}: first at {moment.level:g}", "training episodes"
+    sign = -1.0 if better is False else 1.0
+    present = [(label, values) for label, values in found if values]
+    thresholds = _thresholds([run[1] for _, values in present for run in values.values()], sign)
+    return MetricResult(
+        metric,
+        line,
+        title,
+        unit,
+        better,
+        [_group(label, values, thresholds, sign) for label, values in present],
+        [_pair(*a, *b, sign) for a, b in itertools.combinations(present, 2)],
+        thresholds.tolist(),
+        [*notes, *_ends(groups, metric, line, moment)],
+    )
+
+
+def _values(
+    group: Group, metric: str, line: str, moment: Moment, groups: Sequence[Group], notes: list[str]
+) -> dict[int, tuple[str, float]]:
+    """Return seed to run id and value of a group; says in `notes` which runs are left out."""
+    values: dict[int, tuple[str, float]] = {}
+    without: dict[str, list[str]] = {}
+    for run in group.runs:
+        value, reason = value_of(run, metric, line, moment, groups)
+        if value is None:
+            without.setdefault(reason, []).append(run.run_id)
+        else:
+            values[run.seed] = run.run_id, value
+    notes += [f"{group.label}, left out: {_few_of(runs)} ({reason})" for reason, runs in without.items()]
+    return dict(sorted(values.items()))
+
+
+def _few_of(names: Sequence[str]) -> str:
+    more = len(names) - 5
+    return ", ".join(names[:5]) + (f" and {more} more" if more > 0 else "")
+
+
+def _ends(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> list[str]:
+    """Return a note if the last evaluation comes after other numbers of episodes in the groups."""
+    if moment.kind != "last":
+        return []
+    told = {
+        group.label: max(points)
+        for group in groups
+        for run in group.runs
+        if run.finished and (points := points_of(run, metric, line, aligned=True))
+    }
+    if len(set(told.values())) < 2:
+        return []
+    listed = ", ".join(f"after {end:,} episodes in {label}" for label, end in told.items())
+    return [f"the last evaluation is {listed}; --at {min(told.values())} compares after as many"]
+
+
+def _thresholds(values: Sequence[float], sign: float) -> Values:
+    """Return evenly spaced levels from the worst value to the best; few where there are few values."""
+    finite = sorted({value for value in values if abs(value) < statistics.NEVER})
+    if not finite:
+        return np.empty(0)
+    levels = np.linspace(finite[0], finite[-1], THRESHOLDS) if len(finite) > 1 else np.array(finite)
+    return levels[:: int(sign)]
+
+
+def _group(label: str, values: dict[int, tuple[str, float]], thresholds: Values, sign: float) -> GroupResult:
+    own = np.array([value for _, value in values.values()])
+    share, low, high = (
+        column.tolist() for column in statistics.share_at_least(sign * own, sign * thresholds)
+    )
+    return GroupResult(
+        label,
+        list(values),
+        [run_id for run_id, _ in values.values()],
+        [statistics.bounded(value) for value in own.tolist()],
+        statistics.median(own),
+        statistics.interquartile_mean(own),
+        share,
+        low,
+        high,
+    )
+
+
+def _pair(a: str, ours: dict[int, Any], b: str, theirs: dict[int, Any], sign: float) -> PairResult:
+    seeds = sorted(ours.keys() & theirs.keys())
+    left, right = (np.array([values[seed][1] for seed in seeds]) for values in (ours, theirs))
+    difference = left - right
+    none = Estimate(np.nan, np.nan, np.nan)
+    return PairResult(
+        a,
+        b,
+        seeds,
+        sorted(ours.keys() - theirs.keys()),
+        sorted(theirs.keys() - ours.keys()),
+        statistics.median(difference) if seeds else np.nan,
+        statistics.interquartile_mean(difference),
+        statistics.improvement(sign * left, sign * right) if seeds else none,
+        int((sign * difference > 0).sum()),
+        int((difference == 0).sum()),
+        int((sign * difference < 0).sum()),
+    )

@@ -1,0 +1,123 @@
+"""Which runs belong together, and which metrics they have."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from runner.analysis.series import SHARES, Group, RunSeries, flat_config, label_of
+from runner.errors import RunnerError, nearest
+
+_NOT_COMPARED = ("seeds", "recording", "name")
+_USUAL = ("finish_percent", "mean_length", "mean_penalties", "mean_return")
+
+
+def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Group], list[str]]:
+    """Return runs in groups, and what is to be said of them, a sentence each.
+
+    Runs belong together whose configurations differ in nothing but the seed, whatever they are called and
+    however they are recorded; or, with `by`, those that have the same value there. Of two runs of a seed
+    in a group of one configuration, which are the same run twice, the finished and then the newer one counts.
+
+    Args:
+        series: the runs.
+        by: path of a configuration's value, such as `quirks.epsilon_exploits`.
+
+    Raises:
+        RunnerError: no run has a value of that path.
+    """
+    found: dict[str, list[RunSeries]] = {}
+    key = _content if by is None else _value_at(by, series)
+    for run in series:
+        found.setdefault(key(run), []).append(run)
+    once = {name: list(_each_once(runs)) for name, runs in found.items()}
+    twice = [run.run_id for name, runs in found.items() for run in runs if run not in once[name]]
+    notes = (
+        [f"left out, as another run of the same configuration and seed is there: {', '.join(twice)}"]
+        if twice
+        else []
+    )
+    if by is not None:
+        groups = [Group(f"{by} = {name}", tuple(runs)) for name, runs in once.items()]
+        notes += [note for group in groups for note in _mixed(group)]
+        return groups, notes
+    firsts = list(once.values())
+    names = [" / ".join(dict.fromkeys(run.name for run in runs)) for runs in firsts]
+    flat = [dict(flat_config(runs[0].config)) for runs in firsts]
+    labels = [label_of(i, names, flat) for i in range(len(names))]
+    return [Group(label, tuple(runs)) for label, runs in zip(labels, firsts, strict=True)], notes
+
+
+def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tuple[str, str]]:
+    """Return the (metric, line) pairs of these names; those of evaluation unless some are chosen.
+
+    Args:
+        groups: whose.
+        chosen: a metric (`mean_return`, of all its agents), or one of its lines (`mean_return.taxi_1`).
+
+    Raises:
+        RunnerError: no run has one of them, or any at all.
+    """
+    known: dict[str, list[tuple[str, str]]] = {}
+    for group in groups:
+        for run in group.runs:
+            for _, readings in (*run.evaluation, *run.training):
+                for metric in readings:
+                    for line in readings[metric] if metric != SHARES else ():
+                        for name in {metric, f"{metric}.{line}" if line else metric}:
+                            lines = known.setdefault(name, [])
+                            if (metric, line) not in lines:
+                                lines.append((metric, line))
+    if not known:
+        raise RunnerError("found no evaluation in any of the runs, so there is nothing to compare.")
+    names = list(chosen) or [name for name in _USUAL if name in known]
+    for name in names:
+        if name not in known:
+            listed = ", ".join(sorted(known))
+            raise RunnerError(f"--metric: found {name!r}, expected one of {listed}.{nearest(name, known)}")
+    return list(dict.fromkeys(pair for name in names for pair in known[name]))
+
+
+def _content(run: RunSeries) -> str:
+    return json.dumps({k: v for k, v in run.config.items() if k not in _NOT_COMPARED}, sort_keys=True)
+
+
+def _value_at(path: str, series: Sequence[RunSeries]) -> Callable[[RunSeries], str]:
+    """Return what gives a run's value at a path of the configuration, as JSON."""
+    known = [_paths(run.config) for run in series]
+    if not any(path in paths for paths in known):
+        names = sorted({name for paths in known for name in paths})
+        raise RunnerError(
+            f"--by: found {path!r}, expected a path of the configuration such as discount or "
+            f"evaluation.trials; `dualtaxi config check` prints all.{nearest(path, names)}"
+        )
+    return lambda run: json.dumps(_paths(run.config).get(path), sort_keys=True)
+
+
+def _paths(values: Any, prefix: str = "") -> dict[str, Any]:
+    """Return all values of a configuration by dotted path, mappings as well."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found[f"{prefix}{key}"] = value
+        if isinstance(value, dict):
+            found |= _paths(value, f"{prefix}{key}.")
+    return found
+
+
+def _each_once(runs: Sequence[RunSeries]) -> list[RunSeries]:
+    """Return a run for each configuration and seed: a finished one if there is one, the last given."""
+    best: dict[tuple[str, int], RunSeries] = {}
+    for run in runs:
+        known = best.get((_content(run), run.seed))
+        if known is None or run.finished >= known.finished:
+            best[_content(run), run.seed] = run
+    return list(best.values())
+
+
+def _mixed(group: Group) -> list[str]:
+    """Return a note if a group's runs differ in more than the seed, or several have the same seed."""
+    configurations = {_content(run) for run in group.runs}
+    if len(configurations) == 1:
+        return []
+    return [f"{group.label} has runs of {len(configurations)} configurations"]

@@ -1,0 +1,98 @@
+"""When a metric is read: at the last or best evaluation, after so many episodes, over all, at a crossing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from runner.analysis.compare.statistics import NEVER
+from runner.analysis.series import Group, RunSeries, points_of
+
+HIGHER_IS_BETTER: Final = {
+    "finish_percent": True,
+    "mean_return": True,
+    "training.mean_reward": True,
+    "mean_length": False,
+    "mean_penalties": False,
+    "training.mean_length": False,
+}
+"""Of other metrics nobody can say it in general: they are compared as higher or lower."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A moment, or a way to sum a curve up in one number.
+
+    last: the last evaluation. best: the best of all. area: the mean of the curve by the trapezoid rule,
+    over the episodes that every run has. episode: the evaluation after `number` training episodes.
+    crossing: after how many episodes the curve is first at `level`, coming from the other side.
+    """
+
+    kind: str
+    number: int = 0
+    level: float | None = None
+
+    @property
+    def described(self) -> str:
+        """The moment in words."""
+        return {
+            "last": "at the last evaluation",
+            "best": "at each run's best evaluation",
+            "area": "the mean over training, by area under the curve",
+            "episode": f"after {self.number:,} training episodes",
+            "crossing": f"training episodes until it is first at {self.level:g}"
+            if self.level is not None
+            else "",
+        }[self.kind]
+
+
+def value_of(
+    run: RunSeries, metric: str, line: str, moment: Moment, groups: Sequence[Group]
+) -> tuple[float | None, str]:
+    """Return a run's value of a metric, or None and why it has none."""
+    points = points_of(run, metric, line, aligned=True)
+    if not points:
+        return None, f"has no {metric}{'.' + line if line else ''}"
+    if moment.kind == "episode":
+        return points.get(moment.number), f"has none after {moment.number:,} episodes"
+    if not run.finished:
+        return None, "not finished; --at EPISODE takes it as far as it got"
+    if moment.kind == "area":
+        return _area(points, _shared_episodes(metric, line, groups))
+    return _of_curve(points, metric, moment), ""
+
+
+def _of_curve(points: dict[int, float], metric: str, moment: Moment) -> float:
+    if moment.level is not None:
+        at = first_crossing(points, moment.level)
+        return NEVER if at is None else float(at)
+    if moment.kind == "best":
+        best = min if HIGHER_IS_BETTER.get(metric) is False else max
+        return best(points.values())
+    return points[max(points)]
+
+
+def first_crossing(points: dict[int, float], level: float) -> int | None:
+    """Return the first episode at which a curve is at a level, or on the other side than at its beginning."""
+    below = points[min(points)] < level
+    for episode in sorted(points):
+        if points[episode] >= level if below else points[episode] <= level:
+            return episode
+    return None
+
+
+def _shared_episodes(metric: str, line: str, groups: Sequence[Group]) -> list[int]:
+    """Return the episodes at which every finished run that has the metric has it."""
+    runs = [run for group in groups for run in group.runs if run.finished]
+    episodes = [set(points_of(run, metric, line, aligned=True)) for run in runs]
+    return sorted(set.intersection(*(some for some in episodes if some)))
+
+
+def _area(points: dict[int, float], episodes: Sequence[int]) -> tuple[float | None, str]:
+    if len(episodes) < 2:
+        return None, "fewer than two evaluations after as many episodes as in the other runs"
+    values = [points[episode] for episode in episodes]
+    return float(np.trapezoid(values, episodes)) / (episodes[-1] - episodes[0]), ""

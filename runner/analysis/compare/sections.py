@@ -1,0 +1,137 @@
+"""A `Comparison` as sections of sentences and tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from runner.analysis.compare import Comparison, GroupResult, MetricResult, PairResult
+from runner.analysis.compare.statistics import Estimate
+from runner.analysis.sections import Grid, Section
+
+_LEVELS = 5
+"""So many points of a performance profile are printed."""
+EXPLANATION = (
+    "IQM: interquartile mean, of the middle half of the seeds. In brackets: 95 % percentile bootstrap "
+    "intervals (Agarwal et al. 2021). Differences are taken seed by seed, as runs of one seed share their "
+    "draws. P: the probability that any run of A does better than any of B, of the seeds compared."
+)
+
+
+def sections(comparison: Comparison) -> list[Section]:
+    """Return what is to be said of a comparison."""
+    rows = [(label, str(len(ids)), _few(ids)) for label, ids in comparison.groups.items()]
+    said = [*in_short(comparison), *(f"Note: {note}." for note in comparison.notes)]
+    first = Section("Groups", said, [Grid(("group", "runs", ""), rows)])
+    return [
+        first,
+        *(metric_section(metric) for metric in comparison.metrics),
+        Section("How to read this", [EXPLANATION]),
+    ]
+
+
+def in_short(comparison: Comparison) -> list[str]:
+    """Return what came out of the first metric, a sentence for each pair of groups."""
+    for metric in comparison.metrics:
+        if metric.pairs:
+            return [_told(metric, pair) for pair in metric.pairs if pair.seeds]
+    return []
+
+
+def _told(metric: MetricResult, pair: PairResult) -> str:
+    word = "higher" if metric.higher_is_better is None else "better"
+    first, second, count = pair.a, pair.b, pair.wins
+    if pair.losses > pair.wins:
+        first, second, count = pair.b, pair.a, pair.losses
+    equal = f", equal at {pair.ties}" if pair.ties else ""
+    by = ""
+    if not math.isnan(pair.iqm.value):
+        by = f"; IQM of {pair.a} - {pair.b}: {number(pair.iqm.value, True)}, 95 % {interval(pair.iqm, True)}"
+    return (
+        f"{metric.title}, in {metric.unit}: {first} is {word} than {second} at {count} of {len(pair.seeds)} "
+        f"seeds{equal}{by}."
+    )
+
+
+def metric_section(metric: MetricResult, profile: bool = True) -> Section:
+    """Return what is to be said of one metric.
+
+    Args:
+        metric: which.
+        profile: also a few points of the performance profile.
+    """
+    better = {True: "higher is better", False: "lower is better", None: "neither is better as such"}
+    whose = f", {metric.line.replace('_', ' ')}" if metric.line else ""
+    grids = [Grid(("", "n", "median", "IQM", "95 %"), [_group(group) for group in metric.groups])]
+    if metric.pairs:
+        word = "higher" if metric.higher_is_better is None else "better"
+        count = f"{word} / equal / {'lower' if word == 'higher' else 'worse'}"
+        headings = ("A - B, seed by seed", "seeds", "median", "IQM", "95 %", f"P(A {word})", "95 %", count)
+        grids.append(Grid(headings, [_pair(pair) for pair in metric.pairs]))
+    if profile and len(metric.thresholds) > 1:
+        grids.append(_profile(metric))
+    said = [f"{metric.name}, in {metric.unit}; {better[metric.higher_is_better]}."]
+    said += [f"Note: {note}." for note in (*metric.notes, *unpaired(metric.pairs))]
+    return Section(metric.title + whose, said, grids)
+
+
+def unpaired(pairs: Sequence[PairResult]) -> list[str]:
+    """Return which seeds are left out of the pairs, a sentence each."""
+    said = []
+    for pair in pairs:
+        for own, other, seeds in ((pair.a, pair.b, pair.left_out_a), (pair.b, pair.a, pair.left_out_b)):
+            if seeds:
+                listed = _few([str(seed) for seed in seeds])
+                said.append(
+                    f"{pair.a} against {pair.b} without seed {listed}, which {own} has and {other} has not"
+                )
+    return said
+
+
+def _group(group: GroupResult) -> tuple[str, ...]:
+    return (group.label, str(group.n), number(group.median), number(group.iqm.value), interval(group.iqm))
+
+
+def _pair(pair: PairResult) -> tuple[str, ...]:
+    return (
+        f"{pair.a} - {pair.b}",
+        str(len(pair.seeds)),
+        number(pair.median, signed=True),
+        number(pair.iqm.value, signed=True),
+        interval(pair.iqm, signed=True),
+        number(pair.improvement.value),
+        interval(pair.improvement),
+        f"{pair.wins} / {pair.ties} / {pair.losses}",
+    )
+
+
+def _profile(metric: MetricResult) -> Grid:
+    """Return a few points of the performance profile."""
+    at = np.unique(np.linspace(0, len(metric.thresholds) - 1, _LEVELS).round().astype(int)).tolist()
+    sign = "at most" if metric.higher_is_better is False else "at least"
+    rows = [(group.label, *(f"{100 * group.profile[k]:.0f} %" for k in at)) for group in metric.groups]
+    return Grid((f"share of runs {sign}", *(number(metric.thresholds[k]) for k in at)), rows)
+
+
+def number(value: float, signed: bool = False) -> str:
+    """Return a number with three or more digits that count; `never` for what is not reached."""
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "never" if value > 0 else "-never"
+    digits = 0 if abs(value) >= 1000 else 1 if abs(value) >= 100 else 2
+    return f"{value:{'+' if signed else ''},.{digits}f}"
+
+
+def interval(estimate: Estimate, signed: bool = False) -> str:
+    """Return an interval: `[1.2, 3.4]`."""
+    if math.isnan(estimate.low):
+        return "–"
+    return f"[{number(estimate.low, signed)}, {number(estimate.high, signed)}]"
+
+
+def _few(names: Sequence[str]) -> str:
+    more = len(names) - 6
+    return ", ".join(names[:6]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,40 @@
+"""Sections of sentences and tables: what text, Markdown and pages have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A small table of text."""
+
+    headings: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A title, and what is said under it."""
+
+    title: str
+    sentences: list[str] = field(default_factory=list)
+    grids: list[Grid] = field(default_factory=list)
+
+
+def markdown(made: Sequence[Section]) -> Iterator[str]:
+    """Yield the lines of sections in Markdown."""
+    for section in made:
+        yield from (f"## {section.title}", "")
+        for sentence in section.sentences:
+            yield from (sentence, "")
+        for grid in section.grids:
+            yield _row(grid.headings)
+            yield _row(("---",) * len(grid.headings))
+            yield from (_row(row) for row in grid.rows)
+            yield ""
+
+
+def _row(cells: tuple[str, ...]) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"

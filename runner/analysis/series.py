@@ -1,0 +1,184 @@
+"""The metrics of runs over episodes, and runs by configuration: what plots and comparisons are made of.
+
+Runs belong to one group when their configurations differ in nothing but the seed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from runner.frames import evaluation_records, training_records
+from runner.recording.reader import Recording
+from runner.words import event_in_words, spoken
+
+Readings = dict[str, dict[str, float]]
+"""Metric -> line (an agent, a reward, or "") -> value."""
+
+
+@dataclass(frozen=True)
+class RunSeries:
+    """The metrics of one run."""
+
+    run_id: str
+    name: str
+    seed: int
+    finished: bool
+    config: Mapping[str, Any]
+    evaluation: list[tuple[int, Readings]]
+    """(episode, readings) of every evaluation."""
+    training: list[tuple[int, Readings]]
+    """(episode, readings) of every report of training, those at evaluations among them."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs of one configuration."""
+
+    label: str
+    runs: tuple[RunSeries, ...]
+
+    @property
+    def described(self) -> str:
+        """Its label, and which runs they are: `quick, 3 runs (k3v9m2xq seed 0, ...)`."""
+        shown = ", ".join(
+            f"{run.run_id} seed {run.seed}" + ("" if run.finished else ", interrupted")
+            for run in self.runs[:MOST_NAMED]
+        )
+        more = len(self.runs) - MOST_NAMED
+        shown += f", and {more} more" if more > 0 else ""
+        count = f"{len(self.runs)} runs: " if len(self.runs) > 1 else "run "
+        return f"{self.label} ({count}{shown})"
+
+
+MOST_NAMED: Final = 6
+SHARES: Final = "training.reward"
+"""The metric whose lines are shares of a whole."""
+
+TITLES: Final = {
+    "finish_percent": ("Evaluation trials that succeed", "percent of trials"),
+    "mean_length": ("Length of evaluation trials", "steps, mean"),
+    "mean_penalties": ("Penalties in evaluation trials", "a trial, mean"),
+    "mean_return": ("Return of evaluation trials", "summed reward, mean"),
+    "training.mean_length": ("Length of training episodes", "steps, running mean"),
+    "training.mean_reward": ("Reward in training", "a step, running mean"),
+    "training.percent_filled": ("Q-table filled", "percent of its cells"),
+    "training.zero_cells": ("Q-table cells still zero", "cells"),
+    "training.schedule": ("Schedules", "value"),
+    SHARES: ("Training steps by reward", "percent of recent steps"),
+}
+"""Metric -> title and unit, in the order they are shown; events come after the evaluation's."""
+
+
+def read_series(recording: Recording) -> RunSeries:
+    """Return the metrics of a recording, also of one that was cut off."""
+    evaluations = evaluation_records(recording)
+    training = [(record["episode"], _training(record)) for record in training_records(recording)]
+    training += [(record["episode"], _training(record["training"])) for record in evaluations]
+    return RunSeries(
+        run_id=recording.run["run_id"],
+        name=recording.run["name"],
+        seed=int(recording.run["seed"]),
+        finished=recording.result.get("status") == "finished",
+        config=recording.config,
+        evaluation=[(record["episode"], _evaluation(record)) for record in evaluations],
+        training=sorted(training, key=lambda entry: entry[0]),
+    )
+
+
+def groups_of(series: Sequence[RunSeries]) -> list[Group]:
+    """Return the runs by configuration, in the order given, labelled by name and by what differs."""
+    found: dict[str, list[RunSeries]] = {}
+    for run in series:
+        content = {key: value for key, value in run.config.items() if key not in ("seeds", "recording")}
+        found.setdefault(f"{run.name} {json.dumps(content, sort_keys=True)}", []).append(run)
+    flat = [dict(flat_config(runs[0].config)) for runs in found.values()]
+    names = [runs[0].name for runs in found.values()]
+    labels = [label_of(i, names, flat) for i in range(len(names))]
+    return [Group(label, tuple(runs)) for label, runs in zip(labels, found.values(), strict=True)]
+
+
+def title_of(metric: str) -> tuple[str, str]:
+    """Return a metric's title and its unit."""
+    if metric.startswith("event."):
+        return f"Event: {event_in_words(metric.removeprefix('event.'))}", "times a trial, mean"
+    return TITLES[metric]
+
+
+def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[int, float]:
+    """Return value by episode; a reward that did not come is 0 percent of the steps.
+
+    Args:
+        run: whose.
+        metric: which.
+        line: an agent, a reward, or "".
+        aligned: of the reports of training only those at evaluations, which are at the same episodes in
+            every run of a configuration; all of them if the run has no evaluation.
+    """
+    source = run.training if metric.startswith("training.") else run.evaluation
+    at_evaluations = {episode for episode, _ in run.evaluation}
+    missing = 0.0 if metric == SHARES else np.nan
+    points = {
+        episode: readings[metric].get(line, missing)
+        for episode, readings in source
+        if metric in readings and (not aligned or not at_evaluations or episode in at_evaluations)
+    }
+    return {episode: value for episode, value in points.items() if not np.isnan(value)}
+
+
+# --- inside -------------------------------------------------------------------------------------------
+
+
+def _evaluation(record: Mapping[str, Any]) -> Readings:
+    trials = record["trials"]
+    known = {} if record["finish_percent"] is None else {"finish_percent": {"": record["finish_percent"]}}
+    events: Readings = {}
+    for name, count in record["events"].items():
+        agent, _, kind = name.rpartition(".")
+        events.setdefault(f"event.{kind}", {})[agent] = count / trials
+    means = {
+        "mean_length": {"": record["mean_length"]},
+        "mean_penalties": {"": record["mean_penalties"]},
+        "mean_return": dict(record["mean_returns"]),
+    }
+    return known | means | events
+
+
+def _training(side: Mapping[str, Any]) -> Readings:
+    counts = {entry["reward"]: entry["steps"] for entry in side["reward_counts"]}
+    steps = sum(counts.values())
+    length = side["mean_length"]
+    readings: Readings = {} if length is None else {"training.mean_length": {"": length}}
+    if steps:
+        mean = sum(reward * count for reward, count in counts.items()) / steps
+        readings["training.mean_reward"] = {"": mean}
+        readings[SHARES] = {f"{r:g}": 100 * count / steps for r, count in counts.items()}
+    return readings | {
+        "training.percent_filled": dict(side["percent_filled"]),
+        "training.zero_cells": dict(side["zero_cells"]),
+        "training.schedule": {spoken(key): side[key] for key in ("epsilon", "step_size", "discount")},
+    }
+
+
+def label_of(own: int, names: Sequence[str], flat: Sequence[Mapping[str, Any]]) -> str:
+    """Return a group's name, with the values in which it differs from others of that name."""
+    same = [flat[i] for i, name in enumerate(names) if name == names[own]]
+    keys = sorted({key for other in same for key in other if key not in ("name", "seeds")})
+    differing = [key for key in keys if any(other.get(key) != same[0].get(key) for other in same)]
+    told = ", ".join(f"{key}={flat[own].get(key)}" for key in differing if not key.startswith("recording."))
+    return f"{names[own]}, {told}" if told else names[own]
+
+
+def flat_config(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of a configuration by dotted key."""
+    for key, value in values.items():
+        if key in ("seeds", "name") and not prefix:
+            continue
+        if isinstance(value, Mapping):
+            yield from flat_config(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value

@@ -1,0 +1,153 @@
+"""`dualtaxi compare`: groups of runs against each other, with statistics over seeds."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from runner.cli.options import RunName, json_option, recordings_option
+from runner.cli.output import print_json, say
+from runner.cli.sections import print_sections
+from runner.errors import RunnerError
+
+if TYPE_CHECKING:
+    from runner.analysis.compare import Comparison
+    from runner.analysis.compare.moments import Moment
+    from runner.analysis.series import Group, RunSeries
+
+
+@click.command("compare")
+@click.argument("run_names", metavar="RUN...", type=RunName(), nargs=-1, required=True)
+@click.option("--by", metavar="PATH", help="Group by a value of the configuration, such as discount.")
+@click.option(
+    "--metric",
+    "chosen",
+    multiple=True,
+    metavar="METRIC",
+    help="Which; may be repeated.  [default: the evaluation's]",
+)
+@click.option(
+    "--at",
+    default="last",
+    show_default=True,
+    metavar="last|best|area|EPISODE",
+    help="The last evaluation, each run's best, the mean over training, or the evaluation after EPISODE.",
+)
+@click.option(
+    "--target",
+    metavar="METRIC=LEVEL",
+    help="Instead: after how many episodes a level is first reached, such as finish_percent=80.",
+)
+@json_option
+@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for a note or an issue.")
+@click.option(
+    "--html", type=click.Path(path_type=Path), metavar="FILE", help="Write a page with plots instead."
+)
+@click.option("--force", is_flag=True, help="Replace the page if it exists.")
+@recordings_option
+def command(
+    run_names: tuple[str, ...],
+    by: str | None,
+    chosen: tuple[str, ...],
+    at: str,
+    target: str | None,
+    as_json: bool,
+    as_markdown: bool,
+    html: Path | None,
+    force: bool,
+    recordings: Path | None,
+) -> None:
+    """Compare groups of runs: medians, interquartile means, intervals, and how likely one beats the other.
+
+    Runs that differ in nothing but the seed are one group; the name of several runs stands for all of
+    them. Groups are compared seed by seed, as runs of one seed share their draws. For each metric: median
+    and interquartile mean (IQM) with a 95 % bootstrap interval; for each two groups the differences, and
+    the probability that a run of A is better than one of B; and the share of runs that reach a level.
+
+    Exit code 0 when groups were compared, 2 when there is nothing to compare.
+
+    \b
+    Examples:
+      dualtaxi compare cooperative competitive
+      dualtaxi compare first second third --metric mean_length --at 10000
+      dualtaxi compare sweep --by discount --target finish_percent=80
+      dualtaxi compare cooperative competitive --html comparison.html
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.analysis.compare import compare
+    from runner.analysis.compare.groups import grouped, metrics_of
+    from runner.analysis.compare.sections import sections
+    from runner.analysis.compare.statistics import require_scipy
+
+    require_scipy()
+    moment, chosen = _moment(at, target, chosen)
+    groups, notes = grouped(_read(run_names, recordings), by)
+    if len(groups) < 2:
+        raise RunnerError(_only_one(groups, by))
+    comparison = compare(groups, metrics_of(groups, chosen), moment, notes)
+    if html is not None:
+        _write_page(html, force, comparison, groups)
+    elif as_json:
+        print_json(dataclasses.asdict(comparison))
+    else:
+        print_sections(sections(comparison), as_markdown)
+
+
+def _moment(at: str, target: str | None, chosen: tuple[str, ...]) -> tuple[Moment, tuple[str, ...]]:
+    """Return the moment asked for, and the metrics: a target names its own."""
+    from runner.analysis.compare.moments import Moment
+
+    if target is not None:
+        if at != "last" or chosen:
+            raise RunnerError("--target: found --at or --metric as well, expected it alone.")
+        metric, _, level = target.partition("=")
+        try:
+            return Moment("crossing", level=float(level)), (metric,)
+        except ValueError:
+            message = f"--target: found {target!r}, expected METRIC=LEVEL such as finish_percent=80."
+            raise RunnerError(message) from None
+    if at.isascii() and at.isdecimal():
+        return Moment("episode", number=int(at)), chosen
+    if at not in ("last", "best", "area"):
+        raise RunnerError(f"--at: found {at!r}, expected last, best, area, or a number of training episodes.")
+    return Moment(at), chosen
+
+
+def _read(names: tuple[str, ...], recordings: Path | None) -> list[RunSeries]:
+    """Return the metrics of all runs that answer to the names; says which are not finished."""
+    from runner.analysis.series import read_series
+    from runner.export.report_runs import find_runs
+    from runner.recording.reader import open_recording
+    from runner.runs import recordings_folder
+
+    found = []
+    for run in find_runs(names, recordings_folder(recordings)):
+        with open_recording(run.recording) as recording:
+            found.append(read_series(recording))
+    return found
+
+
+def _only_one(groups: list[Group], by: str | None) -> str:
+    (group,) = groups
+    if len(group.runs) == 1:
+        return f"found one run, {group.runs[0].run_id}, expected at least two to compare."
+    if by is not None:
+        return f"found {len(group.runs)} runs, all with {group.label}, expected two values at least."
+    return (
+        f"found {len(group.runs)} runs of one configuration, {group.label}, expected two configurations at "
+        "least; `dualtaxi plot` draws their median, `dualtaxi ls` lists what there is."
+    )
+
+
+def _write_page(path: Path, force: bool, comparison: Comparison, groups: list[Group]) -> None:
+    from runner.export.compare_page import render_comparison
+    from runner.export.report_runs import write_text_new
+
+    page = render_comparison(comparison, groups)
+    write_text_new(path, force, page)
+    for note in comparison.notes:
+        say(f"Note: {note}.")
+    runs = sum(len(group.runs) for group in groups)
+    click.echo(f"{path}: {len(comparison.metrics)} metrics of {runs} runs in {len(groups)} groups")

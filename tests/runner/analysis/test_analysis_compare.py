@@ -1,0 +1,244 @@
+"""Groups of runs are compared by statistics that can be done by hand, and nothing is left out silently."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import runner
+from runner.analysis.compare import compare, statistics
+from runner.analysis.compare.groups import grouped, metrics_of
+from runner.analysis.compare.moments import Moment
+from runner.analysis.compare.sections import sections
+from runner.analysis.sections import markdown
+from runner.analysis.series import RunSeries
+from runner.errors import RunnerError
+
+FINISH = [("finish_percent", "")]
+
+
+def run(seed, curve, *, name="a", finished=True, metric="finish_percent", line="", **config):
+    """Return a run whose metric takes the values of a curve, every 100 episodes."""
+    evaluation = [(100 * k, {metric: {line: float(value)}}) for k, value in enumerate(curve)]
+    config = {"episodes": 100 * (len(curve) - 1), "name": name, "seeds": [seed]} | config
+    return RunSeries(f"{name}{seed}{'' if finished else 'x'}", name, seed, finished, config, evaluation, [])
+
+
+def two_groups(left, right, **kwargs):
+    """Return runs of two groups, whose last values are these, seeds from 0."""
+    series = [run(seed, [0, value], discount=0.8, **kwargs) for seed, value in enumerate(left)]
+    return series + [run(s, [0, value], name="b", discount=0.9, **kwargs) for s, value in enumerate(right)]
+
+
+def result(series, moment=None, metrics=FINISH, by=None):
+    groups, notes = grouped(series, by)
+    return compare(groups, metrics, moment or Moment("last"), notes)
+
+
+def test_median_iqm_and_wins_are_those_done_by_hand():
+    (metric,) = result(two_groups([10, 20, 30, 90], [11, 10, 30, 40])).metrics
+    a, b = metric.groups
+    assert (a.n, a.median, a.iqm.value) == (4, 25, 25)
+    assert (b.median, b.iqm.value) == (20.5, 20.5)
+    (pair,) = metric.pairs
+    assert (pair.wins, pair.ties, pair.losses) == (2, 1, 1)
+    assert (pair.median, pair.iqm.value) == (5, 5)  # of -1, 10, 0, 50
+    pairs = [(x > y) + (x == y) / 2 for x in (10, 20, 30, 90) for y in (11, 10, 30, 40)]
+    assert pair.improvement.value == pytest.approx(np.mean(pairs))
+
+
+def test_lower_is_better_where_it_is():
+    series = two_groups([10, 10, 10, 10], [50, 60, 70, 80], metric="mean_length")
+    (metric,) = result(series, metrics=[("mean_length", "")]).metrics
+    (pair,) = metric.pairs
+    assert (pair.wins, pair.losses, pair.improvement.value) == (4, 0, 1)
+    assert metric.thresholds[0] == 80
+    assert metric.groups[0].profile[-1] == 1
+    assert metric.groups[1].profile[-1] == 0
+
+
+def test_intervals_hold_what_they_are_of_and_are_the_same_again():
+    rng = np.random.default_rng(7)
+    series = two_groups(rng.normal(60, 5, 12), rng.normal(50, 5, 12))
+    first, second = (result(series).metrics[0] for _ in range(2))
+    assert first == second
+    for estimate in (first.groups[0].iqm, first.pairs[0].iqm, first.pairs[0].improvement):
+        assert estimate.low < estimate.value < estimate.high or estimate.high == 1
+    assert first.pairs[0].iqm.low > 0
+
+
+def test_the_interval_of_the_iqm_covers_as_often_as_it_says():
+    rng = np.random.default_rng(1)
+    inside = [
+        estimate.low <= 0 <= estimate.high
+        for estimate in (statistics.interquartile_mean(rng.normal(0, 1, 20)) for _ in range(40))
+    ]
+    assert sum(inside) >= 33  # 95 % of 40 is 38; a percentile interval of 20 values is a little short
+
+
+def test_equal_values_have_an_interval_of_no_width():
+    (metric,) = result(two_groups([100] * 6, [100] * 6)).metrics
+    assert (metric.groups[0].iqm.low, metric.groups[0].iqm.high) == (100, 100)
+    assert metric.pairs[0].improvement.value == 0.5
+    assert metric.thresholds == [100]
+
+
+def test_seeds_that_only_one_has_are_left_out_of_the_pair_and_named():
+    comparison = result(two_groups([10, 20, 30, 40, 50, 60], [10, 20, 30, 40]))
+    (pair,) = comparison.metrics[0].pairs
+    assert (pair.seeds, pair.left_out_a, pair.left_out_b) == ([0, 1, 2, 3], [4, 5], [])
+    assert "without seed 4, 5, which" in text_of(comparison)
+
+
+def test_without_a_common_seed_there_is_no_difference():
+    series = [run(0, [1, 2], discount=1), run(1, [1, 2], name="b")]
+    (pair,) = result(series).metrics[0].pairs
+    assert math.isnan(pair.median)
+    assert pair.seeds == []
+
+
+def test_few_seeds_are_warned_of_and_have_no_iqm_below_four():
+    comparison = result(two_groups([10, 20, 30], [10, 20, 30]))
+    assert "fewer than 5 seeds" in comparison.notes[0]
+    assert math.isnan(comparison.metrics[0].groups[0].iqm.value)
+    assert result(two_groups([1] * 5, [2] * 5)).notes == []
+
+
+def test_runs_of_one_configuration_are_one_group_whatever_they_are_called():
+    series = [run(0, [1, 2]), run(1, [1, 2], name="b"), run(2, [1, 2], discount=0.5)]
+    groups, _ = grouped(series)
+    assert [group.label for group in groups] == ["a / b", "a"]
+
+
+def test_a_run_done_twice_counts_once_and_it_is_said():
+    groups, notes = grouped([run(0, [1, 2], finished=False), run(0, [1, 2]), run(1, [1, 2])])
+    assert [r.run_id for r in groups[0].runs] == ["a0", "a1"]
+    assert "a0x" in notes[0]
+
+
+def test_grouping_by_a_value_of_the_configuration():
+    series = [run(seed, [1, seed], schedule={"over": over}) for seed in (0, 1) for over in (5, 9)]
+    groups, _ = grouped(series, "schedule.over")
+    assert [(group.label, len(group.runs)) for group in groups] == [
+        ("schedule.over = 5", 2),
+        ("schedule.over = 9", 2),
+    ]
+    with pytest.raises(RunnerError, match=r"--by: found 'schedule.ever'.*Did you mean 'schedule.over'"):
+        grouped(series, "schedule.ever")
+
+
+def test_moments_of_a_curve():
+    series = [run(0, [0, 80, 40, 60], discount=d, name=n) for d, n in ((1, "a"), (0.5, "b"))]
+
+    def value(moment):
+        return result(series, moment).metrics[0].groups[0].median
+
+    assert value(Moment("last")) == 60
+    assert value(Moment("best")) == 80
+    assert value(Moment("episode", 200)) == 40
+    assert value(Moment("area")) == pytest.approx((40 + 60 + 50) / 3)
+    assert value(Moment("crossing", level=50.0)) == 100
+    assert value(Moment("crossing", level=99.0)) == math.inf
+
+
+def test_a_level_reached_by_some_is_ranked_after_all_numbers():
+    series = [run(seed, [0, 10 * seed], discount=1) for seed in range(6)]
+    series += [run(seed, [0, 100], name="b") for seed in range(6)]
+    (metric,) = result(series, Moment("crossing", level=30.0)).metrics
+    slow, fast = metric.groups
+    assert (slow.median, fast.median) == (math.inf, 100)
+    assert slow.values == [math.inf] * 3 + [100.0] * 3
+    assert metric.pairs[0].losses == 3
+    assert "never" in text_of(result(series, Moment("crossing", level=30.0)))
+
+
+def test_interrupted_runs_are_left_out_and_taken_at_an_episode_that_they_have():
+    series = [*two_groups([1, 2, 3, 4], [1, 2, 3, 4]), run(9, [0, 77], finished=False, discount=0.8)]
+    metric = result(series).metrics[0]
+    assert metric.groups[0].seeds == [0, 1, 2, 3]
+    assert "a9x (not finished" in metric.notes[0]
+    assert result(series, Moment("episode", 100)).metrics[0].groups[0].seeds == [0, 1, 2, 3, 9]
+
+
+def test_groups_of_other_lengths_and_modes_are_compared_as_far_as_they_can_be():
+    series = [run(0, [0, 10]), run(0, [0, 10, 20], name="b")]
+    assert "--at 100 compares" in result(series).metrics[0].notes[0]
+    series = [run(0, [0, 1], metric="mean_return", line=line, mode=line) for line in ("agency", "taxi_1")]
+    groups, _ = grouped(series)
+    metrics = metrics_of(groups)
+    assert metrics == [("mean_return", "agency"), ("mean_return", "taxi_1")]
+    first = compare(groups, metrics, Moment("last")).metrics[0]
+    assert len(first.groups) == 1
+    assert "has no mean_return.agency" in first.notes[0]
+
+
+def test_an_unknown_metric_is_refused_with_those_there_are():
+    groups, _ = grouped(two_groups([1], [2]))
+    with pytest.raises(RunnerError, match="Did you mean 'finish_percent'"):
+        metrics_of(groups, ["finish_percentage"])
+
+
+def text_of(comparison):
+    return "\n".join(markdown(sections(comparison)))
+
+
+TINY = {
+    "mode": "competitive",
+    "env": {"kwargs": {"max_episode_steps": 40}},
+    "episodes": 20,
+    "evaluation": {"every": 10, "trials": 5},
+    "recording": {"steps": "none"},
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    made = tmp_path_factory.mktemp("compared")
+    for name, discount in (("near", 0.5), ("far", 0.95)):
+        config = TINY | {"name": name, "discount": discount, "seeds": [0, 1, 2]}
+        list(runner.run_all(config, recordings=made))
+    return made
+
+
+@pytest.fixture
+def command(folder):
+    from click.testing import CliRunner
+
+    from runner.cli import cli
+
+    return lambda *words: CliRunner().invoke(cli, ["compare", *words, "--recordings", str(folder)])
+
+
+def test_the_command_prints_text_json_and_markdown(command):
+    told = command("near", "far")
+    assert told.exit_code == 0, told.output
+    assert "near - far" in told.stdout
+    assert "fewer than 5 seeds" in told.stdout
+    as_json = json.loads(command("near", "far", "--json", "--metric", "mean_return").stdout)
+    assert [metric["line"] for metric in as_json["metrics"]] == ["taxi_1", "taxi_2"]
+    assert as_json["metrics"][0]["groups"][0]["seeds"] == [0, 1, 2]
+    assert command("near", "far", "--markdown").stdout.startswith("## Groups")
+    by_value = command("near", "far", "--by", "discount", "--at", "10")
+    assert "discount = 0.95" in by_value.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["near"], "found 3 runs of one configuration"),
+        (["near@latest"], "found one run"),
+        (["near", "far", "--at", "middle"], "expected last, best, area"),
+        (["near", "far", "--target", "finish_percent"], "expected METRIC=LEVEL"),
+        (["near", "far", "--target", "finish=80"], "expected one of"),
+        (["near", "far", "--by", "tables"], "expected two values"),
+        (["near", "nobody"], "nobody"),
+    ],
+)
+def test_what_cannot_be_compared_is_said_and_ends_with_2(command, words, expected):
+    refused = command(*words)
+    assert refused.exit_code == 2
+    assert expected in refused.stderr
+    assert "Traceback" not in refused.output
