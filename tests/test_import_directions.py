@@ -20,6 +20,7 @@ ORDER = """
     provenance runs
     frames
     analysis
+    archive
     execution export
     verify
     resume

@@ -17,6 +17,7 @@ from runner.config import from_mapping
 from runner.errors import RecordingError
 from runner.learning import kernel
 from runner.learning.learner import Learner
+from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
@@ -110,30 +111,34 @@ class TableReplay:
                 + ("." if self._recorded else "; `dualtaxi rerecord` records them.")
             )
         for block in self._recording.blocks(schema.TRAIN_STEP, self.step, stop) if stop > self.step else ():
-            self._check(block)
+            if int(block["step"][0]) != self.step:
+                raise self._lost(int(block["step"][0]))
+            check_steps(block, self._recording.mdp, str(self._recording.path))
             yield block
             self.step += len(block)
         if self.step < stop:
             raise self._lost(stop)
-
-    def _check(self, block: NDArray[np.void]) -> None:
-        """Refuse steps that do not follow, or that the environment cannot have: the kernel believes them."""
-        if int(block["step"][0]) != self.step:
-            raise self._lost(int(block["step"][0]))
-        mdp = self._recording.mdp
-        bounds = {"state": mdp.states, "next_state": mdp.states, "action": mdp.joint_actions}
-        for name, bound in bounds.items():
-            if (found := int(block[name].max())) >= bound:
-                raise RecordingError(
-                    f"{self._recording.path}: found {name} {found} in training step {self.step} or the "
-                    f"{len(block)} after it, expected less than {bound}; `dualtaxi verify` names the step."
-                )
 
     def _lost(self, found: int) -> RecordingError:
         return RecordingError(
             f"{self._recording.path}: training steps {self.step} to {found - 1} were lost, so the tables "
             "behind them cannot be had; `dualtaxi resume` does the run anew."
         )
+
+
+def check_steps(block: NDArray[np.void], mdp: Mdp, where: str) -> None:
+    """Refuse steps that the environment cannot have: the kernel, which replays them, believes them.
+
+    Raises:
+        RecordingError: there is such a step; `where` is named.
+    """
+    bounds = {"state": mdp.states, "next_state": mdp.states, "action": mdp.joint_actions}
+    for name, bound in bounds.items():
+        if (found := int(block[name].max())) >= bound:
+            raise RecordingError(
+                f"{where}: found {name} {found} in training step {int(block['step'][0])} or the "
+                f"{len(block)} after it, expected less than {bound}; `dualtaxi verify` names the step."
+            )
 
 
 def tables_at(recording: Recording, step: int) -> list[NDArray[np.float64]]:

@@ -157,24 +157,38 @@ class Recording:
             raise RecordingError(f"{self.path}: found metadata {found!r} at {offset}, expected {name!r}.")
         return entries
 
+    @property
+    def metadata_names(self) -> list[str]:
+        """The names of the metadata records, in the order of the file."""
+        return sorted(self._index.metadata, key=lambda name: self._index.metadata[name][0])
+
+    def attachments(self) -> Iterator[tuple[str, str, bytes]]:
+        """Yield name, media type and data of each attachment, in the order of the file."""
+        for name in sorted(self._index.attachments, key=lambda name: self._index.attachments[name][0]):
+            yield name, *self._attachment(name)
+
     def attachment(self, name: str) -> bytes:
         """Return an attachment's data, after comparing its checksum.
 
         Raises:
             RecordingError: there is none of that name, or it is damaged.
         """
+        return self._attachment(name)[1]
+
+    def _attachment(self, name: str) -> tuple[str, bytes]:
+        """Return an attachment's media type and data."""
         if name not in self._index.attachments:
             raise RecordingError(f"{self.path}: has no attachment {name!r}; it was cut off, or is not ours.")
         offset, length = self._index.attachments[name]
         try:
-            found, _, data = attachment_of(self._record(Opcode.ATTACHMENT, offset, length), offset)
+            found, media_type, data = attachment_of(self._record(Opcode.ATTACHMENT, offset, length), offset)
         except UNREADABLE as error:
             raise RecordingError(f"{self.path}: the attachment at {offset} cannot be read.") from error
         except RecordingError as error:
             raise RecordingError(f"{self.path}: {error}.") from error
         if found != name:
             raise RecordingError(f"{self.path}: found attachment {found!r} at {offset}, expected {name!r}.")
-        return data
+        return media_type, data
 
     @cached_property
     def mdp(self) -> Mdp:

@@ -136,11 +136,7 @@ class Recorder:
         log_time = sum(self.steps.values()) * STEP_NANOSECONDS
         self.counts[topic.name] += 1
         known = self._past.compare_message(topic, log_time, payload)
-        header = np.zeros((), dtype=schema.HEADER)
-        header["opcode"], header["channel_id"] = 5, topic.channel
-        header["record_length"] = schema.HEADER_BYTES - 9 + len(payload)
-        header["log_time"] = header["publish_time"] = log_time
-        records = memoryview(header.tobytes() + payload)
+        records = memoryview(schema.message_record(topic, log_time, payload))
         times = np.array([log_time], dtype=np.uint64)
         self._pipeline.send(topic, records, times, np.zeros(1, np.uint64), write=not known)
 

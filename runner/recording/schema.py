@@ -236,6 +236,15 @@ def blank_records(topic: Topic, counts: tuple[int, ...], n: int) -> NDArray[np.v
     return np.full(n, one)
 
 
+def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:
+    """Return the whole message record of one message, logged at a time in nanoseconds."""
+    header = np.zeros((), dtype=HEADER)
+    header["opcode"], header["channel_id"] = 5, topic.channel
+    header["record_length"] = HEADER_BYTES - 9 + len(payload)
+    header["log_time"] = header["publish_time"] = log_time
+    return header.tobytes() + payload
+
+
 def block_counts(topic: Topic, learners: int, events: int) -> tuple[int, ...]:
     """Return the number of elements of the topic's repeated fields in a run."""
     return (learners,) if topic.message is STEP else (learners, events)

@@ -1,0 +1,137 @@
+"""The manifest of an archive, written last: without it there is none, and by it each byte is checked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+from blake3 import blake3
+
+from runner.archive.layout import FORMAT, MANIFEST, VERSION
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.digest import combine
+from runner.scene import is_whole
+
+MAX_MANIFEST_BYTES: Final = 1 << 20
+_MOST: Final = 2**53
+_PIECE: Final = 1 << 20
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A file of an archive, or the messages of a topic: how many, and their BLAKE3."""
+
+    size: int
+    blake3: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What an archive is."""
+
+    run: Mapping[str, Any]
+    """Id, name, seed, creation and status of the run, and the content digest that its result states."""
+    topics: Mapping[str, Entry]
+    """What the archive holds of each topic that has messages."""
+    files: Mapping[str, Entry] = field(default_factory=dict)
+    """Every other file, by its path in the archive's folder."""
+    format: str = FORMAT
+    version: int = VERSION
+
+    @property
+    def run_id(self) -> str:
+        """The run's id."""
+        return str(self.run["run_id"])
+
+    @property
+    def digest(self) -> str:
+        """The content digest of what the archive holds; without steps, another than the run's own."""
+        return content_digest({name: entry.blake3 for name, entry in self.topics.items()})
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files but this one."""
+        return sum(entry.size for entry in self.files.values())
+
+    def to_json(self) -> bytes:
+        """Return the manifest as it is written."""
+        return json.dumps(asdict(self), indent=1, sort_keys=True).encode() + b"\n"
+
+
+def content_digest(topics: Mapping[str, str]) -> str:
+    """Return the content digest made of the hashes of topics, `/log` left out."""
+    return combine(
+        {topic.name: topics[topic.name] for topic in schema.TOPICS if topic.digested and topic.name in topics}
+    )
+
+
+def read_manifest(data: bytes, where: str) -> Manifest:
+    """Return the manifest in these bytes.
+
+    Raises:
+        RecordingError: they are none of ours.
+    """
+    try:
+        said = json.loads(data[:MAX_MANIFEST_BYTES])
+        if said["format"] != FORMAT:
+            raise ValueError(f"found format {said['format']!r}")
+        if said["version"] != VERSION:
+            raise RecordingError(
+                f"{where}: found an archive of version {said['version']!r}, expected {VERSION}: it takes "
+                "another version of dualtaxi to restore it; its tables can be read all the same."
+            )
+        manifest = Manifest(dict(said["run"]), _entries(said["topics"]), _entries(said["files"]))
+        _check(manifest)
+    except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise RecordingError(f"{where}: is no manifest of an archive ({error}).") from error
+    return manifest
+
+
+def _entries(said: Mapping[str, Any]) -> dict[str, Entry]:
+    entries = {name: Entry(entry["size"], entry["blake3"]) for name, entry in said.items()}
+    for name, entry in entries.items():
+        sound = is_whole(entry.size, 0, _MOST) and isinstance(entry.blake3, str) and len(entry.blake3) == 64
+        if not sound or int(entry.blake3, 16) < 0:
+            raise ValueError(f"what it says of {name!r} makes no sense")
+    return entries
+
+
+def _check(manifest: Manifest) -> None:
+    if strange := [name for name in manifest.files if not is_inside(name)]:
+        raise ValueError(f"the file {strange[0]!r} would leave the archive")
+    for name in ("run_id", "name", "created", "status"):
+        if not isinstance(manifest.run[name], str):
+            raise ValueError(f"of its run it says that {name} is {manifest.run[name]!r}")
+    if unknown := set(manifest.topics) - {topic.name for topic in schema.TOPICS}:
+        raise ValueError(f"it has topics {sorted(unknown)}")
+
+
+def is_inside(name: str) -> bool:
+    """Return whether a name is a plain path that stays in the folder it is looked up in, on any system."""
+    path = PurePosixPath(name)
+    plain = bool(name) and name.isprintable() and not set(name) & set('\\:*?"<>|') and len(name) < 200
+    return plain and str(path) == name and not path.is_absolute() and ".." not in path.parts and name != "."
+
+
+def entry_of(path: Path) -> Entry:
+    """Return size and hash of a file.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    size, hashed = 0, blake3()
+    with path.open("rb") as stream:
+        while piece := stream.read(_PIECE):
+            hashed.update(piece)
+            size += len(piece)
+    return Entry(size, hashed.hexdigest())
+
+
+def entries_of(folder: Path) -> dict[str, Entry]:
+    """Return size and hash of every file of an archive but its manifest, by name."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / MANIFEST)
+    return {path.relative_to(folder).as_posix(): entry_of(path) for path in files}
