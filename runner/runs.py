@@ -157,7 +157,7 @@ def create_run(recordings: Path, config: ExperimentConfig, seed: int, name: str 
     try:
         recordings.mkdir(parents=True, exist_ok=True)
         while True:
-            run_id = "".join(secrets.choice(_ALPHABET) for _ in range(_ID_LENGTH))
+            run_id = new_run_id(recordings)
             folder = recordings / run_id
             try:
                 folder.mkdir()
@@ -183,6 +183,13 @@ def create_run(recordings: Path, config: ExperimentConfig, seed: int, name: str 
             f"choose another folder by --recordings or {RECORDINGS_VARIABLE}."
         ) from error
     return run
+
+
+def new_run_id(recordings: Path) -> str:
+    """Return an id that no run in the folder has."""
+    while (recordings / (run_id := "".join(secrets.choice(_ALPHABET) for _ in range(_ID_LENGTH)))).exists():
+        continue
+    return run_id
 
 
 @contextlib.contextmanager

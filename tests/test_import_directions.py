@@ -18,7 +18,7 @@ ORDER = """
     mdp
     words learning recording observer
     provenance runs
-    frames
+    frames packing
     analysis
     archive
     execution export

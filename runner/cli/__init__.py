@@ -47,6 +47,10 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "verify": ("runner.cli.commands.verify", "Check every step of a run by doing it again."),
         "repair": ("runner.cli.commands.repair", "Make a damaged recording whole; tell what was lost."),
     },
+    "Hand on": {
+        "pack": ("runner.cli.commands.pack", "Put a run into one file, to hand to a colleague."),
+        "unpack": ("runner.cli.commands.unpack", "Take a run out of the file that `pack` wrote."),
+    },
     "Set up": {
         "config": ("runner.cli.commands.config", "Check a configuration; print the schema of one."),
         "completion": ("runner.cli.commands.completion", "Print the completion script of a shell."),

@@ -19,18 +19,16 @@ from mcap.opcode import Opcode
 
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
-from runner.recording.chunks import Chunk, message_index
 from runner.recording.contents import asks_for_indexes, attachment_of, metadata_of, read_chunk
 from runner.recording.facts import check_run, json_object
 from runner.recording.integrity import check_integrity, places
 from runner.recording.reader import open_recording
+from runner.recording.rewriting import copied_chunk
 from runner.recording.salvage import DamagedFile
 from runner.recording.schema import BLOCK_TOPICS, TOPICS, Topic
 from runner.recording.writer import RecordingFile
 from runner.scene import is_whole
 
-_HEAD: Final = struct.Struct("<BQ")
-_CHUNK_TIMES: Final = struct.Struct("<QQ")
 _CHUNK_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
 _MOST_MESSAGES: Final = 2**62
 _NEEDED: Final = {"run", "config", "provenance"}
@@ -198,18 +196,7 @@ class _Salvage:
             self._next[topic] = stop
         else:
             self._next[topic] += part.messages
-        start, end = int(times[0]), int(times[-1])
-        body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
-        chunk = Chunk(
-            record=_HEAD.pack(Opcode.CHUNK, len(body)) + body,
-            index=message_index(part.channel, times, offsets) if self._indexed else b"",
-            compression=part.index.compression,
-            compressed_size=part.index.compressed_size,
-            uncompressed_size=part.index.uncompressed_size,
-            start_time=start,
-            end_time=end,
-            messages=part.messages,
-        )
+        chunk = copied_chunk(part, body, times, offsets, self._indexed)
         file.add_chunk(topic, chunk)
         self._done.kept[topic.name] = self._done.kept.get(topic.name, 0) + part.messages
 

@@ -1,0 +1,51 @@
+"""`dualtaxi unpack`: a packed run into the folder of runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.options import json_option, recordings_option
+from runner.cli.output import draw, facts, print_json, say, size
+
+
+@click.command("unpack")
+@click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
+@click.option("--as-new", is_flag=True, help="Give the run a new id, so that it can stand beside another.")
+@recordings_option
+@json_option
+def command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) -> None:
+    """Take a run out of FILE, which `dualtaxi pack` wrote, into the folder of runs.
+
+    Every byte is checked before the run appears: checksums, the content digest, and that the parts say
+    the same. A file that is damaged, cut off or made to do harm is refused, and nothing is written. A run
+    that is there already with the same content is left as it is.
+
+    \b
+    Examples:
+      dualtaxi unpack quick-k3v9m2xq.dualtaxi
+      dualtaxi unpack quick-k3v9m2xq.dualtaxi --as-new --recordings from_anna
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.packing.unpacking import unpack
+    from runner.runs import recordings_folder
+
+    unpacked = unpack(file, recordings_folder(recordings), as_new)
+    run, manifest = unpacked.run, unpacked.manifest
+    if unpacked.already:
+        say(f"Run {run.run_id} is there already with this content; nothing was written.")
+    if as_json:
+        told = {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status}
+        told |= {"path": str(run.recording.absolute()), "already": unpacked.already}
+        print_json(told | {"content_digest": manifest.content_digest, "anonymous": manifest.anonymous})
+        return
+    draw(
+        facts(
+            {
+                "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
+                "digest": manifest.content_digest,
+                "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
+                "next": f"dualtaxi show {run.run_id}",
+            }
+        )
+    )

@@ -1,0 +1,145 @@
+"""A recording written anew with other metadata: every message byte for byte, its content digest the same."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from mcap.opcode import Opcode
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording.chunks import Chunk, message_index
+from runner.recording.contents import (
+    UNREADABLE,
+    Part,
+    asks_for_indexes,
+    attachment_of,
+    metadata_of,
+    read_chunk,
+    walk,
+)
+from runner.recording.digest import ContentHash, combine
+from runner.recording.integrity import check_integrity, places
+from runner.recording.reader import open_recording
+from runner.recording.schema import STEP, TOPICS
+from runner.recording.writer import RecordingFile
+
+Times = NDArray[np.uint64]
+Change = Callable[[str, dict[str, str]], dict[str, str]]
+"""Takes the name and the entries of a metadata record, and gives the entries it shall have."""
+
+_HEAD: Final = struct.Struct("<BQ")
+_CHUNK_TIMES: Final = struct.Struct("<QQ")
+_TOPIC_OF: Final = {topic.channel: topic for topic in TOPICS}
+
+
+def rewrite(path: Path, fresh: Path, change: Change) -> None:
+    """Write a recording into a new file with its metadata changed.
+
+    Of a recording that was cut off, everything up to its last whole chunk is written; the new file has
+    an index and a summary, and no result either.
+
+    Raises:
+        RecordingError: the recording is damaged, not merely cut off.
+        OSError: the new file exists or cannot be written.
+    """
+    indexed, result = True, None
+    with RecordingFile(fresh) as file:
+        for opcode, offset, body in _whole_records(path):
+            if opcode == Opcode.METADATA:
+                name, entries = metadata_of(body)
+                if name == "result":
+                    result = change(name, entries)
+                    continue
+                if name == "config":
+                    indexed = asks_for_indexes(entries)
+                file.add_metadata(name, change(name, entries))
+            elif opcode == Opcode.ATTACHMENT:
+                file.add_attachment(*attachment_of(body, offset))
+            elif opcode == Opcode.CHUNK:
+                part, records = read_chunk(body, offset)
+                _, times, offsets = places(records, f"{path}: chunk at {offset}")
+                file.add_chunk(_TOPIC_OF[part.channel], copied_chunk(part, body, times, offsets, indexed))
+        file.finish("" if result is None else "result", result)
+
+
+def copied_chunk(part: Part, body: bytes, times: Times, offsets: Times, indexed: bool) -> Chunk:
+    """Return a chunk to be written as it was read, with its times and index made anew.
+
+    Args:
+        part: what is known of it.
+        body: the chunk record behind its head.
+        times: log times of its messages, in nanoseconds.
+        offsets: where its messages begin.
+        indexed: whether a message index shall follow it.
+    """
+    start, end = int(times[0]), int(times[-1])
+    body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
+    return Chunk(
+        record=_HEAD.pack(Opcode.CHUNK, len(body)) + body,
+        index=message_index(part.channel, times, offsets) if indexed else b"",
+        compression=part.index.compression,
+        compressed_size=part.index.compressed_size,
+        uncompressed_size=part.index.uncompressed_size,
+        start_time=start,
+        end_time=end,
+        messages=part.messages,
+    )
+
+
+def content_of(path: Path) -> str:
+    """Return the content digest of a recording, after every checksum and every message were looked at.
+
+    It is the one that the recording states, if it states one; of a run that was killed, that of its whole
+    chunks.
+
+    Raises:
+        RecordingError: it is damaged, or states another digest than its messages have.
+    """
+    seen = ContentHash()
+    for opcode, offset, body in _whole_records(path):
+        if opcode == Opcode.CHUNK:
+            part, records = read_chunk(body, offset)
+            places(records, f"{path}: chunk at {offset}")
+            seen.update(_TOPIC_OF[part.channel], records)
+    with open_recording(path) as recording:
+        result = recording.result
+    return _stated(result, seen.topics(), path) if "content_digest" in result else seen.content()
+
+
+def _whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
+    """Yield (opcode, offset, body) of the data section's records, up to where the file may be cut off.
+
+    Raises:
+        RecordingError: it is damaged.
+    """
+    with open_recording(path) as recording:
+        finished = recording.finished
+    if finished:
+        check_integrity(path)
+    try:
+        with path.open("rb") as stream:
+            for opcode, offset, body in walk(stream, path.stat().st_size):
+                if opcode == Opcode.DATA_END:
+                    return
+                yield opcode, offset, body
+    except UNREADABLE as error:
+        raise RecordingError(f"{path}: a record of it cannot be read; `dualtaxi repair` mends it.") from error
+
+
+def _stated(result: dict[str, Any], seen: dict[str, str], path: Path) -> str:
+    """Return the digest that a result states, if it is that of the messages."""
+    topics = result.get("topic_digests")
+    stated = dict(topics) if isinstance(topics, dict) else {}
+    if not result.get("steps_recorded", True):
+        steps = {topic.name for topic in TOPICS if topic.message is STEP}
+        seen = seen | {name: digest for name, digest in stated.items() if name in steps}
+    if stated != seen or combine(seen) != result["content_digest"]:
+        raise RecordingError(
+            f"{path}: found messages of other content than the digest it states; it was altered."
+        )
+    return str(result["content_digest"])
