@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -39,8 +40,15 @@ class Batch:
         own = self.records["episode"][rows].astype(np.int64)
         return np.asarray(own % self.trials) if self.trials else own
 
-    def times(self, rows: Any = slice(None)) -> list[rr.TimeColumn]:
-        """Return the timelines of these rows."""
+    def times(self, rows: Any = None) -> list[rr.TimeColumn]:
+        """Return the timelines of these rows, of all unless given."""
+        return self._all_times if rows is None else self._times(rows)
+
+    @cached_property
+    def _all_times(self) -> list[rr.TimeColumn]:
+        return self._times(slice(None))
+
+    def _times(self, rows: Any) -> list[rr.TimeColumn]:
         return [
             rr.TimeColumn("step", sequence=self.time[rows]),
             rr.TimeColumn("episode", sequence=self.episode[rows]),
@@ -88,9 +96,20 @@ class _Column:
 
 def instances(archetype: Any, n: int, **parts: NDArray[Any]) -> list[Any]:
     """Return the columns of n rows of equally many instances; each part is [n, instances, ...]."""
-    count = next(iter(parts.values())).shape[1]
-    flat = {name: part.reshape(n * count, *part.shape[2:]) for name, part in parts.items()}
-    return list(archetype.columns(**flat).partition([count] * n))
+    return [column(getattr(archetype, f"descriptor_{name}")(), n, part) for name, part in parts.items()]
+
+
+def column(descriptor: Any, n: int, values: NDArray[Any]) -> Any:
+    """Return a component's column of n rows: text or numbers [n, instances], points [n, instances, 2]."""
+    count = values.shape[1]
+    flat = values.reshape(n * count, *values.shape[2:])
+    items = pa.FixedSizeListArray.from_arrays(flat.reshape(-1), type=_POINT) if flat.ndim == 2 else flat
+    return _Column(descriptor, pa.ListArray.from_arrays(_offsets(n, count), pa.array(items)))
+
+
+def scalars(values: NDArray[np.float64]) -> list[Any]:
+    """Return the column of series, [n, series]."""
+    return [column(rr.Scalars.descriptor_scalars(), len(values), values)]
 
 
 def strips(lines: NDArray[np.float32]) -> list[Any]:

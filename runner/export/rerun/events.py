@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from runner.export.rerun.columns import Batch, Sender
+from runner.export.rerun.columns import Batch, Sender, instances, texts
 from runner.export.rerun.scene import event_words, events_of_steps
 from runner.mdp import Mdp
 from runner.words import states_in_words
+
+_OVER: Final = 1
+_TIME_OUT: Final = 2
 
 
 class EventWriter(Sender):
@@ -24,7 +27,7 @@ class EventWriter(Sender):
         self._states = states_in_words(mdp)
         quiet = [bit for bit, name in enumerate(mdp.event_names) if ".illegal" in name]
         self._told = np.uint32((1 << len(mdp.event_names)) - 1 - sum(1 << bit for bit in quiet))
-        self._words: dict[int, str] = {}
+        self._words: dict[int, tuple[str, str]] = {}
 
     def write(self, batch: Batch) -> None:
         """Send the events of a batch; an illegal action is none, there are too many at first."""
@@ -35,36 +38,43 @@ class EventWriter(Sender):
         rows = np.concatenate((begins, happens))
         if not len(rows):
             return
-        text = [self._beginning(batch, row) for row in begins.tolist()]
-        text += [self._happening(records[row], int(masks[row])) for row in happens]
-        levels = ["INFO"] * len(begins) + [self._level(mask) for mask in masks[happens].tolist()]
+        text = self._beginnings(batch, begins)
+        levels = ["INFO"] * len(begins)
+        ends = np.where(records["terminated"], _OVER, np.where(records["truncated"], _TIME_OUT, 0))
+        lengths = np.where(ends, records["t"] + 1, 0)
+        for happening in zip(*(part[happens].tolist() for part in (masks, ends, lengths)), strict=True):
+            said, level = self._happening(*happening)
+            text.append(said)
+            levels.append(level)
         order = np.argsort(rows, kind="stable")
         rows = rows[order]
-        columns = rr.TextLog.columns(text=[text[i] for i in order], level=[levels[i] for i in order])
+        columns = instances(
+            rr.TextLog,
+            len(rows),
+            text=texts([text[i] for i in order]),
+            level=texts([levels[i] for i in order]),
+        )
         self.send("events", batch.times(rows), columns)
 
-    def _beginning(self, batch: Batch, row: int) -> str:
-        record = batch.records[row]
+    def _beginnings(self, batch: Batch, rows: NDArray[np.int64]) -> list[str]:
         kind = "episode" if self._phase == "train" else "trial"
-        named = f"{kind} {batch.number([row])[0]:,}"
-        return f"{named} begins: {self._states[record['state']]}"
+        states = batch.records["state"][rows].tolist()
+        return [
+            f"{kind} {number:,} begins: {self._states[state]}"
+            for number, state in zip(batch.number(rows).tolist(), states, strict=True)
+        ]
 
-    def _happening(self, record: np.void, mask: int) -> str:
-        words = [self._in_words(mask)] if mask else []
-        if record["terminated"]:
-            words.append(f"episode over after {int(record['t']) + 1} steps")
-        elif record["truncated"]:
-            words.append(f"time-out after {int(record['t']) + 1} steps")
-        return ", ".join(words)
-
-    def _level(self, mask: int) -> str:
-        good = mask & self._mdp.success_mask
-        return "WARN" if not good and "collision" in self._in_words(mask) else "INFO"
-
-    def _in_words(self, mask: int) -> str:
+    def _happening(self, mask: int, end: int, length: int) -> tuple[str, str]:
+        """Return what is said of a step, and the level of that."""
         if mask not in self._words:
-            self._words[mask] = event_words(self._mdp, mask)
-        return self._words[mask]
+            words = event_words(self._mdp, mask)
+            bad = "collision" in words and not mask & self._mdp.success_mask
+            self._words[mask] = words, "WARN" if bad else "INFO"
+        words, level = self._words[mask]
+        if not end:
+            return words, level
+        ending = f"{'episode over' if end == _OVER else 'time-out'} after {length} steps"
+        return f"{words}, {ending}" if mask else ending, level
 
 
 def evaluation_texts(metrics: list[dict[str, Any]]) -> list[str]:

@@ -8,6 +8,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from runner.export.rerun import filling
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, ink, instances, place, rgba, strips, texts
 from runner.export.rerun.scene import (
@@ -125,13 +126,10 @@ class GridWriter(Sender):
 
 def trails(scene: Scene, batch: Batch) -> NDArray[np.float32]:
     """Return the way each mover came, [n, movers, 6, 2]: the last five steps of the episode, to here."""
-    movers, k = len(scene.movers), len(batch.before)
-    states = np.concatenate((batch.before["state"], batch.records["state"])).astype(np.int64)
-    back = np.arange(TRAIL_STEPS, -1, -1)[None, :]
-    back = np.minimum(back, batch.records["t"][:, None].astype(np.int64))
-    index = np.maximum(np.arange(k, k + len(batch.records))[:, None] - back, 0)
-    way = scene.points[:, :movers][states[index]]
-    return np.ascontiguousarray(way.swapaxes(1, 2))
+    states = np.concatenate((batch.before["state"], batch.records["state"]))
+    lines = np.empty((len(batch.records), len(scene.movers), TRAIL_STEPS + 1, 2), np.float32)
+    filling.trails(scene.points, states, batch.records["t"], len(batch.before), lines)
+    return lines
 
 
 def _title(phase: str, trained: int, own: int) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from runner.export.rerun import filling
 from runner.export.rerun.columns import Batch, Sender, centres, images, ink, instances, place, rgba, texts
 from runner.export.rerun.scene import BAD_COLOUR, MOVER_COLOURS, Placements, Scene, own_actions
 
@@ -122,11 +123,10 @@ class MapWriter(Sender):
     def _arrows(self, learner: int, greedy: NDArray[np.int32]) -> NDArray[np.float32]:
         """Return the arrows of greedy actions, [k, agents * pixels, 2]."""
         shown = self._agents(learner)
-        arrows = []
-        for agent in shown:
-            own = greedy if len(shown) == 1 else self._own[greedy, agent]
-            arrows.append(np.where((greedy >= 0)[..., None], self._moves[agent][own], np.float32(0)))
-        return np.concatenate(arrows, axis=1)
+        own = self._own[:, shown] if len(shown) > 1 else np.arange(len(self._moves[shown[0]]))[:, None]
+        arrows = np.empty((len(greedy), len(shown), greedy.shape[1], 2), np.float32)
+        filling.arrows(greedy, own, np.stack([self._moves[agent] for agent in shown]), arrows)
+        return arrows.reshape(len(greedy), -1, 2)
 
     def _agent_moves(self, agent: int) -> NDArray[np.float32]:
         """Return the arrow of each own action of an agent, [actions, 2]."""

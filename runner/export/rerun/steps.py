@@ -12,7 +12,7 @@ import numpy as np
 import rerun as rr
 
 from runner.export.rerun.classes import Vocabulary
-from runner.export.rerun.columns import Batch, Sender
+from runner.export.rerun.columns import Batch, Sender, scalars
 from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
 from runner.export.rerun.maps import MapWriter
@@ -58,14 +58,14 @@ class StepWriter(Sender):
         """Send a batch of steps."""
         records, times = batch.records, batch.times()
         rewards = np.ascontiguousarray(records["rewards"], dtype=np.float64)
-        self.send("reward", times, rr.Scalars.columns(scalars=rewards))
+        self.send("reward", times, scalars(rewards))
         self._values.write(batch)
         self._events.write(batch)
         if self._grid:
             self._grid.write(batch, self._phase)
         else:
             for name in ("state", "action"):
-                self.send(name, times, rr.Scalars.columns(scalars=records[name].astype(np.float64)))
+                self.send(name, times, scalars(records[name].astype(np.float64)[:, None]))
         if self._maps:
             self._maps.write(batch)
 

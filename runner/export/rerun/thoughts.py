@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.tables import tables_at
 from runner.config import from_mapping
+from runner.export.rerun.filling import best_of_joint, pictures_of
 from runner.export.rerun.scene import Placements, own_actions
 from runner.learning import kernel
 from runner.learning.learner import Learner
@@ -57,7 +58,7 @@ class Thinker:
         self._recording = recording
         self._config = from_mapping(recording.config)
         self.mdp: Mdp = recording.mdp
-        self._placements = placements
+        self._own_actions = own_actions(self.mdp)
         self._context = np.zeros(self.mdp.states, np.int64)
         self._states = np.empty((1, 0), np.int32)
         if placements is not None:
@@ -91,9 +92,7 @@ class Thinker:
         model = self._state[0]
         rows = np.full((len(block), len(model.width), max(model.width)), np.nan)
         renewed = self._renewals(block)
-        pixels = self._states.shape[1]
-        value = np.empty((len(renewed), len(model.width), pixels), np.float32)
-        greedy = np.empty((len(renewed), len(model.width), pixels), np.int32)
+        value, greedy = self._empty_pictures(len(renewed))
         pictures = self._states[self._context[block["state"][renewed]]]
         _replay(*self._state, block.view(np.recarray), rows, renewed, pictures, value, greedy)
         self._step += len(block)
@@ -110,10 +109,9 @@ class Thinker:
             rows[:, i, :width] = learner.table(i)[state]
         renewed = self._renewals(block)
         pictures = self._states[self._context[state[renewed]]]
-        value = tables.value[:, pictures].swapaxes(0, 1).astype(np.float32)
-        greedy = tables.greedy[:, pictures].swapaxes(0, 1).astype(np.int32)
-        missing = np.broadcast_to(pictures[:, None] < 0, value.shape)
-        value[missing], greedy[missing] = np.nan, -1
+        value, greedy = self._empty_pictures(len(renewed))
+        for k, picture in enumerate(pictures):
+            pictures_of(tables, picture, value[k], greedy[k])
         return Thoughts(*self._by_agent(rows), renewed, value, greedy)
 
     @property
@@ -131,18 +129,21 @@ class Thinker:
         self._last = (int(block["log_time"][-1]), int(context[-1]))
         return np.flatnonzero(new)
 
+    def _empty_pictures(self, count: int) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        shape = (count, self.learners, self._states.shape[1])
+        return np.empty(shape, np.float32), np.empty(shape, np.int32)
+
     def _by_agent(self, rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return values and greedy actions of each agent, from what each learner saw."""
         counts = self.mdp.action_counts
-        n = len(rows)
         if rows.shape[1] == len(counts):
             own = [rows[:, i, :count] for i, count in enumerate(counts)]
             return np.concatenate(own, axis=1), np.stack([part.argmax(axis=1) for part in own], axis=1)
-        joint = rows[:, 0].reshape(n, *counts)
-        axes = range(1, len(counts) + 1)
-        best = [joint.max(axis=tuple(axis for axis in axes if axis != i)) for i in axes]
-        greedy = own_actions(self.mdp)[rows[:, 0].argmax(axis=1)]
-        return np.concatenate(best, axis=1), greedy
+        best = np.empty((len(rows), sum(counts)))
+        greedy = np.empty((len(rows), len(counts)), np.int64)
+        first = np.cumsum((0, *counts[:-1]))
+        best_of_joint(rows[:, 0], self._own_actions, first, best, greedy)
+        return best, greedy
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
@@ -162,13 +163,5 @@ def _replay(
     for k in range(len(renewed)):
         kernel.replay(model, tables, rules, steps[at : renewed[k]], rows[at : renewed[k]])
         at = renewed[k]
-        for i in range(value.shape[1]):
-            for pixel in range(value.shape[2]):
-                state = pictures[k, pixel]
-                if state < 0:
-                    value[k, i, pixel] = np.nan
-                    greedy[k, i, pixel] = -1
-                else:
-                    value[k, i, pixel] = tables.value[i, state]
-                    greedy[k, i, pixel] = tables.greedy[i, state]
+        pictures_of(tables, pictures[k], value[k], greedy[k])
     kernel.replay(model, tables, rules, steps[at:], rows[at:])

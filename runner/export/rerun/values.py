@@ -9,7 +9,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.export.rerun.classes import Vocabulary
-from runner.export.rerun.columns import Batch, Sender, instances, rgba, strips
+from runner.export.rerun.columns import Batch, Sender, instances, rgba, scalars, strips
+from runner.export.rerun.filling import bar_ends
 from runner.export.rerun.scene import INK, MOVER_COLOURS, action_labels, agent_label, own_actions
 from runner.mdp import Mdp
 
@@ -66,7 +67,7 @@ class ValueWriter(Sender):
         values, n = batch.thoughts.values, len(batch.records)
         points = self._points(batch)
         columns = [
-            *rr.Scalars.columns(scalars=values),
+            *scalars(values),
             *instances(rr.Points2D, n, positions=points, class_ids=self._classes(batch)),
             *strips(self._bars(values)),
         ]
@@ -100,18 +101,11 @@ class ValueWriter(Sender):
 
     def _bars(self, values: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return a bar a value, [n, values, 2 points, 2]: from the agent's lowest there to its highest."""
-        n, at = len(values), 0
-        bars = np.empty((n, values.shape[1], 2, 2), np.float32)
+        bars = np.empty((*values.shape, 2, 2), np.float32)
         bars[:, :, 0, 0] = BAR_LEFT
-        for rows in self._rows:
-            part = slice(at, at + len(rows))
-            own = values[:, part]
-            low = own.min(axis=1, keepdims=True)
-            spread = own.max(axis=1, keepdims=True) - low
-            share = (own - low) * (BAR_LENGTH * _FINENESS / np.where(spread > 0, spread, 1.0))
-            bars[:, part, 1, 0] = BAR_LEFT + np.ceil(share) / _FINENESS
-            bars[:, part, :, 1] = rows[:, None]
-            at += len(rows)
+        bars[..., 1] = np.concatenate(self._rows)[:, None]
+        bounds = np.cumsum((0, *self._mdp.action_counts))
+        bar_ends(values, bounds, BAR_LEFT, BAR_LENGTH, _FINENESS, bars[:, :, 1, 0])
         return bars
 
 

@@ -13,6 +13,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.errors import StorageError
+from runner.export.rerun.ahead import ahead
 from runner.export.rerun.classes import Vocabulary, vocabulary_of
 from runner.export.rerun.columns import Batch, Sender, ink, instances, place, texts
 from runner.export.rerun.layout import Shown, blueprint, draw_background
@@ -133,7 +134,7 @@ class RunExporter:
         writer = StepWriter(self._stream, path, phase, mdp, self._scene, self._marks, words, self._learners)
         plan = self._recording.config.get("evaluation") if phase == "eval" else None
         trials = int(plan["trials"]) if plan else 0
-        for batch in _batches(pieces, trials):
+        for batch in ahead(_batches(pieces, trials)):
             if not covered:
                 writer.dress()
             writer.write(batch)
