@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from runner.export.rerun.scene import (
     BAD_COLOUR,
+    GOOD_COLOUR,
     INK,
     MOVER_COLOURS,
     PASSENGER_COLOUR,
@@ -67,10 +68,13 @@ class Vocabulary:
     rewards: tuple[tuple[int, NDArray[np.float64]], ...]
     """A learner: its first label, and the rewards it can get, ascending."""
     values: Levels
+    unmarked: int
+    """No mark."""
     greedy: int
     """The mark of a greedy action."""
     chosen: int
-    """What is said of the chosen action: greedy, explored, explored and yet the greedy one."""
+    """What is said of the chosen action if it was not explored."""
+    explored: int
 
     def of_t(self, t: NDArray[Any]) -> NDArray[np.uint16]:
         """Return the class of each `t`."""
@@ -125,10 +129,11 @@ def vocabulary_of(
         if len(distinct) <= MOST_REWARDS:
             colour = MOVER_COLOURS[i % len(MOVER_COLOURS)] if whose else INK
             told.append((classes.add([f"reward{whose} {_signed(r)}" for r in distinct], colour), distinct))
-    greedy = classes.add([""], INK)
-    chosen = classes.add(["greedy", "explored", "explored"], ["#009E73", BAD_COLOUR, BAD_COLOUR])
+    unmarked = classes.add(["", "●", "greedy", "explored"], [INK, INK, GOOD_COLOUR, BAD_COLOUR])
     levels = _levels(classes, value_range)
-    return Vocabulary(classes, mark, passenger, riding, t, tuple(told), levels, greedy, chosen)
+    return Vocabulary(
+        classes, mark, passenger, riding, t, tuple(told), levels, *range(unmarked, unmarked + 4)
+    )
 
 
 def _levels(classes: Classes, value_range: tuple[float, float]) -> Levels:

@@ -76,11 +76,10 @@ class MapWriter(Sender):
         pictures, thoughts, n = self._pictures, batch.thoughts, len(batch.records)
         middle = centres(pictures.height, pictures.width)
         rows, times = thoughts.renewed, batch.times()
-        half = np.full((n, 1, 2), 0.5, np.float32)
         for i, learner in enumerate(self._learners):
             order = self._orders[i]
             pixel = np.argsort(order)[pictures.pixel[batch.records["state"]]]
-            here = instances(rr.Boxes2D, n, centers=middle[pixel][:, None], half_sizes=half)
+            here = instances(rr.Boxes2D, n, centers=middle[pixel][:, None])
             self.send(f"map/{learner}/here", times, here)
             if len(rows):
                 moves = self._arrows(i, thoughts.greedy_maps[:, i][:, order])
@@ -92,6 +91,8 @@ class MapWriter(Sender):
         rows = batch.thoughts.renewed
         times, n = batch.times(rows), len(rows)
         self.send(f"map/{learner}", times, images(values))
+        frame = instances(rr.Boxes2D, n, half_sizes=np.full((n, 1, 2), 0.5, np.float32))
+        self.send(f"map/{learner}/here", times, frame)
         self.send(f"map/{learner}/moves", times, instances(rr.Arrows2D, n, vectors=moves))
         contexts = self._pictures.context[batch.records["state"][rows]].tolist()
         names = self._pictures.names

@@ -21,6 +21,7 @@ MOVER_COLOURS: Final = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7")
 PASSENGER_COLOUR: Final = "#CC79A7"
 GOAL_COLOUR: Final = "#CC79A7"
 BAD_COLOUR: Final = "#D55E00"
+GOOD_COLOUR: Final = "#009E73"
 INK: Final = "#808080"
 
 BAD_SIGN: Final = "✗"

@@ -49,7 +49,6 @@ class ValueWriter(Sender):
         counts = self._mdp.action_counts
         colours = [MOVER_COLOURS[i % len(MOVER_COLOURS)] for i in range(len(counts))]
         bars = [rgba(colour) for colour, count in zip(colours, counts, strict=True) for _ in range(count)]
-        radii = [0.0] * sum(counts) + [0.25] * len(counts) + [0.0] * len(counts)
         series = [
             f"{agent_label(agent)} {name}"
             for agent, names in zip(self._mdp.agents, action_labels(self._mdp), strict=True)
@@ -58,46 +57,43 @@ class ValueWriter(Sender):
         self.static(
             "q",
             rr.LineStrips2D.from_fields(colors=bars, radii=0.22),
-            rr.Points2D.from_fields(radii=radii, show_labels=True, draw_order=40.0),
+            rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=40.0),
             rr.SeriesLines(names=series),
         )
 
     def write(self, batch: Batch) -> None:
         """Send the values of each step of a batch: as they were before its update."""
         values, n = batch.thoughts.values, len(batch.records)
-        points = self._points(batch)
         columns = [
             *scalars(values),
-            *instances(rr.Points2D, n, positions=points, class_ids=self._classes(batch)),
+            *instances(rr.Points2D, n, class_ids=self._classes(batch)),
             *strips(self._bars(values)),
         ]
         self.send("q", batch.times(), columns)
+        rows = batch.thoughts.renewed  # the places are always the same, and cleared with the rest
+        places = np.broadcast_to(self._places(), (len(rows), 3 * values.shape[1], 2))
+        self.send("q", batch.times(rows), instances(rr.Points2D, len(rows), positions=places))
 
-    def _points(self, batch: Batch) -> NDArray[np.float32]:
-        """Return where the numbers, the greedy marks and the chosen marks are."""
-        n, agents = batch.thoughts.greedy.shape
-        height = np.concatenate(self._rows)
-        first = np.array([rows[0] for rows in self._rows])
-        points = np.empty((n, len(height) + 2 * agents, 2), np.float32)
-        points[:, : len(height), 0] = NUMBER_X
-        points[:, : len(height), 1] = height - LABEL_RISE
-        points[:, len(height) : -agents, 0] = GREEDY_X
-        points[:, len(height) : -agents, 1] = first + batch.thoughts.greedy
-        points[:, -agents:, 0] = CHOSEN_X
-        points[:, -agents:, 1] = first + self._own[batch.records["action"]] - LABEL_RISE
-        return points
+    def _places(self) -> NDArray[np.float32]:
+        """Return where the number of each action is, its mark as the greedy one, and as the chosen one."""
+        height = np.concatenate(self._rows) - LABEL_RISE
+        columns = [
+            np.stack((np.full_like(height, x), height), axis=1) for x in (NUMBER_X, GREEDY_X, CHOSEN_X)
+        ]
+        return np.concatenate(columns).astype(np.float32)
 
     def _classes(self, batch: Batch) -> NDArray[np.uint16]:
-        """Return the label of each of those points, by number."""
-        words, greedy = self._words, batch.thoughts.greedy
-        explored = batch.records["explored"][:, None] >> self._explored_bit & 1
-        is_greedy = self._own[batch.records["action"]] == greedy
-        parts = (
-            words.values.of(batch.thoughts.values),
-            np.full(greedy.shape, words.greedy),
-            words.chosen + explored.astype(np.int64) * (1 + is_greedy),
-        )
-        return np.concatenate(parts, axis=1).astype(np.uint16)
+        """Return the label at each of those places, by number."""
+        words, thoughts = self._words, batch.thoughts
+        n, count = thoughts.values.shape
+        own = self._own[batch.records["action"]]
+        explored = (batch.records["explored"][:, None] >> self._explored_bit & 1).astype(bool)
+        classes = np.full((n, 3 * count), words.unmarked, np.uint16)
+        classes[:, :count] = words.values.of(thoughts.values)
+        each, first = np.arange(n)[:, None], np.cumsum((0, *self._mdp.action_counts[:-1]))
+        classes[each, count + first + thoughts.greedy] = words.greedy
+        classes[each, 2 * count + first + own] = np.where(explored, words.explored, words.chosen)
+        return classes
 
     def _bars(self, values: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return a bar a value, [n, values, 2 points, 2]: from the agent's lowest there to its highest."""

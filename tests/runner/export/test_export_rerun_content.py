@@ -30,11 +30,12 @@ class Exported:
         (self.selection,) = export([Source(recording, "a run")], Request(everything=True), path)
         self.store = reading.RrdReader(str(path)).store()
 
-    def table(self, entity):
-        """Return the columns of an entity's rows that have times, in order of the step."""
+    def table(self, entity, component=None):
+        """Return the columns of an entity's rows that have times and the component, in order of the step."""
         chunks = self.store.stream().filter(content=entity).to_chunks()
         batches = [chunk.to_record_batch() for chunk in chunks if not chunk.is_static]
         batches = [batch for batch in batches if "Clear:is_recursive" not in batch.schema.names]
+        batches = [batch for batch in batches if component is None or component in batch.schema.names]
         names = [name for name in batches[0].schema.names if not name.startswith("rerun.")]
         columns = {
             name: [cell for batch in batches for cell in batch.column(name).to_pylist()] for name in names
@@ -95,7 +96,7 @@ class TestSteps:
         else:
             joint = rows[:, 0].reshape(len(steps), *counts)
             expected = np.concatenate((joint.max(axis=2), joint.max(axis=1)), axis=1)
-        assert np.array_equal(exported.table(f"/{phase}/q")["Scalars:scalars"], expected)
+        assert np.array_equal(exported.table(f"/{phase}/q", "Scalars:scalars")["Scalars:scalars"], expected)
 
     def test_positions_and_moves(self, exported, phase):
         mdp = exported.recording.mdp
