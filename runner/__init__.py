@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from runner.errors import RunnerError
     from runner.recording.reader import Recording, open_recording
     from runner.runs import Run, find_run, list_runs
+    from runner.wrappers.single import record
 
 __version__ = "0.1.0"
 
@@ -34,6 +35,7 @@ __all__ = [
     "frames",
     "list_runs",
     "open_recording",
+    "record",
     "run",
     "run_all",
 ]
@@ -46,6 +48,7 @@ _HOME = {
     "find_run": "runner.runs",
     "list_runs": "runner.runs",
     "open_recording": "runner.recording.reader",
+    "record": "runner.wrappers.single",
     "run": "runner.api",
     "run_all": "runner.api",
 }

@@ -175,6 +175,24 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
     return mdp
 
 
+def mdp_of(env: Any, kwargs: Mapping[str, Any]) -> Mdp:
+    """Return the arrays of an environment that is made already, with `kwargs`; its agents share the reward.
+
+    Raises:
+        EnvironmentNotUsable: it has no transition table, or one that makes no sense.
+    """
+    spec = env.spec
+    env_id = spec.id if spec is not None else type(env.unwrapped).__qualname__
+    try:
+        mdp = _read(env_id, kwargs, env, "team")
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise EnvironmentNotUsable(
+            f"environment {env_id!r}: what it tells of itself makes no sense."
+        ) from error
+    _check(mdp)
+    return mdp
+
+
 def _read(env_id: str, kwargs: Mapping[str, Any], env: Any, rewards: str) -> Mdp:
     """Return what an environment tells of itself, not yet checked; a team shares the summed reward."""
     base = env.unwrapped

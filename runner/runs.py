@@ -15,7 +15,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -154,6 +154,15 @@ def create_run(recordings: Path, config: ExperimentConfig, seed: int, name: str 
     Raises:
         StorageError: the recordings folder cannot be written.
     """
+    return new_run(recordings, config.to_mapping(), seed, name or config.name)
+
+
+def new_run(recordings: Path, config: Mapping[str, Any], seed: int, name: str) -> Run:
+    """Make a folder for a new run of this configuration, as `create_run` does.
+
+    Raises:
+        StorageError: the recordings folder cannot be written.
+    """
     try:
         recordings.mkdir(parents=True, exist_ok=True)
         while True:
@@ -168,12 +177,12 @@ def create_run(recordings: Path, config: ExperimentConfig, seed: int, name: str 
             folder,
             {
                 "run_id": run_id,
-                "name": name or config.name,
+                "name": name,
                 "seed": seed,
                 "status": "running",
                 "created": datetime.now(UTC).isoformat(timespec="milliseconds"),
                 "owner": owner(),
-                "config": config.to_mapping(),
+                "config": dict(config),
             },
         )
         write_whole(folder / RUN_FILE, run.facts)

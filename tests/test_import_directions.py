@@ -26,6 +26,7 @@ ORDER = """
     resume
     again notebook
     api
+    wrappers
     cli
 """
 SHOWN_BY = {("runs", "notebook")}

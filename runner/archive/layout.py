@@ -113,7 +113,7 @@ class Shape:
     events: tuple[str, ...]
 
     @property
-    def counts(self) -> dict[Topic, tuple[int, ...]]:
+    def counts(self) -> dict[Topic, schema.Sizes]:
         """Elements of each repeated field of the fixed-width topics, as `schema.record_dtype` wants them."""
         sizes = len(self.learners), len(self.events)
         return {topic: schema.block_counts(topic, *sizes) for topic in schema.BLOCK_TOPICS}

@@ -76,12 +76,14 @@ def write_archive(
         RecordingError: the recording is damaged, or holds what no recorder writes.
         OSError: the folder cannot be written.
     """
+    recording.require_job("an archive of tables")
     manifest = _Writing(recording, folder, report).write()
     (folder / layout.MANIFEST).write_bytes(manifest.to_json())
     return manifest
 
 
 def _shape(recording: Recording) -> Shape:
+    recording.require_job("a table of its steps")
     return shape_of(recording.run, recording.mdp, str(recording.path))
 
 

@@ -64,6 +64,11 @@ def from_mapping(
     Raises:
         ConfigError: The values do not describe an experiment; a line for each problem.
     """
+    if "made_by" in values:
+        raise ConfigError(
+            f"found a run made by {values['made_by']}: it was recorded from somebody's own training loop, "
+            "which alone can do it again. It can be looked at, compared and checked, not redone."
+        )
     return _experiment(Document(values), overrides, name, named_by=repr(name))
 
 

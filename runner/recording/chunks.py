@@ -19,14 +19,12 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.schema import Topic
+from runner.recording.schema import MESSAGE_HEAD, Topic
 
 MAX_CHUNK_BYTES: Final = 64 << 20
 """The largest chunk that is read, packed or unpacked; the recorder's are below 16 MiB."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, size unpacked, its CRC, and the length of the name of the compression."""
-MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
-"""Opcode, length, channel, sequence, log time, publish time."""
 _NAME_BYTES: Final = 4
 
 

@@ -56,6 +56,12 @@ class Contents:
     chunks: list[Part] = field(default_factory=list)
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
+    channels: list[int] = field(default_factory=list)
+
+    @property
+    def topics(self) -> list[schema.Topic]:
+        """The topics of its channels."""
+        return [topic for topic in schema.ALL_TOPICS if topic.channel in self.channels]
 
 
 Check = Callable[[int, int, bytes, bytes], None]
@@ -130,7 +136,9 @@ class _Surveyor:
             self._note(contents.metadata, MetadataIndex(offset=at, length=9 + len(body), name=name))
         elif opcode == Opcode.ATTACHMENT:
             self._note(contents.attachments, _attachment_index(body, at))
-        elif opcode not in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL):
+        elif opcode == Opcode.CHANNEL:
+            contents.channels.append(struct.unpack_from("<H", body)[0])
+        elif opcode not in (Opcode.HEADER, Opcode.SCHEMA):
             raise RecordingError(f"found a record of kind {opcode} at {at}, expected none there")
         self._check(opcode, at, body, records)
         contents.end = end
@@ -189,9 +197,9 @@ def _messages(records: bytes, where: str) -> tuple[int, int]:
     if len(records) < schema.HEADER_BYTES:
         raise RecordingError(f"{where}: holds no whole message")
     opcode, length, channel = struct.unpack_from("<BQH", records)
-    if opcode != Opcode.MESSAGE or channel not in {topic.channel for topic in schema.TOPICS}:
+    if opcode != Opcode.MESSAGE or channel not in {topic.channel for topic in schema.ALL_TOPICS}:
         raise RecordingError(f"{where}: holds no messages of ours")
-    if channel in {topic.channel for topic in schema.BLOCK_TOPICS}:
+    if channel in {topic.channel for topic in schema.ALL_BLOCK_TOPICS}:
         if len(records) % (9 + length) or 9 + length < schema.HEADER_BYTES:
             raise RecordingError(f"{where}: its messages differ in size")
         return channel, len(records) // (9 + length)

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 from blake3 import blake3
 
-from runner.recording.schema import TOPICS, Topic
+from runner.recording.schema import ALL_TOPICS, Topic
 
 _PREFIX = b"dualtaxi content 0\n"
 
@@ -22,7 +22,7 @@ class ContentHash:
     """The running digest of a recording."""
 
     def __init__(self) -> None:
-        self._topics = {topic.name: blake3() for topic in TOPICS if topic.digested}
+        self._topics = {topic.name: blake3() for topic in ALL_TOPICS if topic.digested}
         self._bytes = dict.fromkeys(self._topics, 0)
 
     def update(self, topic: Topic, records: bytes | memoryview) -> None:

@@ -14,6 +14,8 @@ from runner.recording import schema
 from runner.recording.arrays import unpack_array
 from runner.recording.contents import MAX_METADATA_BYTES
 from runner.recording.index import Index
+from runner.recording.schema import Topic
+from runner.recording.spaces import dtype_of, leaves_of
 
 _FACTS: Final = {
     **dict.fromkeys(("run_id", "name", "job", "created", "agents")),
@@ -30,14 +32,14 @@ def check_facts(run: Mapping[str, str], index: Index, path: str) -> None:
     Raises:
         RecordingError: it is one.
     """
-    topics = {topic.channel: topic.name for topic in schema.TOPICS}
+    check_run(run, path)
+    topics = {topic.channel: topic.name for topic in schema.KINDS[kind_of(run)]}
     for number, channel in index.channels.items():
         if topics.get(number) != channel.topic:
             raise RecordingError(
                 f"{path}: found channel {number} for {channel.topic!r}, "
                 f"expected {topics.get(number)!r}: not written by dualtaxi."
             )
-    check_run(run, path)
 
 
 def check_run(run: Mapping[str, str], path: str) -> None:
@@ -56,6 +58,53 @@ def check_run(run: Mapping[str, str], path: str) -> None:
         said = run.get(name, "")
         if not said or (most and not (said.isdecimal() and len(said) <= 20 and int(said) <= most)):
             raise RecordingError(f"{path}: is damaged: of its run it says that {name} is {said!r}.")
+
+    if kind_of(run) not in schema.KINDS:
+        raise RecordingError(
+            f"{path}: found a recording of the kind {run['kind']!r}, expected {', '.join(schema.KINDS)}."
+        )
+    environments = run.get("environments", "1")
+    if not (environments.isdecimal() and len(environments) <= 7 and int(environments) > 0):
+        raise RecordingError(f"{path}: is damaged: of its run it says that environments is {environments!r}.")
+
+
+def kind_of(run: Mapping[str, str]) -> str:
+    """Return which of `schema.KINDS` a recording is, by its metadata record `run`."""
+    return run.get("kind", "job")
+
+
+def spaces_of(run: Mapping[str, str], path: str) -> dict[str, Any]:
+    """Return the descriptions of the spaces, `observation` and `action`, that a loop's recording has.
+
+    Raises:
+        RecordingError: they are missing, or describe no spaces.
+    """
+    spaces = json_object(run.get("spaces"), f"{path}: the spaces of its run")
+    for name in ("observation", "action"):
+        leaves_of(spaces.get(name), f"{path}: the {name} space")
+    return spaces
+
+
+def sizes_of(run: Mapping[str, str], path: str) -> dict[Topic, schema.Sizes]:
+    """Return what `schema.record_dtype` must know of each fixed-width topic of a recording.
+
+    Raises:
+        RecordingError: its spaces are not described.
+    """
+    learners, events, kind = int(run["learners"]), int(run["events"]), kind_of(run)
+    action = observation = None
+    if kind in ("step", "transition"):
+        spaces = spaces_of(run, path)
+        action, observation = (
+            dtype_of(spaces[name], f"{path}: the {name} space") for name in ("action", "observation")
+        )
+        if action is None or observation is None:
+            raise RecordingError(f"{path}: has a space of variable width, expected fixed ones in its kind.")
+    return {
+        topic: schema.block_counts(topic, learners, events, action, observation)
+        for topic in schema.KINDS[kind]
+        if topic in schema.ALL_BLOCK_TOPICS
+    }
 
 
 def json_object(text: str | bytes | None, what: str) -> dict[str, Any]:
@@ -107,6 +156,11 @@ def environment_of(description: dict[str, Any], attachment: Callable[[str], byte
     names = description.pop("arrays", None)
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise RecordingError(f"{path}: environment.json does not name the environment's arrays.")
+    if not names:
+        raise RecordingError(
+            f"{path}: has no transition table of {description.get('env_id')}, which is not tabular: it was "
+            "recorded from a loop over it."
+        )
     arrays: dict[str, NDArray[Any]] = {}
     for name in names:
         data = attachment(f"environment/{name}.npy.zst")

@@ -29,8 +29,8 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES, MESSAGE_HEAD
-from runner.recording.schema import PROFILE, TOPICS
+from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES
+from runner.recording.schema import ALL_TOPICS, MESSAGE_HEAD, PROFILE
 
 K = TypeVar("K")
 T = TypeVar("T")
@@ -58,7 +58,7 @@ _EXPECTED: Final = frozenset(
 """What the data section has: behind anything else nothing can be believed."""
 _FOOTER_BYTES: Final = 9 + 20
 _TAIL_BYTES: Final = _FOOTER_BYTES + len(MCAP0_MAGIC)
-_CHANNELS: Final = frozenset(topic.channel for topic in TOPICS)
+_CHANNELS: Final = frozenset(topic.channel for topic in ALL_TOPICS)
 
 
 class ChunkEntry(NamedTuple):
@@ -353,7 +353,7 @@ def _put(known: dict[K, T], key: K, value: T, path: str, what: str) -> None:
     """Add what may stand in a file once."""
     if key in known:
         raise RecordingError(f"{path}: has {what} {key!r} twice.")
-    if len(known) == (len(TOPICS) if what == "channel" else MAX_NAMED):
+    if len(known) == (len(ALL_TOPICS) if what == "channel" else MAX_NAMED):
         raise RecordingError(f"{path}: has more than {len(known):,} {what} records; too many to be ours.")
     if isinstance(key, str) and len(key) > MAX_NAME_BYTES:
         raise RecordingError(f"{path}: has {what} with a name of {len(key):,} letters.")

@@ -24,8 +24,13 @@ from runner.recording.contents import Contents, survey
 from runner.recording.writer import RecordingFile, schema_and_channel_bytes
 
 Times = NDArray[np.uint64]
-_schemas_and_channels = cache(schema_and_channel_bytes)
-_BLOCK_CHANNELS = {topic.channel for topic in schema.BLOCK_TOPICS}
+_BLOCK_CHANNELS = {topic.channel for topic in schema.ALL_BLOCK_TOPICS}
+
+
+@cache
+def _beginnings() -> tuple[bytes, ...]:
+    """Return what recordings have behind their header, a kind each."""
+    return tuple(schema_and_channel_bytes(topics) for topics in schema.KINDS.values())
 
 
 def check_integrity(path: Path) -> None:
@@ -73,10 +78,15 @@ def _check_beginning(stream: BinaryIO, path: Path) -> None:
     if start[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
         raise RecordingError(f"{path}: found {start[:8]!r} at 0, expected the MCAP magic.")
     opcode, length = struct.unpack("<BQ", start[len(MCAP0_MAGIC) :].ljust(9, b"\0"))
-    expected = _schemas_and_channels()
     stream.seek(len(MCAP0_MAGIC) + 9 + min(length, 4096))
-    if opcode != Opcode.HEADER or stream.read(len(expected)) != expected:
+    if opcode != Opcode.HEADER or not _begins(stream):
         raise RecordingError(f"{path}: found other schemas or channels than every recording begins with.")
+
+
+def _begins(stream: BinaryIO) -> bool:
+    """Return whether the schemas and channels of a kind stand here."""
+    found = stream.read(max(map(len, _beginnings())))
+    return found.startswith(_beginnings())
 
 
 class _IndexCheck:

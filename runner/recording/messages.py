@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.schema import MessageType
+from runner.recording.spaces import NUMBERS
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,32 @@ def decode_q_table(payload: bytes) -> QTable:
     return QTable(fields["step"], fields["episode"], fields["agent"], fields["table"], values)
 
 
-def encode_log(text: str, seconds: float, level: str = "INFO") -> bytes:
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """An array that a loop recorded, after `step` steps of its phase."""
+
+    name: str
+    phase: str
+    step: int
+    episode: int
+    values: NDArray[Any]
+
+
+def decode_array(payload: bytes) -> Snapshot:
+    """Return the array in a `dualtaxi.Array`.
+
+    Raises:
+        RecordingError: shape, dtype and data do not fit together.
+    """
+    fields = decode(schema.ARRAY, payload)
+    shape, kind, data = tuple(fields["shape"]), fields["dtype"], fields["data"]
+    if not NUMBERS.fullmatch(kind) or math.prod(shape) * np.dtype(kind).itemsize != len(data):
+        raise RecordingError(f"found an array of shape {shape}, dtype {kind!r} and {len(data)} bytes")
+    values = np.frombuffer(data, kind).reshape(shape)
+    return Snapshot(fields["name"], fields["phase"], fields["step"], fields["episode"], values)
+
+
+def encode_log(text: str, seconds: float, level: str = "INFO", name: str = "dualtaxi") -> bytes:
     """Return a `foxglove.Log` at a logical time."""
     whole = int(seconds)
     return encode(
@@ -91,6 +118,6 @@ def encode_log(text: str, seconds: float, level: str = "INFO") -> bytes:
             "timestamp": {"seconds": whole, "nanos": round((seconds - whole) * 1e9)},
             "level": schema.LOG_LEVELS.index(level),
             "message": text,
-            "name": "dualtaxi",
+            "name": name,
         },
     )

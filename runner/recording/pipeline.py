@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from runner.recording.chunks import Chunk, Packing, encode_chunk
 from runner.recording.digest import ContentHash
-from runner.recording.schema import Topic
+from runner.recording.schema import Topic, message_record
 from runner.recording.writer import RecordingFile
 
 ENCODERS: Final = 2
@@ -82,8 +82,26 @@ class Pipeline:
         """
         chunk = None
         if write and self._file is not None:
-            chunk = self._encoders.submit(encode_chunk, topic, records, log_times, offsets, self._packing)
+            chunk = self._encode(encode_chunk, topic, records, log_times, offsets, self._packing)
         self._work.put(_Work(topic, records, chunk, used))
+
+    def submit(self, topic: Topic, make: Callable[[], bytes], log_time: int) -> None:
+        """Send one message of a topic on its way that is yet to be made; waits while too many are.
+
+        Args:
+            topic: its topic; the digest must not cover it.
+            make: returns the message; called by an encoder thread.
+            log_time: nanoseconds.
+        """
+        assert not topic.digested
+
+        def encoded() -> Chunk:
+            record = message_record(topic, log_time, make())
+            times = np.array([log_time], np.uint64)
+            return encode_chunk(topic, record, times, np.zeros(1, np.uint64), self._packing)
+
+        chunk = self._encode(encoded) if self._file is not None else None
+        self._work.put(_Work(topic, memoryview(b""), chunk, lambda: None))
 
     def close(self) -> None:
         """Wait until everything sent is written, or was given up after a failure; stop the threads."""
@@ -91,6 +109,15 @@ class Pipeline:
             self._work.put(None)
             self._writer.join()
         self._encoders.shutdown(cancel_futures=True)
+
+    def _encode(self, work: Callable[..., Chunk], *arguments: object) -> Future[Chunk]:
+        """Give work to an encoder thread; when the interpreter is exiting there are none, so do it here."""
+        try:
+            return self._encoders.submit(work, *arguments)
+        except RuntimeError:
+            done: Future[Chunk] = Future()
+            done.set_result(work(*arguments))
+            return done
 
     def _run(self) -> None:
         last_beat = last_sync = time.monotonic()

@@ -26,12 +26,21 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.mdp import Mdp
 from runner.recording import schema
-from runner.recording.chunks import MAX_CHUNK_BYTES, MESSAGE_HEAD
+from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.contents import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
-from runner.recording.facts import check_facts, environment_of, holes, json_object
+from runner.recording.facts import (
+    check_facts,
+    environment_of,
+    holes,
+    json_object,
+    kind_of,
+    sizes_of,
+    spaces_of,
+)
 from runner.recording.index import ChunkEntry, read_index
-from runner.recording.messages import QTable, decode, decode_q_table
-from runner.recording.schema import BLOCK_TOPICS, Topic
+from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
+from runner.recording.schema import MESSAGE_HEAD, Topic
+from runner.recording.spaces import decode as decode_value
 from runner.recording.store import RecordStore
 
 MAX_EPISODE_BYTES: Final = 128 << 20
@@ -205,18 +214,63 @@ class Recording:
     @cached_property
     def dtypes(self) -> dict[Topic, np.dtype[np.void]]:
         """The dtype of each fixed-width topic's message records in this recording."""
-        learners, events = int(self.run["learners"]), int(self.run["events"])
         return {
-            topic: schema.record_dtype(topic.message, schema.block_counts(topic, learners, events))
-            for topic in BLOCK_TOPICS
+            topic: schema.record_dtype(topic.message, sizes)
+            for topic, sizes in sizes_of(self.run, str(self.path)).items()
         }
+
+    @property
+    def kind(self) -> str:
+        """`job` if the runner learned it; else what the spaces of somebody's own loop ask for.
+
+        `step`: both are `Discrete`; `transition`: all values have one size; `variable`: they have not.
+        """
+        return kind_of(self.run)
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The topics that a recording of its kind has."""
+        return schema.KINDS[self.kind]
+
+    def require_job(self, purpose: str) -> None:
+        """Refuse a recording of somebody's own loop.
+
+        Raises:
+            RecordingError: it is one; `purpose` says what it cannot be used for.
+        """
+        if self.kind != "job":
+            raise RecordingError(
+                f"{self.path}: was recorded from somebody's own loop, by {self.config.get('made_by')}; "
+                f"{purpose} is for runs that were trained here."
+            )
+
+    @cached_property
+    def spaces(self) -> dict[str, Any]:
+        """The descriptions of the `observation` and the `action` space of a loop's recording."""
+        return spaces_of(self.run, str(self.path))
+
+    @property
+    def environments(self) -> int:
+        """How many environments took turns: step number n was taken in number n modulo this."""
+        return int(self.run.get("environments", "1"))
+
+    def topic(self, name: str) -> Topic:
+        """Return the topic of that name, such as `/train/step`.
+
+        Raises:
+            RecordingError: a recording of its kind has none.
+        """
+        for topic in self.topics:
+            if topic.name == name:
+                return topic
+        raise RecordingError(f"{self.path}: has no topic {name!r}: it is of the kind {self.kind!r}.")
 
     def count(self, topic: Topic) -> int:
         """Return the number behind a topic's last message: how many there are, if none was lost.
 
         For a topic of variable size it reads them.
         """
-        if topic in BLOCK_TOPICS:
+        if topic in self.dtypes:
             ends = self._numbers(topic)[1]
             return int(ends[-1]) if len(ends) else 0
         return sum(1 for _ in self.messages(topic))
@@ -253,11 +307,11 @@ class Recording:
     def blocks_of_episodes(self, phase: str, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
         """Yield the steps of the episodes number `start` up to `stop`; None for the very end."""
         behind = None if stop is None else self._first_step(phase, stop)
-        return self.blocks(schema.PHASES[phase][0], self._first_step(phase, start), behind)
+        return self.blocks(self.topic(f"/{phase}/step"), self._first_step(phase, start), behind)
 
     def _first_step(self, phase: str, episode: int) -> int:
         """Return the first step of an episode or a later one, found in the steps themselves."""
-        topic = schema.PHASES[phase][0]
+        topic = self.topic(f"/{phase}/step")
         firsts, ends = (numbers.tolist() for numbers in self._numbers(topic))
         k = bisect_left(ends, episode, key=lambda end: next(self.blocks(topic, end - 1, end))["episode"][0])
         if k == len(ends):
@@ -282,25 +336,28 @@ class Recording:
 
     def episodes(self, phase: str, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
         """Return the episode records of a phase (`train` or `eval`) as one array."""
-        topic = schema.PHASES[phase][1]
+        topic = self.topic(f"/{phase}/episode")
         blocks = list(self.blocks(topic, start, stop))
         return np.concatenate(blocks) if blocks else np.empty(0, self.dtypes[topic])
 
     def episode_steps(self, phase: str, episode: int) -> NDArray[np.void]:
         """Return the steps of one episode, also of one that never ended.
 
+        Where several environments take turns, episodes are numbered as they ended, and only those are given.
+
         Raises:
             RecordingError: the recording has no such episode, or no steps.
         """
-        topic, episodes = schema.PHASES[phase]
+        topic, episodes = self.topic(f"/{phase}/step"), self.topic(f"/{phase}/episode")
+        stride = self.environments
         total, ended = self.count(topic), self.count(episodes)
         if not total:
             raise RecordingError(f"{self.path}: has no {phase} steps.")
         start = stop = 0
         if 0 <= episode < ended and len(records := self.episodes(phase, episode, episode + 1)):
             stop = int(records[0]["last_step"]) + 1
-            start = stop - int(records[0]["length"])
-        elif episode == ended:
+            start = stop - (int(records[0]["length"]) - 1) * stride - 1
+        elif episode == ended and stride == 1:
             last = self.episodes(phase, ended - 1, ended)
             start, stop = int(last[0]["last_step"]) + 1 if len(last) else 0, total
         if not 0 <= start < stop <= total:
@@ -313,7 +370,52 @@ class Recording:
         blocks = list(self.blocks(topic, start, stop))
         if not blocks:
             raise RecordingError(f"{self.path}: the steps of {phase} episode {episode} were lost.")
-        return np.concatenate(blocks)
+        return np.concatenate(blocks)[::stride]
+
+    # --- of somebody's own loop ---------------------------------------------------------------------
+
+    def transitions(self, phase: str) -> Iterator[Any]:
+        """Yield the steps of a phase one by one, with `action` and `next_observation` as values.
+
+        Of the kind `step` they have `state`, `action` and `next_state`, counted from 0.
+
+        Records of NumPy where values have one size (`blocks` gives many at once), else dictionaries.
+        """
+        yield from self._values(self.topic(f"/{phase}/step"), action="action", next_observation="observation")
+
+    def resets(self, phase: str) -> Iterator[Any]:
+        """Yield the resets of a phase one by one, as `transitions` yields steps."""
+        yield from self._values(self.topic(f"/{phase}/reset"), observation="observation")
+
+    def decoded(self, topic: Topic) -> Iterator[dict[str, Any]]:
+        """Yield the messages of a topic of variable size: `log_time` and the fields, by name."""
+        for time, payload in self.messages(topic):
+            try:
+                yield {"log_time": time} | decode(topic.message, payload)
+            except RecordingError as error:
+                raise RecordingError(f"{self.path}: {topic.name} at {time} ns: {error}") from error
+
+    def arrays(self) -> Iterator[Snapshot]:
+        """Yield the arrays that a loop recorded by `snapshot`, in order."""
+        for time, payload in self.messages(schema.ARRAY_TOPIC):
+            try:
+                yield decode_array(payload)
+            except RecordingError as error:
+                raise RecordingError(f"{self.path}: the array at {time} ns: {error}") from error
+
+    def _values(self, topic: Topic, **spaces: str) -> Iterator[Any]:
+        """Yield a topic's messages one by one; `spaces` names the space of each field that is a value."""
+        if topic in self.dtypes:
+            for block in self.blocks(topic):
+                yield from block
+            return
+        for fields in self.decoded(topic):
+            where = f"{self.path}: {topic.name} at {fields['log_time']} ns"
+            for name, space in spaces.items():
+                fields[name] = decode_value(self.spaces[space], fields[name], where)
+            if "rewards" in fields:
+                fields["rewards"] = np.array(fields["rewards"])
+            yield fields
 
     def metrics(self, phase: str) -> list[dict[str, Any]]:
         """Return the metrics of a phase, in order.
@@ -369,10 +471,10 @@ class Recording:
         channels = table.columns["channel"].copy() if table else np.empty(0, np.uint16)
         for k in np.flatnonzero(channels == 0).tolist():
             channel = self._store.first_channel(table[k])
-            if channel not in self._index.channels:
-                raise self._damaged(table[k], f"messages of channel {channel}, expected one of ours")
             channels[k] = channel
-        return {topic.channel: np.flatnonzero(channels == topic.channel) for topic in schema.TOPICS}
+        for k in np.flatnonzero(~np.isin(channels, list(self._index.channels))).tolist():
+            raise self._damaged(table[k], f"messages of channel {channels[k]}, expected one of ours")
+        return {topic.channel: np.flatnonzero(channels == topic.channel) for topic in schema.ALL_TOPICS}
 
     def _entry(self, topic: Topic, k: int) -> ChunkEntry:
         """Return the entry of a topic's chunk number k."""

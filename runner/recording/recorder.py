@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import queue
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final
@@ -29,6 +29,10 @@ FLUSH_SECONDS: Final = 0.5
 """An open block is closed when it is this old; with the time to write it, well under a second."""
 BLOCKS_UNDER_WAY: Final = 8
 EPISODES_A_BLOCK: Final = 2048
+BLOCK_BYTES: Final = 8 << 20
+"""A block has no more bytes than this, unless one record has."""
+_PILE_BYTES: Final = 1 << 18
+_PILE_MESSAGES: Final = 4096
 
 
 @dataclass
@@ -44,12 +48,21 @@ class _Lane:
     """The buffers of one fixed-width topic."""
 
     topic: Topic
-    counts: tuple[int, ...]
+    sizes: schema.Sizes
     capacity: int
     write: bool
     open: _Block | None = None
     free: queue.SimpleQueue[_Block] = field(default_factory=queue.SimpleQueue)
     made: int = 0
+
+
+@dataclass
+class _Pile:
+    """Messages of one topic of variable size, waiting to be a chunk together."""
+
+    records: bytearray = field(default_factory=bytearray)
+    times: list[int] = field(default_factory=list)
+    offsets: list[int] = field(default_factory=list)
 
 
 class Recorder:
@@ -64,6 +77,7 @@ class Recorder:
         record_steps: False keeps the steps' digest but not the steps.
         past: what the recording already holds.
         beat: called about once a second while the recorder lives, from its own thread.
+        sizes: the fixed-width topics of the recording; those of a job unless given.
     """
 
     def __init__(
@@ -76,21 +90,26 @@ class Recorder:
         record_steps: bool = True,
         past: Past | None = None,
         beat: Callable[[], None] = lambda: None,
+        sizes: Mapping[Topic, schema.Sizes] | None = None,
     ) -> None:
         self._file = file
         self._past = past or Past()
+        sizes = sizes or {
+            topic: schema.block_counts(topic, learners, events) for topic in schema.BLOCK_TOPICS
+        }
         self._lanes = {
             topic: _Lane(
                 topic,
-                schema.block_counts(topic, learners, events),
-                capacity=chunk_steps if topic.message is schema.STEP else EPISODES_A_BLOCK,
+                own,
+                capacity=_capacity(topic, own, chunk_steps),
                 write=record_steps or topic.message is not schema.STEP,
             )
-            for topic in schema.BLOCK_TOPICS
+            for topic, own in sizes.items()
         }
+        self._piles: dict[Topic, _Pile] = {}
         self.steps = {"train": 0, "eval": 0}
         """Steps committed so far, a phase."""
-        self.counts = {topic.name: 0 for topic in schema.TOPICS}
+        self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
         """Messages committed so far, a topic."""
         self._last_flush = time.monotonic()
         self._pipeline = Pipeline(file, packing or Packing(), beat)
@@ -121,12 +140,12 @@ class Recorder:
         other = self.steps["eval" if phase == "train" else "train"]
         if steps:
             first = self.steps[phase] + other + 1
-            self._take(step_topic, np.arange(first, first + steps, dtype=np.uint64))
+            self.take(step_topic, np.arange(first, first + steps, dtype=np.uint64))
             self.steps[phase] += steps
         if episodes:
             block = self._open(episode_topic)
             ended_by = block.records["last_step"][block.filled : block.filled + episodes]
-            self._take(episode_topic, ended_by.astype(np.uint64) + np.uint64(other + 1))
+            self.take(episode_topic, ended_by.astype(np.uint64) + np.uint64(other + 1))
         if time.monotonic() - self._last_flush > FLUSH_SECONDS:
             self.flush()
 
@@ -140,8 +159,46 @@ class Recorder:
         times = np.array([log_time], dtype=np.uint64)
         self._pipeline.send(topic, records, times, np.zeros(1, np.uint64), write=not known)
 
+    def append(self, topic: Topic, payload: bytes, position: int) -> None:
+        """Record one message of a topic of variable size, in a chunk with others.
+
+        Args:
+            topic: its topic.
+            payload: the message.
+            position: the number of steps executed so far.
+
+        Raises:
+            StorageError: the disk is full or failing; everything before is kept.
+        """
+        self._raise_failure()
+        pile = self._piles.setdefault(topic, _Pile())
+        if pile.records and len(pile.records) + len(payload) > _PILE_BYTES:
+            self._close_pile(topic)
+            pile = self._piles.setdefault(topic, _Pile())
+        log_time = position * STEP_NANOSECONDS
+        pile.offsets.append(len(pile.records))
+        pile.times.append(log_time)
+        pile.records += schema.message_record(topic, log_time, payload)
+        self.counts[topic.name] += 1
+        if len(pile.times) == _PILE_MESSAGES:
+            self._close_pile(topic)
+
+    def submit(self, topic: Topic, make: Callable[[], bytes], position: int) -> None:
+        """Record one message that is yet to be made, by a thread of the recorder's own.
+
+        Its topic must be one that the digest does not cover.
+
+        Raises:
+            StorageError: the disk is full or failing; everything before is kept.
+        """
+        self._raise_failure()
+        self.counts[topic.name] += 1
+        self._pipeline.submit(topic, make, position * STEP_NANOSECONDS)
+
     def flush(self) -> None:
         """Close every open block, so that it is written now."""
+        for topic in list(self._piles):
+            self._close_pile(topic)
         for lane in self._lanes.values():
             if lane.open is not None and lane.open.filled:
                 self._close_block(lane)
@@ -167,10 +224,15 @@ class Recorder:
         assert block is not None, "commit without block"
         return block
 
-    def _take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
+    def take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
         """Take the next records of the topic's block in: give them their times, compare or keep them.
 
-        A record's time is the number of steps executed so far, 0.1 s each.
+        Args:
+            topic: whose block.
+            positions: for each record the number of steps executed so far, 0.1 s each.
+
+        Raises:
+            Diverged: a record differs from the one that the recording holds already.
         """
         lane, block = self._lanes[topic], self._open(topic)
         known = self._past.remaining(topic) > 0
@@ -192,7 +254,7 @@ class Recorder:
         """Return a block to fill: a used one that came back, or a new one while there may be more."""
         if lane.made < BLOCKS_UNDER_WAY and lane.free.empty():
             lane.made += 1
-            return _Block(schema.blank_records(lane.topic, lane.counts, lane.capacity).view(np.recarray))
+            return _Block(schema.blank_records(lane.topic, lane.sizes, lane.capacity).view(np.recarray))
         block = lane.free.get()
         block.filled = 0
         return block
@@ -213,12 +275,23 @@ class Recorder:
             used=partial(lane.free.put, block),
         )
 
+    def _close_pile(self, topic: Topic) -> None:
+        pile = self._piles.pop(topic)
+        times, offsets = (np.array(numbers, np.uint64) for numbers in (pile.times, pile.offsets))
+        self._pipeline.send(topic, memoryview(pile.records), times, offsets)
+
     def _raise_failure(self) -> None:
         failure = self._pipeline.failure
         if isinstance(failure, OSError) and self._file is not None:
             raise storage_error(self._file, failure) from failure
         if failure is not None:
             raise failure
+
+
+def _capacity(topic: Topic, sizes: schema.Sizes, chunk_steps: int) -> int:
+    """Return how many records a block of a topic has."""
+    most = EPISODES_A_BLOCK if topic.message in (schema.EPISODE, schema.RESET) else chunk_steps
+    return max(1, min(most, BLOCK_BYTES // schema.record_dtype(topic.message, sizes).itemsize))
 
 
 def storage_error(file: RecordingFile, error: OSError) -> StorageError:

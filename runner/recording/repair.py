@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -20,12 +21,12 @@ from mcap.opcode import Opcode
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
 from runner.recording.contents import asks_for_indexes, attachment_of, metadata_of, read_chunk
-from runner.recording.facts import check_run, json_object
+from runner.recording.facts import check_run, json_object, kind_of, sizes_of
 from runner.recording.integrity import check_integrity, places
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import copied_chunk
 from runner.recording.salvage import DamagedFile
-from runner.recording.schema import BLOCK_TOPICS, TOPICS, Topic
+from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
 from runner.scene import is_whole
 
@@ -93,7 +94,21 @@ def _salvaged(path: Path, fresh: Path) -> Repair:
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
     with stream:
-        return _Salvage(path, DamagedFile(stream, path)).write(fresh)
+        topics = schema.KINDS[_kind(DamagedFile(stream, path), path)]
+        return _Salvage(path, DamagedFile(stream, path), topics).write(fresh)
+
+
+def _kind(file: DamagedFile, path: Path) -> str:
+    """Return of which kind a damaged recording is."""
+    for opcode, _, body in file.good_records():
+        if opcode == Opcode.METADATA:
+            name, entries = metadata_of(body)
+            if name == "run":
+                check_run(entries, str(path))
+                return kind_of(entries)
+        if opcode == Opcode.CHUNK:
+            break
+    return "job"
 
 
 def _remove(fresh: Path) -> None:
@@ -109,8 +124,8 @@ def _read_back(fresh: Path, done: Repair) -> None:
     """
     check_integrity(fresh)
     with open_recording(fresh) as recording:
-        for topic in TOPICS:
-            if topic in BLOCK_TOPICS:
+        for topic in recording.topics:
+            if topic in recording.dtypes:
                 found = sum(len(block) for block in recording.blocks(topic))
             else:
                 found = recording.count(topic)
@@ -130,13 +145,14 @@ def _free_name(path: Path) -> Path:
 class _Salvage:
     """Takes the good records out of a damaged file's bytes."""
 
-    def __init__(self, path: Path, file: DamagedFile) -> None:
+    def __init__(self, path: Path, file: DamagedFile, topics: Sequence[Topic]) -> None:
         self._path = path
+        self._topics = topics
         self._damaged = file
         self._done = Repair(path)
         self._indexed = True
         self._dtypes: dict[Topic, np.dtype[np.void]] = {}
-        self._next = dict.fromkeys(TOPICS, 0)
+        self._next = dict.fromkeys(topics, 0)
         """Number of the message expected next, a topic."""
         self._result: dict[str, str] | None = None
         self._counts: dict[str, int] = {}
@@ -145,7 +161,7 @@ class _Salvage:
     def write(self, fresh: Path) -> Repair:
         """Write a new file of what is good."""
         described = set()
-        with RecordingFile(fresh) as file:
+        with RecordingFile(fresh, self._topics) as file:
             for opcode, offset, body in self._damaged.good_records():
                 if opcode == Opcode.METADATA:
                     name, entries = metadata_of(body)
@@ -178,17 +194,18 @@ class _Salvage:
             self._indexed = asks_for_indexes(entries)
         if name == "run":
             check_run(entries, str(self._path))
-            learners, events = int(entries["learners"]), int(entries["events"])
             self._dtypes = {
-                topic: schema.record_dtype(topic.message, schema.block_counts(topic, learners, events))
-                for topic in BLOCK_TOPICS
+                topic: schema.record_dtype(topic.message, sizes)
+                for topic, sizes in sizes_of(entries, str(self._path)).items()
             }
         file.add_metadata(name, entries)
 
     def _take_chunk(self, file: RecordingFile, offset: int, body: bytes) -> None:
         """Copy a good chunk, with its index made anew; note a hole before it."""
         part, records = read_chunk(body, offset)
-        topic = next(topic for topic in TOPICS if topic.channel == part.channel)
+        topic = next((topic for topic in self._topics if topic.channel == part.channel), None)
+        if topic is None:
+            raise RecordingError(f"{self._path}: chunk at {offset}: found messages of another kind of run.")
         _, times, offsets = places(records, f"{self._path}: chunk at {offset}")
         if topic in self._dtypes:
             first, stop = self._numbers(topic, offset, records)
@@ -223,7 +240,7 @@ class _Salvage:
     def _close(self, file: RecordingFile) -> None:
         """Say what was lost, or give the result back; finish the file."""
         if self._result is not None:
-            for topic in TOPICS:
+            for topic in self._topics:
                 if self._next[topic] < (count := self._counts.get(topic.name, 0)):
                     self._done.lost.setdefault(topic.name, []).append([self._next[topic], count])
         self._done.lost_bytes = self._damaged.lost_bytes
@@ -241,7 +258,8 @@ class _Salvage:
             return 0
         start, end, size = _CHUNK_TIMES_AND_SIZE.unpack_from(torn)
         ticks = (end - start) // schema.STEP_NANOSECONDS + 1
-        return ticks if size == ticks * self._dtypes[schema.TRAIN_STEP].itemsize else 0
+        widths = [dtype.itemsize for topic, dtype in self._dtypes.items() if topic.name == "/train/step"]
+        return ticks if [size] == [ticks * width for width in widths] else 0
 
 
 def _recorded_counts(result: dict[str, str]) -> dict[str, int]:
@@ -254,6 +272,6 @@ def _recorded_counts(result: dict[str, str]) -> dict[str, int]:
     counts = said.get("messages", {})
     if not isinstance(counts, dict) or not all(is_whole(n, 0, _MOST_MESSAGES) for n in counts.values()):
         raise RecordingError("the metadata 'result' does not say how many messages there were")
-    steps = {topic.name for topic in TOPICS if topic.message is schema.STEP}
+    steps = {topic.name for topic in schema.TOPICS if topic.message is schema.STEP}
     left_out = set() if said.get("steps_recorded", True) else steps
     return {name: count for name, count in counts.items() if name not in left_out}

@@ -8,6 +8,7 @@ and in the reader's hands, and a standard protobuf parser still reads each messa
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
@@ -63,6 +64,7 @@ class Topic:
 
 _BOOL, _BYTES, _STRING = Pb.TYPE_BOOL, Pb.TYPE_BYTES, Pb.TYPE_STRING
 _DOUBLE, _FIXED32, _SFIXED64 = Pb.TYPE_DOUBLE, Pb.TYPE_FIXED32, Pb.TYPE_SFIXED64
+_FIXED64 = Pb.TYPE_FIXED64
 
 # The order of the fields is the one that compresses best: what changes together stands together.
 STEP = MessageType(
@@ -148,6 +150,77 @@ LOG = MessageType(
 )
 """Foxglove's own log message, so that viewers show it as text."""
 
+TRANSITION = MessageType(
+    "Transition",
+    (
+        Field(1, "action", _BYTES),
+        Field(2, "next_observation", _BYTES),
+        Field(3, "rewards", _DOUBLE, repeated=True),
+        Field(4, "step", _SFIXED64),
+        Field(5, "episode", _SFIXED64),
+        Field(6, "t", _FIXED32),
+        Field(7, "terminated", _BOOL),
+        Field(8, "truncated", _BOOL),
+        Field(9, "acted", _FIXED32),
+        Field(10, "agents_terminated", _FIXED32),
+        Field(11, "agents_truncated", _FIXED32),
+    ),
+)
+"""A step in spaces that are not both `Discrete`; bit i of the last three is agent i."""
+RESET = MessageType(
+    "Reset",
+    (
+        Field(1, "observation", _BYTES),
+        Field(2, "reset", _SFIXED64),
+        Field(3, "episode", _SFIXED64),
+        Field(4, "step", _SFIXED64),
+        Field(5, "environment", _FIXED32),
+        Field(6, "seed", _FIXED64),
+        Field(7, "seeded", _BOOL),
+    ),
+)
+INFO = MessageType(
+    "Info",
+    (
+        Field(1, "step", _SFIXED64),
+        Field(2, "reset", _BOOL),
+        Field(3, "json", _STRING),
+    ),
+)
+SCALAR = MessageType(
+    "Scalar",
+    (
+        Field(1, "name", _STRING),
+        Field(2, "value", _DOUBLE),
+        Field(3, "phase", _STRING),
+        Field(4, "step", _SFIXED64),
+        Field(5, "episode", _SFIXED64),
+    ),
+)
+ARRAY = MessageType(
+    "Array",
+    (
+        Field(1, "name", _STRING),
+        Field(2, "phase", _STRING),
+        Field(3, "step", _SFIXED64),
+        Field(4, "episode", _SFIXED64),
+        Field(5, "shape", _FIXED32, repeated=True),
+        Field(6, "dtype", _STRING),
+        Field(7, "data", _BYTES),
+    ),
+)
+IMAGE = MessageType(
+    "CompressedImage",
+    (
+        Field(1, "timestamp", Pb.TYPE_MESSAGE),
+        Field(2, "data", _BYTES),
+        Field(3, "format", _STRING),
+        Field(4, "frame_id", _STRING),
+    ),
+    package="foxglove",
+)
+"""Foxglove's own image message, so that viewers show it as a picture."""
+
 LOG_LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
 
 TRAIN_STEP = Topic("/train/step", 1, STEP, "train")
@@ -168,17 +241,69 @@ TOPICS: Final = (
     Q_TABLE_TOPIC,
     LOG_TOPIC,
 )
+"""The topics of a run that the runner itself learned."""
+
+TRAIN_TRANSITION = Topic("/train/step", 9, TRANSITION, "train")
+EVAL_TRANSITION = Topic("/eval/step", 10, TRANSITION, "eval")
+TRAIN_TRANSITION_VARIABLE = Topic("/train/step", 11, TRANSITION, "train")
+EVAL_TRANSITION_VARIABLE = Topic("/eval/step", 12, TRANSITION, "eval")
+TRAIN_RESET = Topic("/train/reset", 13, RESET, "train")
+EVAL_RESET = Topic("/eval/reset", 14, RESET, "eval")
+TRAIN_RESET_VARIABLE = Topic("/train/reset", 15, RESET, "train")
+EVAL_RESET_VARIABLE = Topic("/eval/reset", 16, RESET, "eval")
+TRAIN_INFO = Topic("/train/info", 17, INFO, "train")
+EVAL_INFO = Topic("/eval/info", 18, INFO, "eval")
+SCALAR_TOPIC = Topic("/scalar", 19, SCALAR)
+ARRAY_TOPIC = Topic("/array", 20, ARRAY)
+TRAIN_FRAME = Topic("/train/frame", 21, IMAGE, "train", digested=False)
+EVAL_FRAME = Topic("/eval/frame", 22, IMAGE, "eval", digested=False)
+
+LOOP_TOPICS: Final = {
+    "step": (TRAIN_STEP, EVAL_STEP, TRAIN_RESET, EVAL_RESET),
+    "transition": (TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET),
+    "variable": (
+        TRAIN_TRANSITION_VARIABLE,
+        EVAL_TRANSITION_VARIABLE,
+        TRAIN_RESET_VARIABLE,
+        EVAL_RESET_VARIABLE,
+    ),
+}
+"""What a recording of somebody's own loop has in this place, by the kind of its spaces."""
+_LOOP_ANYWAY: Final = (
+    *(TRAIN_EPISODE, EVAL_EPISODE, TRAIN_INFO, EVAL_INFO),
+    *(SCALAR_TOPIC, ARRAY_TOPIC, TRAIN_FRAME, EVAL_FRAME, LOG_TOPIC),
+)
+KINDS: Final = {
+    "job": TOPICS,
+    **{kind: (*topics, *_LOOP_ANYWAY) for kind, topics in LOOP_TOPICS.items()},
+}
+"""Kind of a recording, as its metadata record `run` says it, to its topics."""
+ALL_TOPICS: Final = tuple(
+    sorted({topic for topics in KINDS.values() for topic in topics}, key=lambda topic: topic.channel)
+)
+MESSAGES: Final = tuple(dict.fromkeys(topic.message for topic in (*TOPICS, *ALL_TOPICS)))
+"""Every message; the id of a schema is its place here, from 1."""
+
 BLOCK_TOPICS: Final = (TRAIN_STEP, EVAL_STEP, TRAIN_EPISODE, EVAL_EPISODE)
-"""Topics whose messages have one size: read and written as blocks."""
+"""Topics of a job whose messages have one size: read and written as blocks."""
+ALL_BLOCK_TOPICS: Final = (
+    *BLOCK_TOPICS,
+    *(TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET),
+)
 
 PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_EPISODE)}
-"""The step and the episode topic of each phase."""
+"""The step and the episode topic of each phase of a job."""
 
-NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode"}
+NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", TRANSITION: "step", RESET: "reset"}
 """The field that numbers the messages of a fixed-width topic, from 0."""
+NEVER: Final = 2**32 - 1
+"""The `t` of a step in which a vector environment only reset one of its environments."""
 
-_WIDTH: dict[int, str] = {_DOUBLE: "<f8", _FIXED32: "<u4", _SFIXED64: "<i8", _BOOL: "?"}
-_WIRE: dict[int, int] = {_DOUBLE: 1, _SFIXED64: 1, _FIXED32: 5, _BOOL: 0, _STRING: 2, _BYTES: 2}
+_WIDTH: dict[int, str] = {_DOUBLE: "<f8", _FIXED32: "<u4", _SFIXED64: "<i8", _FIXED64: "<u8", _BOOL: "?"}
+_WIRE: dict[int, int] = {_DOUBLE: 1, _SFIXED64: 1, _FIXED64: 1, _FIXED32: 5, _BOOL: 0, _STRING: 2, _BYTES: 2}
+
+Sizes = tuple[int | np.dtype[Any], ...]
+"""What is not fixed by the format: the elements of each repeated field, the dtype of each bytes field."""
 
 HEADER: Final = [
     ("opcode", "u1"),
@@ -191,63 +316,100 @@ HEADER: Final = [
 """An MCAP message record up to its data: 31 bytes. `sequence` is not used and is 0."""
 
 HEADER_BYTES: Final = np.dtype(HEADER).itemsize
+MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
+"""The same, for one message: opcode, length, channel, sequence, log time, publish time."""
 
 
 @cache
-def record_dtype(message: MessageType, counts: tuple[int, ...]) -> np.dtype[np.void]:
+def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
     """Return the dtype of a whole MCAP message record of a fixed-width message.
 
     Args:
         message: its fields must all be of fixed width.
-        counts: number of elements of each repeated field, in order.
+        sizes: of each repeated field the number of elements, of each bytes field its dtype, in order.
 
     Fields named `tag…` hold protobuf's constant bytes (see `blank_records`).
     """
-    remaining = iter(counts)
     layout: list[Any] = list(HEADER)
-    for field in message.fields:
-        count = next(remaining) if field.repeated else 1
-        layout.append((f"tag_{field.name}", "u1", (len(_tag(field, count)),)))
-        width = _WIDTH[field.kind]
-        layout.append((field.name, width, (count,)) if field.repeated else (field.name, width))
+    for field, value in zip(message.fields, _values(message, sizes), strict=True):
+        layout.append((f"tag_{field.name}", "u1", (len(_tag(field, value)),)))
+        layout.append((field.name, value))
     return np.dtype(layout)
 
 
-def _tag(field: Field, count: int) -> bytes:
-    """Return the constant bytes before a field's value: tag, and the length if it is packed."""
-    if not field.repeated:
+def _values(message: MessageType, sizes: Sizes) -> list[np.dtype[Any]]:
+    """Return the dtype of each field's value."""
+    remaining = iter(sizes)
+    values = []
+    for field in message.fields:
+        if field.kind == _BYTES:
+            values.append(np.dtype(next(remaining)))  # type: ignore[arg-type]
+        elif field.repeated:
+            values.append(np.dtype((_WIDTH[field.kind], (next(remaining),))))
+        else:
+            values.append(np.dtype(_WIDTH[field.kind]))
+    return values
+
+
+def _tag(field: Field, value: np.dtype[Any]) -> bytes:
+    """Return the constant bytes before a field's value: tag, and its length if it is bytes or packed."""
+    if not field.repeated and field.kind != _BYTES:
         return bytes([field.number << 3 | _WIRE[field.kind]])
-    size = count * np.dtype(_WIDTH[field.kind]).itemsize
-    length = [size] if size < 128 else [size & 0x7F | 0x80, size >> 7]
-    return bytes([field.number << 3 | 2, *length])
+    return bytes([field.number << 3 | 2]) + varint(value.itemsize)
 
 
-def blank_records(topic: Topic, counts: tuple[int, ...], n: int) -> NDArray[np.void]:
+def varint(number: int) -> bytes:
+    """Return a number as protobuf writes lengths: seven bits a byte, the lowest first."""
+    low = []
+    while number >= 128:
+        low.append(number & 0x7F | 0x80)
+        number >>= 7
+    return bytes([*low, number])
+
+
+def blank_records(topic: Topic, sizes: Sizes, n: int) -> NDArray[np.void]:
     """Return n message records of the topic with every constant byte set and every value 0."""
-    dtype = record_dtype(topic.message, counts)
+    dtype = record_dtype(topic.message, sizes)
     one = np.zeros((), dtype=dtype)
     one["opcode"] = 5
     one["record_length"] = dtype.itemsize - 9
     one["channel_id"] = topic.channel
-    remaining = iter(counts)
-    for field in topic.message.fields:
-        count = next(remaining) if field.repeated else 1
-        one[f"tag_{field.name}"] = list(_tag(field, count))
+    for field, value in zip(topic.message.fields, _values(topic.message, sizes), strict=True):
+        one[f"tag_{field.name}"] = list(_tag(field, value))
     return np.full(n, one)
 
 
 def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:
     """Return the whole message record of one message, logged at a time in nanoseconds."""
-    header = np.zeros((), dtype=HEADER)
-    header["opcode"], header["channel_id"] = 5, topic.channel
-    header["record_length"] = HEADER_BYTES - 9 + len(payload)
-    header["log_time"] = header["publish_time"] = log_time
-    return header.tobytes() + payload
+    length = HEADER_BYTES - 9 + len(payload)
+    return MESSAGE_HEAD.pack(5, length, topic.channel, 0, log_time, log_time) + payload
 
 
-def block_counts(topic: Topic, learners: int, events: int) -> tuple[int, ...]:
-    """Return the number of elements of the topic's repeated fields in a run."""
-    return (learners,) if topic.message is STEP else (learners, events)
+def block_counts(
+    topic: Topic,
+    learners: int,
+    events: int,
+    action: np.dtype[Any] | None = None,
+    observation: np.dtype[Any] | None = None,
+) -> Sizes:
+    """Return what `record_dtype` must know of a topic in a run.
+
+    Args:
+        topic: one of `ALL_BLOCK_TOPICS`.
+        learners: number of reward columns.
+        events: number of event counters.
+        action: dtype of an action, for `Transition`.
+        observation: dtype of an observation, for `Transition` and `Reset`.
+    """
+    known: dict[MessageType, tuple[int | np.dtype[Any] | None, ...]] = {
+        STEP: (learners,),
+        EPISODE: (learners, events),
+        TRANSITION: (action, observation, learners),
+        RESET: (observation,),
+    }
+    sizes = known[topic.message]
+    assert None not in sizes, f"{topic.message.name} needs the dtypes of its spaces"
+    return sizes  # type: ignore[return-value]
 
 
 def file_descriptor_set(message: MessageType) -> bytes:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
@@ -36,7 +36,7 @@ from mcap.writer import MCAP0_MAGIC
 from runner import __version__
 from runner.recording.chunks import Chunk
 from runner.recording.contents import Contents
-from runner.recording.schema import PROFILE, TOPICS, Topic, file_descriptor_set
+from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPICS, Topic, file_descriptor_set
 
 LIBRARY = f"dualtaxi {__version__}"
 
@@ -44,21 +44,25 @@ LIBRARY = f"dualtaxi {__version__}"
 class RecordingFile:
     """A recording on its way to disk: append, then `finish`. Not thread-safe."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, topics: Sequence[Topic] = TOPICS) -> None:
         """Create the file; one that exists is never overwritten.
+
+        Args:
+            path: where to.
+            topics: those of its kind, one of `schema.KINDS`.
 
         Raises:
             OSError: it exists, or cannot be created.
         """
-        self._reset(path, path.open("xb", buffering=0))
+        self._reset(path, path.open("xb", buffering=0), topics)
         try:
-            self._append(MCAP0_MAGIC + _bytes_of(Header(PROFILE, LIBRARY)) + schema_and_channel_bytes())
+            self._append(MCAP0_MAGIC + _bytes_of(Header(PROFILE, LIBRARY)) + schema_and_channel_bytes(topics))
         except OSError:
             self._stream.close()
             path.unlink(missing_ok=True)
             raise
 
-    def _reset(self, path: Path, stream: BinaryIO) -> None:
+    def _reset(self, path: Path, stream: BinaryIO, topics: Sequence[Topic]) -> None:
         self.path = path
         self._stream = stream
         self._crc = 0
@@ -66,10 +70,10 @@ class RecordingFile:
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._chunks: list[ChunkIndex] = []
-        self._counts = {topic.channel: 0 for topic in TOPICS}
+        self._counts = {topic.channel: 0 for topic in ALL_TOPICS}
         self._start_time: int | None = None
         self._end_time = 0
-        self._schemas, self._channels = schemas_and_channels()
+        self._schemas, self._channels = schemas_and_channels(topics)
 
     @classmethod
     def reopen(cls, path: Path, contents: Contents) -> RecordingFile:
@@ -83,7 +87,7 @@ class RecordingFile:
             OSError: it cannot be written.
         """
         file = cls.__new__(cls)
-        file._reset(path, path.open("r+b", buffering=0))
+        file._reset(path, path.open("r+b", buffering=0), contents.topics)
         file._stream.truncate(contents.end)
         file._take_over(contents)
         return file
@@ -92,7 +96,7 @@ class RecordingFile:
     def inspect(cls, path: Path, contents: Contents) -> RecordingFile:
         """Open a recording for reading, to ask what its `tail` should be."""
         file = cls.__new__(cls)
-        file._reset(path, path.open("rb", buffering=0))
+        file._reset(path, path.open("rb", buffering=0), contents.topics)
         file._take_over(contents)
         return file
 
@@ -256,12 +260,13 @@ class RecordingFile:
         )
 
 
-def schemas_and_channels() -> tuple[list[Schema], list[Channel]]:
-    """Return the schema and channel records that every recording has; a schema's id counts from 1."""
-    messages = list(dict.fromkeys(topic.message for topic in TOPICS))
+def schemas_and_channels(topics: Sequence[Topic]) -> tuple[list[Schema], list[Channel]]:
+    """Return the schema and channel records of a recording with these topics."""
+    used = {topic.message for topic in topics}
     schemas = [
         Schema(id=number, name=message.full_name, encoding="protobuf", data=file_descriptor_set(message))
-        for number, message in enumerate(messages, start=1)
+        for number, message in enumerate(MESSAGES, start=1)
+        if message in used
     ]
     channels = [
         Channel(
@@ -269,16 +274,16 @@ def schemas_and_channels() -> tuple[list[Schema], list[Channel]]:
             topic=topic.name,
             message_encoding="protobuf",
             metadata={},
-            schema_id=1 + messages.index(topic.message),
+            schema_id=1 + MESSAGES.index(topic.message),
         )
-        for topic in TOPICS
+        for topic in sorted(topics, key=lambda topic: topic.channel)
     ]
     return schemas, channels
 
 
-def schema_and_channel_bytes() -> bytes:
-    """Return the records that stand behind the header of every recording."""
-    schemas, channels = schemas_and_channels()
+def schema_and_channel_bytes(topics: Sequence[Topic]) -> bytes:
+    """Return the records that stand behind the header of a recording with these topics."""
+    schemas, channels = schemas_and_channels(topics)
     return _bytes_of(*schemas, *channels)
 
 

@@ -1,0 +1,162 @@
+"""How values of a space stand in a recording: as raw bytes, laid out as the space's description says.
+
+A description is JSON that anyone can read, kept in the metadata record `run`:
+
+    {"type": "Dict", "spaces": {
+        "position": {"type": "Box", "dtype": "<f4", "shape": [3], "low": -1.0, "high": 1.0},
+        "mission": {"type": "Text", "max_length": 40}}}
+
+The leaves follow one another in its order, without gaps: an array row by row, little-endian, in the
+space's own dtype; a text as its length in bytes (uint32) and UTF-8. Where no leaf is a text, every value
+has one size, and many of them are one NumPy array.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from runner.errors import RecordingError
+from runner.scene import is_text, is_whole
+
+MAX_VALUE_BYTES: Final = 16 << 20
+"""The most that one value of a space of fixed width may take."""
+_MAX_DEPTH: Final = 16
+_MAX_LEAVES: Final = 4096
+NUMBERS: Final = re.compile(r"(?:\|[biu]1|<[iu][248]|<f[248])")
+"""The dtypes that stand in a recording."""
+_ARRAYS: Final = ("Box", "Discrete", "MultiBinary", "MultiDiscrete")
+_LENGTH: Final = struct.Struct("<I")
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A part of a space that has no parts: where it is, and what stands there."""
+
+    path: tuple[str, ...]
+    """Keys of `Dict`s and numbers of `Tuple`s, from the outermost in."""
+    dtype: np.dtype[Any] | None
+    """Of its value, its shape included; None for a text."""
+
+
+def leaves_of(description: Any, where: str) -> list[Leaf]:
+    """Return the leaves of a space in order.
+
+    Raises:
+        RecordingError: this describes no space; `where` is named.
+    """
+    try:
+        leaves = list(_leaves(description, ()))
+        if len(leaves) > _MAX_LEAVES:
+            raise ValueError(f"{len(leaves):,} parts")
+        size = sum(leaf.dtype.itemsize for leaf in leaves if leaf.dtype is not None)
+        if size > MAX_VALUE_BYTES:
+            raise ValueError(f"{size:,} bytes a value, expected {MAX_VALUE_BYTES:,} at most")
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise RecordingError(f"{where}: describes no space that can be recorded ({error}).") from error
+    return leaves
+
+
+def dtype_of(description: Any, where: str) -> np.dtype[Any] | None:
+    """Return the dtype of a space's values, `Dict` and `Tuple` as fields; None if their size varies.
+
+    Raises:
+        RecordingError: this describes no space; `where` is named.
+    """
+    if any(leaf.dtype is None for leaf in leaves_of(description, where)):
+        return None
+    return _dtype(description)
+
+
+def decode(description: Mapping[str, Any], data: bytes, where: str) -> Any:
+    """Return the value that stands in these bytes: dictionaries, tuples, texts and arrays.
+
+    Raises:
+        RecordingError: it is no value of the space; `where` is named.
+    """
+    try:
+        value, end = _value(description, data, 0)
+    except (struct.error, ValueError) as error:
+        raise RecordingError(f"{where}: found no value of its space ({error}).") from error
+    if end != len(data):
+        raise RecordingError(f"{where}: found {len(data)} bytes, expected {end} for a value of its space.")
+    return value
+
+
+def encode_text(text: str) -> bytes:
+    """Return a text as it stands in a recording."""
+    encoded = text.encode("utf-8", "surrogatepass")
+    return _LENGTH.pack(len(encoded)) + encoded
+
+
+def _parts(description: Mapping[str, Any]) -> list[tuple[str, Any]] | None:
+    """Return the parts of a `Dict` or `Tuple` by name; None for a leaf."""
+    kind = description["type"]
+    if kind == "Dict":
+        return list(description["spaces"].items())
+    if kind == "Tuple":
+        return [(str(i), part) for i, part in enumerate(description["spaces"])]
+    return None
+
+
+def _leaves(description: Any, path: tuple[str, ...]) -> Iterator[Leaf]:
+    if not isinstance(description, Mapping) or len(path) > _MAX_DEPTH:
+        raise ValueError("found no object that describes a space, or too many inside one another")
+    parts = _parts(description)
+    if parts is None:
+        yield Leaf(path, _leaf_dtype(description))
+        return
+    for name, part in parts:
+        if not is_text(name) or not name:
+            raise ValueError(f"a part is called {name!r}")
+        yield from _leaves(part, (*path, name))
+
+
+def _leaf_dtype(description: Mapping[str, Any]) -> np.dtype[Any] | None:
+    kind = description["type"]
+    if kind == "Text":
+        return None
+    dtype, shape = description["dtype"], description["shape"]
+    if kind not in _ARRAYS or not isinstance(dtype, str) or not NUMBERS.fullmatch(dtype):
+        raise ValueError(f"{kind} of {dtype}")
+    if not isinstance(shape, list) or not all(is_whole(n, 0, MAX_VALUE_BYTES) for n in shape):
+        raise ValueError(f"shape {shape}")
+    if len(shape) > 32 or math.prod(shape) > MAX_VALUE_BYTES:
+        raise ValueError(f"shape {shape}")
+    return np.dtype((dtype, tuple(shape)))
+
+
+def _dtype(description: Mapping[str, Any]) -> np.dtype[Any]:
+    parts = _parts(description)
+    if parts is None:
+        leaf = _leaf_dtype(description)
+        assert leaf is not None
+        return leaf
+    return np.dtype([(name, _dtype(part)) for name, part in parts])
+
+
+def _value(description: Mapping[str, Any], data: bytes, at: int) -> tuple[Any, int]:
+    """Return the value at an offset, and the offset behind it."""
+    parts = _parts(description)
+    if parts is not None:
+        values = {}
+        for name, part in parts:
+            values[name], at = _value(part, data, at)
+        return (values if description["type"] == "Dict" else tuple(values.values())), at
+    dtype = _leaf_dtype(description)
+    if dtype is None:
+        (length,) = _LENGTH.unpack_from(data, at)
+        start, at = at + _LENGTH.size, at + _LENGTH.size + length
+        if at > len(data):
+            raise ValueError(f"a text of {length:,} bytes in {len(data):,}")
+        return data[start:at].decode("utf-8", "surrogatepass"), at
+    if at + dtype.itemsize > len(data):
+        raise ValueError(f"{len(data):,} bytes, too few")
+    flat = np.frombuffer(data, dtype.base, math.prod(dtype.shape), at)
+    return (flat.reshape(dtype.shape) if dtype.shape else flat[0]), at + dtype.itemsize

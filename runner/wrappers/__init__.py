@@ -1,0 +1,1 @@
+"""Recording any training loop over any environment: wrappers that watch, and change nothing."""

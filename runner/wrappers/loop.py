@@ -1,0 +1,403 @@
+"""The recording of somebody's own loop: its folder, its file, and whoever writes into it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from blake3 import blake3
+
+from runner.errors import ConfigError, RunnerError, StorageError
+from runner.mdp import Mdp
+from runner.provenance import provenance
+from runner.recording import schema
+from runner.recording.arrays import pack_array
+from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
+from runner.recording.digest import combine
+from runner.recording.facts import sizes_of
+from runner.recording.messages import encode, encode_log
+from runner.recording.recorder import FLUSH_SECONDS, Recorder, storage_error
+from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.writer import RecordingFile
+from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder
+from runner.wrappers.described import Described, as_json
+from runner.wrappers.rows import Rows
+
+MADE_BY: Final = "runner.record"
+MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
+PHASES: Final = ("train", "eval")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a loop is recorded, as its user asked."""
+
+    recordings: str | os.PathLike[str] | None = None
+    name: str | None = None
+    seed: int = 0
+    config: Mapping[str, Any] = field(default_factory=dict)
+    info: tuple[str, ...] = ()
+    frames_every: int = 0
+    frame_format: str = "png"
+    compression: str = "zstd"
+    level: int = 3
+    index: str = "message"
+    chunk_steps: int = 16_384
+
+    def mapping(self, described: Described) -> dict[str, Any]:
+        """Return the configuration that the recording carries.
+
+        Raises:
+            ConfigError: it cannot be used.
+        """
+        self._check()
+        return {
+            "name": self.name or described.env_id.rpartition("/")[2].rpartition(":")[2],
+            "made_by": MADE_BY,
+            "env": {"id": described.env_id, "kwargs": described.kwargs},
+            "seeds": [self.seed],
+            "config": as_json(dict(self.config)),
+            "info": list(self.info),
+            "frames": {"every": self.frames_every, "format": self.frame_format},
+            "recording": {
+                "compression": self.compression,
+                "level": self.level,
+                "index": self.index,
+                "chunk_steps": self.chunk_steps,
+                "steps": "all",
+            },
+        }
+
+    def _check(self) -> None:
+        expectations = (
+            ("seed", "a whole number from 0", _is_whole(self.seed, 0, 2**64 - 1)),
+            ("config", "a mapping", isinstance(self.config, Mapping)),
+            ("info", "names of fields", all(isinstance(name, str) for name in self.info)),
+            ("frames_every", "a whole number from 0", _is_whole(self.frames_every, 0, 2**31)),
+            ("frame_format", "png or jpeg", self.frame_format in ("png", "jpeg")),
+            ("compression", "zstd, lz4 or none", self.compression in ("zstd", "lz4", "none")),
+            ("level", "1 to 19", _is_whole(self.level, 1, 19)),
+            ("index", "message or chunk", self.index in ("message", "chunk")),
+            ("chunk_steps", "256 to 65,536", _is_whole(self.chunk_steps, 256, 65_536)),
+        )
+        for key, expected, holds in expectations:
+            if not holds:
+                raise ConfigError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
+
+
+class Loop:
+    """A loop that is being recorded; safe to use from several threads.
+
+    Args:
+        described: the environment and its spaces.
+        plan: how to record it.
+        rows: makes what puts down the steps of a phase, from recorder and phase.
+
+    Raises:
+        ConfigError: the plan cannot be used.
+        StorageError: the recordings folder cannot be written.
+    """
+
+    def __init__(self, described: Described, plan: Plan, rows: Callable[[Recorder, str], Rows]) -> None:
+        from runner.api import checked_name
+
+        config = plan.mapping(described)
+        checked_name(plan.name)
+        self._started = time.monotonic()
+        self._make_rows = rows
+        self._rows: dict[str, Rows] = {}
+        self._active: Rows | None = None
+        self.described = described
+        self.plan = plan
+        self.lock = threading.RLock()
+        self.run = new_run(recordings_folder(plan.recordings), config, plan.seed, config["name"])
+        self._topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
+        path = self.run.folder / RECORDING_FILE
+        try:
+            self._file = RecordingFile(path, schema.KINDS[described.kind])
+        except OSError as error:
+            raise StorageError(f"{path}: cannot be created ({error.strerror}).") from error
+        facts = self._describe(config)
+        self._recorder = Recorder(
+            self._file,
+            learners=len(described.agents),
+            events=int(facts["events"]),
+            packing=Packing(plan.compression, plan.level, plan.index),
+            chunk_steps=plan.chunk_steps,
+            beat=self.run.beat,
+            sizes=sizes_of(facts, str(path)),
+        )
+        self.closed = False
+        self._stop = threading.Event()
+        self._flusher = threading.Thread(target=self._keep_flushing, name="recording-flush", daemon=True)
+        self._flusher.start()
+
+    def _describe(self, config: Mapping[str, Any]) -> dict[str, str]:
+        """Write what makes the recording self-contained; return what is said of the run."""
+        described, mdp = self.described, self.described.mdp
+        identity = {key: value for key, value in config.items() if key not in ("name", "seeds", "recording")}
+        job = json.dumps(identity | {"seed": self.plan.seed}, sort_keys=True)
+        facts = {
+            "format_version": str(schema.FORMAT_VERSION),
+            "run_id": self.run.run_id,
+            "name": self.run.name,
+            "seed": str(self.plan.seed),
+            "job": blake3(job.encode()).hexdigest()[:32],
+            "created": self.run.facts["created"],
+            "agents": json.dumps(described.agents),
+            "learners": str(len(described.agents)),
+            "events": str(len(mdp.event_names) if mdp else 0),
+            "kind": described.kind,
+            "spaces": json.dumps(described.spaces()),
+            "environments": str(described.environments),
+        }
+        try:
+            self._file.add_metadata("run", facts)
+            self._file.add_metadata("config", {"json": json.dumps(config, sort_keys=True)})
+            self._file.add_metadata("provenance", provenance())
+            _write_environment(self._file, described, mdp)
+        except OSError as error:
+            raise storage_error(self._file, error) from error
+        return facts
+
+    # --- what is recorded -----------------------------------------------------------------------------
+
+    def rows(self, phase: str) -> Rows:
+        """Return what puts down the steps of a phase.
+
+        Raises:
+            ConfigError: there is no such phase.
+        """
+        if phase not in PHASES:
+            raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(PHASES)}")
+        if phase not in self._rows:
+            with self.lock:
+                self._rows[phase] = self._make_rows(self._recorder, phase)
+        return self._rows[phase]
+
+    def activate(self, rows: Rows) -> None:
+        """Say whose steps come now; times go on in the order in which steps are taken. Holds the lock."""
+        if self.closed:
+            raise RunnerError(
+                f"run {self.run.run_id} is closed: steps can no longer be recorded in it. "
+                "Wrap the environment anew to go on."
+            )
+        if self._active is not None and self._active is not rows:
+            self._active.commit()
+            self._active.open()
+        self._active = rows
+
+    @property
+    def active(self) -> Rows | None:
+        """Whose steps came last."""
+        return self._active
+
+    @property
+    def position(self) -> int:
+        """The number of steps executed so far."""
+        return sum(self._recorder.steps.values()) + (self._active.filled if self._active else 0)
+
+    def log(self, phase: str, name: str, value: Any) -> None:
+        """Record a number or a text under a name, at this moment.
+
+        Raises:
+            ConfigError: it is neither, or the name is none.
+        """
+        if not isinstance(name, str) or not name:
+            raise ConfigError(f"log: found the name {name!r}, expected text")
+        with self.lock:
+            position = self._moment()
+            if isinstance(value, str):
+                payload = encode_log(value, position * STEP_NANOSECONDS / 1e9, name=name)
+                self._recorder.append(self._topics["/log"], payload, position)
+                return
+            try:
+                number = float(value)
+            except (TypeError, ValueError) as error:
+                raise ConfigError(
+                    f"log: found {type(value).__name__} for {name!r}, expected a number or text; "
+                    "an array is recorded by snapshot()."
+                ) from error
+            step, episode = self.rows(phase).place
+            fields = {"name": name, "value": number, "phase": phase, "step": step, "episode": episode}
+            self._recorder.append(self._topics["/scalar"], encode(schema.SCALAR, fields), position)
+
+    def snapshot(self, phase: str, name: str, array: Any) -> None:
+        """Record an array of numbers as it is now.
+
+        Raises:
+            ConfigError: it holds something else, or is too large.
+        """
+        values = np.ascontiguousarray(array)
+        if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8 or not isinstance(name, str):
+            raise ConfigError(
+                f"snapshot: found {values.dtype} for {name!r}, expected an array of numbers and a name."
+            )
+        if values.nbytes > MAX_ARRAY_BYTES:
+            raise ConfigError(
+                f"snapshot: found {values.nbytes:,} bytes for {name!r}, expected at most "
+                f"{MAX_ARRAY_BYTES:,}; record it in parts."
+            )
+        values = values.astype(values.dtype.newbyteorder("<"), copy=False)
+        with self.lock:
+            position = self._moment()
+            step, episode = self.rows(phase).place
+            fields = {"name": name, "phase": phase, "step": step, "episode": episode}
+            fields |= {"shape": list(values.shape), "dtype": values.dtype.str, "data": values.tobytes()}
+            self._recorder.append(self._topics["/array"], encode(schema.ARRAY, fields), position)
+
+    def info(
+        self,
+        phase: str,
+        info: Mapping[str, Any],
+        reset: bool = False,
+        beside: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Record the chosen fields of an info, those that it has, of the step or reset just put down."""
+        chosen = {key: as_json(info[key]) for key in self.plan.info if key in info}
+        if not chosen and not beside:
+            return
+        said = {"info": chosen} | ({"reset": as_json(beside)} if beside else {})
+        with self.lock:
+            step, _ = self.rows(phase).place
+            fields = {"step": step if reset else step - 1, "reset": reset, "json": json.dumps(said)}
+            topic = self._topics[f"/{phase}/info"]
+            self._recorder.append(topic, encode(schema.INFO, fields), self._moment())
+
+    def reset_info(
+        self, phase: str, info: Mapping[str, Any], options: Mapping[str, Any] | None, seed: Any
+    ) -> None:
+        """Record the chosen fields of a reset's info; its options, and a seed too large for `Reset`."""
+        beside = {"options": options} if options else {}
+        if isinstance(seed, int) and seed >= 2**64:
+            beside["seed"] = {"value": str(seed)}
+        if beside or self.plan.info:
+            self.info(phase, info, reset=True, beside=beside)
+
+    def frame(self, phase: str, image: Any) -> None:
+        """Record a picture, [height, width, 3] of uint8; it is encoded by another thread."""
+        from runner.wrappers.frames import image_bytes
+
+        pixels = np.array(image, dtype=np.uint8)
+        if pixels.ndim != 3 or pixels.shape[2] != 3:
+            raise ConfigError(f"frames: found a picture of shape {pixels.shape}, expected [height, width, 3]")
+        kind = self.plan.frame_format
+        with self.lock:
+            position = self._moment()
+            seconds, tenths = divmod(position, 10)
+            fields = {"timestamp": {"seconds": seconds, "nanos": tenths * STEP_NANOSECONDS}, "format": kind}
+
+            def make() -> bytes:
+                return encode(schema.IMAGE, fields | {"data": image_bytes(pixels, kind), "frame_id": phase})
+
+            self._recorder.submit(self._topics[f"/{phase}/frame"], make, position)
+
+    def _moment(self) -> int:
+        """Return the number of steps executed so far, of a loop that is not closed."""
+        if self.closed:
+            raise RunnerError(f"run {self.run.run_id} is closed: nothing more can be recorded in it.")
+        return self.position
+
+    # --- the end --------------------------------------------------------------------------------------
+
+    def close(self, status: str = "finished", error: str = "") -> Run:
+        """Write everything, and say how it ended; return the run as it then is. The second time, only that.
+
+        Raises:
+            StorageError: the disk is full or failing; what was written is kept.
+        """
+        self._stop.set()
+        with self.lock:
+            if self.closed:
+                return self.run
+            try:
+                summary = self._finish(status, error)
+            except BaseException as failure:
+                self._recorder.abandon()
+                with contextlib.suppress(OSError):
+                    self._file.finish("result", _result("failed", {"error": str(failure)}))
+                with contextlib.suppress(StorageError):
+                    self.run = self.run.update(status="failed", summary={"error": str(failure)})
+                raise
+            finally:
+                self.closed = True
+                self._file.close()
+            self.run = self.run.update(status=status, summary=summary)
+        return self.run
+
+    def _finish(self, status: str, error: str) -> dict[str, Any]:
+        for rows in self._rows.values():
+            rows.commit()
+        topics = self._recorder.drain()
+        counts = self._recorder.counts
+        result = {
+            "content_digest": combine(topics),
+            "topic_digests": topics,
+            "episodes": counts["/train/episode"],
+            "train_steps": self._recorder.steps["train"],
+            "eval_steps": self._recorder.steps["eval"],
+            "messages": {name: count for name, count in counts.items() if count},
+            "steps_recorded": True,
+            "last_evaluation": None,
+        } | ({"error": error} if error else {})
+        try:
+            self._file.finish("result", _result(status, result))
+        except OSError as failure:
+            raise storage_error(self._file, failure) from failure
+        seconds = round(time.monotonic() - self._started, 3)
+        return result | {"seconds": seconds, "bytes": self._file.size}
+
+    def _keep_flushing(self) -> None:
+        """Put on its way what is half a second old, also while the loop does something else."""
+        while not self._stop.wait(FLUSH_SECONDS):
+            with self.lock:
+                if self.closed:
+                    return
+                try:
+                    self._flush()
+                except BaseException:  # the loop's own thread meets it again, with its next step
+                    return
+
+    def _flush(self) -> None:
+        for rows in self._rows.values():
+            rows.commit()
+        self._recorder.flush()
+        for rows in self._rows.values():
+            rows.open()
+
+
+def _write_environment(file: RecordingFile, described: Described, mdp: Mdp | None) -> None:
+    """Attach what is said of the environment, and its arrays if it is tabular."""
+    said = {
+        "env_id": described.env_id,
+        "kwargs": described.kwargs,
+        "step_limit": described.step_limit,
+        "agents": list(described.agents),
+        "action_counts": [],
+        "event_names": [],
+        "success_events": [],
+        "penalty_below": None,
+        "scene": None,
+    }
+    arrays = {}
+    if mdp is not None:
+        said, arrays = mdp.description(), mdp.arrays()
+    description = json.dumps(said | {"arrays": sorted(arrays)}, indent=1)
+    file.add_attachment("environment.json", "application/json", description.encode())
+    for name, array in sorted(arrays.items()):
+        file.add_attachment(f"environment/{name}.npy.zst", "application/zstd", pack_array(array))
+
+
+def _result(status: str, result: Mapping[str, Any]) -> dict[str, str]:
+    return {"json": json.dumps({"status": status, **result}, sort_keys=True)}
+
+
+def _is_whole(value: Any, low: int, high: int) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high

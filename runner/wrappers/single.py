@@ -1,0 +1,254 @@
+"""`runner.record`: any loop over one Gymnasium environment."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Literal, Self
+
+import gymnasium
+
+from runner.errors import ConfigError
+from runner.runs import Run
+from runner.wrappers.described import describe
+from runner.wrappers.loop import Loop, Plan
+from runner.wrappers.rows import ROWS
+
+
+class Recorded:
+    """What every recorded environment offers beside the environment; a context manager."""
+
+    _loop: Loop
+    _phase: str
+
+    @property
+    def run(self) -> Run:
+        """The run that is recorded, in its folder; its `summary` is there once it is closed."""
+        return self._loop.run
+
+    def log(self, name: str, value: Any) -> None:
+        """Record a number or a text under a name: `rec.log("loss", loss)`.
+
+        Raises:
+            ConfigError: it is neither.
+        """
+        self._loop.log(self._phase, name, value)
+
+    def snapshot(self, name: str, array: Any) -> None:
+        """Record an array of numbers as it is now: `rec.snapshot("q", q)`.
+
+        Raises:
+            ConfigError: it holds something else, or is larger than 64 MB.
+        """
+        self._loop.snapshot(self._phase, name, array)
+
+    @contextlib.contextmanager
+    def phase(self, name: str) -> Iterator[Self]:
+        """Record what happens inside as of this phase, `train` or `eval`: `with rec.phase("eval"):`.
+
+        Each phase has episodes of its own, so begin and end it with `reset()`.
+
+        Raises:
+            ConfigError: there is no such phase.
+        """
+        before = self._phase
+        self._enter(name)
+        try:
+            yield self
+        finally:
+            self._enter(before)
+
+    def _enter(self, phase: str) -> None:
+        self._loop.rows(phase)
+        self._phase = phase
+
+    def _own(self, loop: Loop) -> None:
+        """Begin a recording; should it never be closed, it is when the process ends."""
+        self._loop = loop
+        weakref.finalize(self, loop.close, "interrupted")
+
+    def _leave(self, error: BaseException | None) -> None:
+        """Close the recording with how the loop ended."""
+        if error is None:
+            self._loop.close()
+        elif isinstance(error, KeyboardInterrupt):
+            self._loop.close("interrupted")
+        else:
+            self._loop.close("failed", f"{type(error).__name__}: {error}")
+
+
+class RecordedEnv(Recorded, gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A Gymnasium environment whose every reset and step is recorded; made by `record`."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], loop: Loop, phase: str = "train") -> None:
+        gymnasium.Wrapper.__init__(self, env)
+        self._env_step = env.step
+        self._lock = loop.lock
+        self._watched = bool(loop.plan.info or loop.plan.frames_every)
+        self._until_frame = 0
+        self._loop = loop
+        self._enter(phase)
+
+    def _enter(self, phase: str) -> None:
+        self._phase = phase
+        self._rows = self._loop.rows(phase)
+        self._take = self._rows.take
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step, and record it."""
+        result = self._env_step(action)
+        observation, reward, terminated, truncated, info = result
+        with self._lock:
+            if self._loop.active is not self._rows or self._loop.closed:
+                self._loop.activate(self._rows)
+            self._take(action, observation, reward, terminated, truncated)
+        if self._watched:
+            self._watch(info, terminated or truncated)
+        return result
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment, and record it: the seed, the options, the observation."""
+        asked = dict(options) if options else None
+        result = self.env.reset(seed=seed, options=options)
+        observation, info = result
+        with self._lock:
+            self._loop.activate(self._rows)
+            self._rows.reset(observation, seed)
+        self._loop.reset_info(self._phase, info, asked, seed)
+        if self._loop.plan.frames_every:
+            self._until_frame = self._loop.plan.frames_every
+            self._loop.frame(self._phase, self.env.render())
+        return result
+
+    def close(self) -> None:
+        """Close the environment and the recording, as finished."""
+        try:
+            self.env.close()
+        finally:
+            self._loop.close()
+
+    def __exit__(self, *raised: Any) -> Literal[False]:
+        try:
+            self.env.close()
+        finally:
+            self._leave(raised[1])
+        return False
+
+    def _watch(self, info: Mapping[str, Any], over: bool) -> None:
+        """Record what else is asked for of the step that was just put down."""
+        if self._loop.plan.info:
+            self._loop.info(self._phase, info)
+        if self._loop.plan.frames_every:
+            self._until_frame -= 1
+            if over or self._until_frame <= 0:
+                self._until_frame = self._loop.plan.frames_every
+                self._loop.frame(self._phase, self.env.render())
+
+
+def record(
+    env: gymnasium.Env[Any, Any],
+    recordings: str | os.PathLike[str] | None = None,
+    *,
+    name: str | None = None,
+    seed: int = 0,
+    config: Mapping[str, Any] | None = None,
+    info: Sequence[str] = (),
+    frames_every: int = 0,
+    frame_format: str = "png",
+    into: Recorded | None = None,
+    phase: str = "train",
+    **packing: Any,
+) -> RecordedEnv:
+    """Return the environment, recording whatever any loop does with it.
+
+        with runner.record(gymnasium.make("CartPole-v1"), name="mine", config={"lr": 3e-4}) as env:
+            observation, info = env.reset(seed=0)
+            ...
+            env.log("loss", loss)
+
+    The environment behaves as before: what goes in and comes out is not touched, nor is its randomness.
+    Each reset and step is recorded; closing the environment, or leaving the `with`, closes the recording.
+
+    Args:
+        env: a Gymnasium environment, wrapped or not; recorded is what passes here.
+        recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, unless given.
+        name: what the run is called; the environment's name unless given.
+        seed: what the run is listed with; the seeds of resets are recorded beside.
+        config: your own settings, to be shown, compared and searched by: what JSON can hold.
+        info: fields of `info` to record, of steps and resets; one that is missing now and then is no error.
+        frames_every: render a frame at each reset, every so many steps and at the end of each episode; the
+            environment must be made with render_mode="rgb_array".
+        frame_format: `png`, exact, or `jpeg`.
+        into: another recorded environment of the same spaces, to record into the same run.
+        phase: `train`, or `eval`; of the environment recorded `into` another, the other one.
+        packing: `compression`, `level`, `index`, `chunk_steps`, as the configuration's `recording` has them.
+
+    Raises:
+        EnvironmentNotUsable: a space cannot be recorded: Graph, Sequence, OneOf, or one of your own.
+        ConfigError: an argument cannot be used.
+        StorageError: the recordings folder cannot be written.
+    """
+    if into is not None:
+        return _beside(env, into, phase)
+    described = describe(env, env.observation_space, env.action_space)
+    plan = _plan(recordings, name, seed, config, info, frames_every, frame_format, packing)
+    if frames_every and env.render_mode != "rgb_array":
+        raise ConfigError(
+            f"frames_every: found an environment with render_mode={env.render_mode!r}, expected "
+            "'rgb_array': make it with render_mode=\"rgb_array\"."
+        )
+    loop = Loop(described, plan, lambda recorder, part: ROWS[described.kind](recorder, described, part))
+    recorded = RecordedEnv(env, loop, phase)
+    recorded._own(loop)
+    return recorded
+
+
+def _beside(env: gymnasium.Env[Any, Any], into: Recorded, phase: str) -> RecordedEnv:
+    """Return an environment recorded into the run of another one."""
+    loop = into._loop
+    spaces = loop.described.observation, loop.described.action
+    if (env.observation_space, env.action_space) != spaces:
+        raise ConfigError("into: found an environment of other spaces than the run's, expected the same")
+    if phase == into._phase:
+        raise ConfigError(f"phase: found {phase!r} for both environments of a run, expected one each")
+    return RecordedEnv(env, loop, phase)
+
+
+def _plan(
+    recordings: str | os.PathLike[str] | None,
+    name: str | None,
+    seed: int,
+    config: Mapping[str, Any] | None,
+    info: Sequence[str],
+    frames_every: int,
+    frame_format: str,
+    packing: Mapping[str, Any],
+) -> Plan:
+    """Return what a user asked for.
+
+    Raises:
+        ConfigError: there is no such argument, or Pillow is missing for frames.
+    """
+    known = ("compression", "level", "index", "chunk_steps")
+    if unknown := set(packing) - set(known):
+        raise ConfigError(f"found the argument {sorted(unknown)[0]!r}, expected one of {', '.join(known)}")
+    if isinstance(info, str):
+        raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
+    if frames_every:
+        from runner.wrappers.frames import pillow
+
+        pillow()
+    return Plan(
+        recordings=recordings,
+        name=name,
+        seed=seed,
+        config=config or {},
+        info=tuple(info),
+        frames_every=frames_every,
+        frame_format=frame_format,
+        **packing,
+    )

@@ -1,0 +1,99 @@
+"""Loops and environments that the wrapper's tests share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+import runner
+from runner.recording.reader import Recording, open_recording
+
+KWARGS = {"FrozenLake-v1": {"is_slippery": True}}
+
+
+class Rooms(gymnasium.Env[Any, Any]):
+    """Values of every kind of space; a goal at random, an info that comes and goes."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium has it
+    render_mode = "rgb_array"
+
+    def __init__(self, with_text: bool = False) -> None:
+        inside: dict[str, spaces.Space[Any]] = {
+            "position": spaces.Box(-1, 1, (2,), np.float32),
+            "doors": spaces.MultiBinary(3),
+            "room": spaces.Tuple((spaces.Discrete(5, start=-2), spaces.MultiDiscrete([2, 3]))),
+        }
+        if with_text:
+            inside["mission"] = spaces.Text(30)
+        self.observation_space = spaces.Dict(inside)
+        self.action_space = spaces.Dict(
+            {"go": spaces.Discrete(4), "push": spaces.Box(0, 1, (1,), np.float64)}
+        )
+        self._t = 0
+
+    def _observation(self) -> Any:
+        seed = int(self.np_random.integers(2**31))
+        self.observation_space.seed(seed)
+        return self.observation_space.sample()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self._t = 0
+        return self._observation(), {"first": True}
+
+    def step(self, action: Any) -> Any:
+        self._t += 1
+        over = bool(self.np_random.random() < 0.1)
+        info = {"luck": np.float32(0.5), "way": [1, 2]} if self._t % 2 else {}
+        return self._observation(), float(action["go"]), over, self._t >= 25, info
+
+    def render(self) -> Any:
+        return np.full((16, 24, 3), self._t, np.uint8)
+
+
+def make(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
+    if name.startswith("Rooms"):
+        return Rooms(with_text=name.endswith("Text"))
+    return gymnasium.make(name, **KWARGS.get(name, {}), **kwargs)
+
+
+NAMES = (
+    "Taxi-v4",
+    "FrozenLake-v1",
+    "CliffWalking-v1",
+    "Blackjack-v1",
+    "CartPole-v1",
+    "Rooms",
+    "RoomsText",
+)
+
+
+def play(env: gymnasium.Env[Any, Any], steps: int, seed: int = 5) -> Iterator[tuple[Any, ...]]:
+    """Play at random; yield ("reset", seed, observation) and ("step", action, ...) as they come."""
+    actions = env.action_space
+    actions.seed(seed)
+    yield "reset", seed, env.reset(seed=seed)[0]
+    over = False
+    for _ in range(steps):
+        if over:
+            yield "reset", None, env.reset()[0]
+        action = actions.sample()
+        observation, reward, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+        yield "step", action, observation, reward, terminated, truncated, info
+
+
+def recorded(folder: Path, name: str, steps: int, **options: Any) -> tuple[Path, list[tuple[Any, ...]]]:
+    """Return the recording of a loop, and what the loop saw."""
+    with runner.record(make(name), folder, **options) as env:
+        seen = list(play(env, steps))
+    return env.run.recording, seen
+
+
+def opened(path: Path) -> Recording:
+    return open_recording(path)
