@@ -1,8 +1,9 @@
-"""Sections of sentences and tables, printed as text or as Markdown."""
+"""What comparing commands share: sections printed as text or as Markdown, and whether a page can be made."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -22,6 +23,15 @@ def print_sections(made: Sequence[Section], as_markdown: bool) -> None:
         return
     for section in made:
         _draw(section)
+
+
+def require_page(path: Path, force: bool) -> None:
+    """Refuse to begin where the page could not be made in the end."""
+    from runner.export.report import require_packages
+    from runner.export.report_runs import require_new
+
+    require_packages()
+    require_new(path, force)
 
 
 def _draw(section: Section) -> None:

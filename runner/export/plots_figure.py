@@ -29,7 +29,7 @@ SUFFIXES: Final = (".png", ".svg", ".pdf")
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
-_DASHES: Final = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
+DASHES: Final = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
 _BAND_OPACITY: Final = 0.2
 INK: Final = "#1b1f24"
 STYLE: Final = {
@@ -181,7 +181,7 @@ def _draw_curve(axes: Axes, panel: Panel, curve: Curve, groups: int) -> None:
         curve.episodes,
         curve.median,
         color=colour,
-        linestyle=_DASHES[line % len(_DASHES)],
+        linestyle=DASHES[line % len(DASHES)],
         marker=marker,
         markersize=3.2,
         markevery=max(len(curve.episodes) // 8, 1),
@@ -270,7 +270,7 @@ def _legend(axes: Axes, panel: Panel, groups: int) -> None:
             [],
             [],
             color=COLOURS[number % len(COLOURS)] if groups == 1 else INK,
-            linestyle=_DASHES[number % len(_DASHES)],
+            linestyle=DASHES[number % len(DASHES)],
             marker=MARKERS[number % len(MARKERS)] if groups == 1 else "",
             markersize=3.2,
             label=line.replace("_", " ") or "all",

@@ -34,10 +34,7 @@ def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
     Raises:
         RunnerError: there is one already and `force` is not given, or it cannot be written.
     """
-    if path.is_dir():
-        raise RunnerError(f"{path}: found a folder, expected a file to write.")
-    if path.exists() and not force:
-        raise RunnerError(f"{path}: exists already; --force replaces it, or choose another by -o.")
+    require_new(path, force)
     fresh = path.with_name(f".{secrets.token_hex(4)}.{path.name}")
     try:
         write(fresh)
@@ -47,6 +44,18 @@ def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
     finally:
         if os.path.lexists(fresh):
             fresh.unlink()
+
+
+def require_new(path: Path, force: bool) -> None:
+    """Refuse a path at which no file may be written.
+
+    Raises:
+        RunnerError: it is a folder, or there is a file already and `force` is not given.
+    """
+    if path.is_dir():
+        raise RunnerError(f"{path}: found a folder, expected a file to write.")
+    if path.exists() and not force:
+        raise RunnerError(f"{path}: exists already; --force replaces it, or choose another name.")
 
 
 def write_text_new(path: Path, force: bool, text: str) -> None:

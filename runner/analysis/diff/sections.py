@@ -66,6 +66,8 @@ def in_short(difference: RunDiff) -> str:
         said.append(f"Training is the same for {parting.step:,} steps.")
     elif parting is not None:
         said.append("Training differs from the first step on.")
+    elif difference.overlap is not None:
+        said.append("Training took the same steps.")
     return " ".join(said)
 
 
@@ -119,13 +121,24 @@ def _trajectory(difference: RunDiff) -> Section:
 def _evaluations(difference: RunDiff) -> Section:
     sentences, grids = [], []
     for parting, cause in difference.evaluations:
-        sentences += _told(parting, cause)
+        sentences += [
+            f"They part {where_in_words(parting)}: {cause.text}.",
+            *evaluation_told(difference, cause),
+        ]
         grids += _q_rows(cause)
     return Section("Evaluation", sentences, grids)
 
 
 def _told(parting: Parting, cause: Cause) -> list[str]:
     return [f"They part {where_in_words(parting)}: {cause.text}.", *updates_in_words(cause)]
+
+
+def evaluation_told(difference: RunDiff, cause: Cause) -> list[str]:
+    """Return how the tables came to differ that an evaluation used, in a sentence or two."""
+    known = difference.cause
+    if known is not None and known.update is not None and known.update == cause.update:
+        return ["The tables came to differ by the same update as above."]
+    return updates_in_words(cause)
 
 
 def where_in_words(parting: Parting) -> str:

@@ -53,6 +53,16 @@ def table_diffs(a: Recording, b: Recording, visits: NDArray[np.int64] | None) ->
         b: another, whose tables have the same shape.
         visits: how often each state was acted in, [S], both runs together.
     """
+    for left, right in common_snapshots(a, b):
+        yield _table_diff(a.mdp, left, right, visits)
+
+
+def common_snapshots(a: Recording, b: Recording) -> Iterator[tuple[QTable, QTable]]:
+    """Yield the tables, of one shape, that both runs have after as many episodes.
+
+    Raises:
+        RecordingError: one is not of the shape that its environment has.
+    """
     theirs = b.snapshots()
     right = next(theirs, None)
     for left in a.snapshots():
@@ -60,7 +70,7 @@ def table_diffs(a: Recording, b: Recording, visits: NDArray[np.int64] | None) ->
             right = next(theirs, None)
         if right is not None and _moment(right) == _moment(left) and right.values.shape == left.values.shape:
             _check_shape(a, left)
-            yield _table_diff(a.mdp, left, right, visits)
+            yield left, right
 
 
 def _moment(table: QTable) -> tuple[int, int]:

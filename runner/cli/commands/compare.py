@@ -10,7 +10,7 @@ import click
 
 from runner.cli.options import RunName, json_option, recordings_option
 from runner.cli.output import print_json, say
-from runner.cli.sections import print_sections
+from runner.cli.sections import print_sections, require_page
 from runner.errors import RunnerError
 
 if TYPE_CHECKING:
@@ -82,6 +82,8 @@ def command(
     from runner.analysis.compare.statistics import require_scipy
 
     require_scipy()
+    if html is not None:
+        require_page(html, force)
     moment, chosen = _moment(at, target, chosen)
     groups, notes = grouped(_read(run_names, recordings), by)
     if len(groups) < 2:

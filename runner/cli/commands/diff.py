@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli.options import RunName, find, json_option, recordings_option
-from runner.cli.output import print_json
-from runner.cli.sections import print_sections
+from runner.cli.output import print_json, size
+from runner.cli.sections import print_sections, require_page
 from runner.errors import RunnerError
 
 if TYPE_CHECKING:
     from runner.analysis.diff import Change, RunDiff
+    from runner.recording.reader import Recording
 
 
 @click.command("diff")
@@ -24,6 +25,10 @@ if TYPE_CHECKING:
 @recordings_option
 @json_option
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for a note or an issue.")
+@click.option(
+    "--html", type=click.Path(path_type=Path), metavar="FILE", help="Write a page with pictures instead."
+)
+@click.option("--force", is_flag=True, help="Replace the page if it exists.")
 @click.option(
     "--ignore", multiple=True, metavar="GLOB", help="Leave out settings and provenance whose path fits."
 )
@@ -40,6 +45,8 @@ def command(
     recordings: Path | None,
     as_json: bool,
     as_markdown: bool,
+    html: Path | None,
+    force: bool,
     ignore: tuple[str, ...],
     everything: bool,
     first: bool,
@@ -53,19 +60,32 @@ def command(
     Examples:
       dualtaxi diff k3v9m2xq p7 --ignore 'package.*'
       dualtaxi diff tutorial_cooperative cooperative --target finish_percent=80
+      dualtaxi diff first second --html difference.html
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.diff import diff
     from runner.recording.reader import open_recording
 
     levels = dict(_level(target) for target in targets)
+    if html is not None:
+        require_page(html, force)
     left, right = find(a, recordings), find(b, recordings)
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
         difference = _without(diff(recording_a, recording_b, levels, first), ignore)
+        if html is not None:
+            _write_page(html, force, difference, recording_a, recording_b)
     if as_json:
         print_json(_as_json(difference))
-    else:
+    elif html is None:
         _print(difference, everything, as_markdown)
     ctx.exit(0 if difference.same_content else 1)
+
+
+def _write_page(path: Path, force: bool, difference: RunDiff, a: Recording, b: Recording) -> None:
+    from runner.export.diff_page import render_diff
+    from runner.export.report_runs import write_text_new
+
+    write_text_new(path, force, render_diff(difference, a, b))
+    click.echo(f"{path}: {size(path.stat().st_size)}")
 
 
 def _level(text: str) -> tuple[str, float]:

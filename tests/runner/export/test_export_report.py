@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -22,39 +21,14 @@ from runner.export.report_replay import ranked_trials
 from runner.export.svg import Drawing, trail_points, transform
 from runner.recording.reader import open_recording
 from runner.words import states_in_words
+from tests.runner.export.outline import Outline, check_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 CHROMEDRIVER = shutil.which("chromedriver")
-VOID = {"meta", "link", "input", "br", "wbr", "hr", "img"}
 
 
 def report(*words):
     return CliRunner().invoke(cli, ["report", *map(str, words)])
-
-
-class Outline(HTMLParser):
-    """Checks that elements are closed in order, and keeps what a page refers to."""
-
-    def __init__(self):
-        super().__init__()
-        self.open, self.addresses, self.ids, self.cells = [], [], [], []
-
-    def handle_starttag(self, tag, attrs):
-        values = dict(attrs)
-        self.ids += [values["id"]] if "id" in values else []
-        self.addresses += [v for k, v in attrs if k in ("src", "href", "xlink:href", "action", "data")]
-        if tag == "th":
-            self.cells.append(values.get("scope"))
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.handle_starttag(tag, attrs)
-        if tag not in VOID:
-            self.open.pop()
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag, tag
 
 
 def data_of(page, number=0):
@@ -66,15 +40,7 @@ def data_of(page, number=0):
 
 def test_a_page_is_whole_needs_no_network_and_is_small(recording, page_of):
     page = page_of(recording.run["name"])
-    outline = Outline()
-    outline.feed(page)
-    assert outline.open == []
-    assert all(address.startswith("#") for address in outline.addresses)
-    assert not re.search(r"url\((?!#)|@import|https?://(?!www\.w3\.org/)", page)
-    assert len(outline.ids) == len(set(outline.ids))
-    assert set(outline.cells) <= {"row", "col"}
-    assert {address[1:] for address in outline.addresses} <= set(outline.ids)
-    assert len(page) < 1_000_000
+    check_page(page)
 
 
 def test_replays_are_the_recorded_episodes_best_and_worst_among_them(recording, page_of):

@@ -1,0 +1,98 @@
+"""The pages about a difference and a comparison: whole, and with what the text says in them."""
+
+from __future__ import annotations
+
+import html
+import re
+
+import pytest
+from click.testing import CliRunner
+
+from runner.analysis.compare import compare
+from runner.analysis.compare.groups import grouped, metrics_of
+from runner.analysis.compare.moments import Moment
+from runner.analysis.diff import diff
+from runner.analysis.series import read_series
+from runner.cli import cli
+from runner.export.compare_page import render_comparison
+from runner.export.diff_page import render_diff
+from runner.recording.reader import open_recording
+from tests.runner.export.conftest import WORLDS
+from tests.runner.export.outline import check_page
+
+
+def page_of(a, b):
+    with open_recording(a.recording) as left, open_recording(b.recording) as right:
+        difference = diff(left, right)
+        return difference, render_diff(difference, left, right)
+
+
+def text_of(page):
+    return re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]*>", "", page)))
+
+
+@pytest.mark.parametrize("world", ["taxi", "cliff", "stairs"])
+def test_the_page_of_another_discount_shows_where_and_why_the_runs_part(world, pictured):
+    difference, page = page_of(pictured(world), pictured(world, discount=0.7))
+    check_page(page)
+    text = text_of(page)
+    parting = difference.parting
+    assert f"In training episode {parting.episode:,}, at t = {parting.t}" in text
+    assert "Why that update differs: the discount was" in text
+    assert text.count("\N{BLACK LEFT-POINTING TRIANGLE} greedy") >= 2
+    drawn = world != "stairs"
+    assert ("Before, in both: " in page) == drawn
+    assert ('aria-label="Largest difference of' in page) == drawn
+    assert "Difference of the Q-tables over training episodes" in page
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_page_of_another_seed_shows_where_the_runs_part(world, pictured):
+    difference, page = page_of(pictured(world), pictured(world, seed=5))
+    check_page(page)
+    assert f"at t = {difference.parting.t}" in text_of(page)
+    starts = difference.cause.kind == "start"
+    drawn = page.count("B, where it stood: " if starts else "B, after its step: ")
+    assert (drawn > 0) == (world != "stairs")
+
+
+def test_a_page_of_runs_that_hardly_have_anything_in_common_is_whole(pictured):
+    for other in (
+        pictured("lake"),
+        pictured("rivals"),
+        pictured("taxis", recording={"steps": "none"}, seed=2),
+    ):
+        _, page = page_of(pictured("taxis"), other)
+        check_page(page)
+
+
+def test_a_page_of_the_same_run_says_so(pictured):
+    _, page = page_of(pictured("taxis"), pictured("taxis"))
+    check_page(page)
+    assert "The content is the same" in page
+
+
+def test_the_page_of_a_comparison_is_whole(pictured):
+    runs = [pictured("rivals", seed=seed, discount=discount) for seed in (1, 2, 3) for discount in (0.7, 0.9)]
+    series = []
+    for run in runs:
+        with open_recording(run.recording) as recording:
+            series.append(read_series(recording))
+    groups, notes = grouped(series)
+    page = render_comparison(compare(groups, metrics_of(groups), Moment("last"), notes), groups)
+    check_page(page)
+    assert "rivals, discount=0.7: 3 runs" in page
+    assert "fewer than 5 seeds" in page.lower()
+    assert page.count('performance profile"') >= 2
+
+
+@pytest.mark.parametrize("command", ["diff", "compare"])
+def test_an_existing_page_is_replaced_by_force_only(command, pictured, tmp_path):
+    runs = [pictured("taxi"), pictured("taxi", discount=0.5)]
+    words = [command, *(str(run.recording) for run in runs), "--html", str(tmp_path / "page.html")]
+    made = CliRunner().invoke(cli, words)
+    assert made.exit_code == (command == "diff"), made.output
+    again = CliRunner().invoke(cli, words)
+    assert again.exit_code == 2
+    assert "--force" in again.stderr
+    assert CliRunner().invoke(cli, [*words, "--force"]).exit_code == (command == "diff")
