@@ -16,7 +16,7 @@ ORDER = """
     config owner labels
     job toy_text scene
     mdp
-    words learning recording observer
+    words learning planning recording observer
     provenance runs
     frames packing
     analysis

@@ -240,7 +240,7 @@ def _attachment(body: bytes, rng: random.Random, change: Bytes) -> bytes:
         description = json.loads(data)
         return attachment_body(name, json.dumps(with_value(description, rng)).encode())
     if rng.random() < 0.9 and name.endswith(".zst"):
-        array = zstandard.ZstdDecompressor().stream_reader(data).read(1 << 20)  # whatever it states
+        array = zstandard.ZstdDecompressor(max_window_size=1 << 23).stream_reader(data).read(1 << 20)
         array = with_number(array, rng) if rng.random() < 0.5 else change(array)
         return attachment_body(name, zstandard.ZstdCompressor().compress(array))
     return attachment_body(name, change(data))

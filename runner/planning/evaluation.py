@@ -1,0 +1,191 @@
+"""What a policy gets, from every state that an episode can start in, without playing one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import EnvironmentNotUsable
+from runner.mdp import Mdp
+from runner.planning import kernel
+from runner.planning.kernel import Chain, Paths
+from runner.planning.optimum import TOLERANCE
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """States that a policy goes round for ever, so that its episodes time out."""
+
+    states: tuple[int, ...]
+    """In the order they are passed, from the lowest on."""
+    percent: float
+    """How many episodes end up here."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a policy gets on average over the start states, weighted by how often an episode starts there."""
+
+    starts: int
+    """Number of start states."""
+    finish_percent: float
+    """Episodes with a success; nan if the environment does not know any."""
+    timeout_percent: float
+    """Episodes that the step limit cuts off."""
+    mean_length: float
+    mean_penalties: float
+    mean_returns: tuple[float, ...]
+    """Undiscounted, until the step limit; one a learner."""
+    values: tuple[float, ...]
+    """Discounted, without a step limit; one a learner."""
+    cycles: tuple[Cycle, ...]
+    """Where time-outs are stuck, the most frequent first; empty if the environment is not deterministic."""
+
+
+def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount: float) -> Outcome:
+    """Return what a deterministic policy gets, exactly.
+
+    In a deterministic environment every state has one successor, and each path ends, or closes a cycle;
+    else the chances are followed step by step up to the limit.
+
+    Args:
+        mdp: the environment.
+        policy: [S]: the joint action of each state.
+        learners: 1, or the number of agents; each has its own return.
+        discount: of the values; below 1.
+
+    Raises:
+        EnvironmentNotUsable: it has no step limit, or the discount is not below 1.
+    """
+    if not mdp.step_limit:
+        raise EnvironmentNotUsable(
+            f"{mdp.env_id}: found no step limit, expected one: without it some episodes never end."
+        )
+    if not 0 <= discount < 1:
+        raise EnvironmentNotUsable(f"found discount {discount}, expected one from 0 up to below 1.")
+    rows = np.arange(mdp.states)
+    chosen = _Chosen(
+        mdp.next_state[rows, policy],
+        mdp.probability[rows, policy],
+        mdp.rewards_of(learners)[rows, policy],
+        mdp.terminated[rows, policy],
+        (mdp.events[rows, policy] & mdp.success_mask) != 0,
+        mdp.summed_rewards[rows, policy] < mdp.penalty_below,
+    )
+    starts = np.flatnonzero(mdp.start > 0)
+    weights = mdp.start[starts]
+    if ((chosen.probability > 0).sum(axis=1) == 1).all():
+        return _deterministic(chosen, starts, weights, mdp.step_limit, discount, bool(mdp.success_mask))
+    return _stochastic(chosen, starts, weights, mdp.step_limit, discount, bool(mdp.success_mask))
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """The outcomes of the action that a policy chooses in each state, [S, K] each."""
+
+    next_state: NDArray[np.int32]
+    probability: NDArray[np.float64]
+    rewards: NDArray[np.float64]
+    """[S, K, L]."""
+    terminated: NDArray[np.bool_]
+    success: NDArray[np.bool_]
+    penalty: NDArray[np.bool_]
+
+
+def _deterministic(
+    chosen: _Chosen,
+    starts: NDArray[np.int64],
+    weights: NDArray[np.float64],
+    limit: int,
+    discount: float,
+    known: bool,
+) -> Outcome:
+    only = np.arange(len(chosen.next_state)), chosen.probability.argmax(axis=1)
+    chain = Chain(
+        chosen.next_state[only].astype(np.int64),
+        np.ascontiguousarray(chosen.rewards[only]),
+        chosen.terminated[only],
+        chosen.success[only],
+        chosen.penalty[only],
+    )
+    paths = kernel.find_paths(chain)
+    lengths, returns, counts = kernel.play_all(chain, paths, starts, limit)
+    values = np.zeros_like(chain.rewards)
+    kernel.discounted_paths(chain, paths, _nearest_first(paths), discount, values)
+    timed_out = (paths.cycle[starts] >= 0) | (paths.length[starts] > limit)
+    return Outcome(
+        starts=len(starts),
+        finish_percent=_mean(100.0 * (counts[:, 0] > 0), weights) if known else float("nan"),
+        timeout_percent=_mean(100.0 * timed_out, weights),
+        mean_length=_mean(lengths, weights),
+        mean_penalties=_mean(counts[:, 1], weights),
+        mean_returns=_means(returns, weights),
+        values=_means(values[starts], weights),
+        cycles=_cycles(paths, starts, weights),
+    )
+
+
+def _nearest_first(paths: Paths) -> NDArray[np.int64]:
+    """Return the states outside cycles, by the steps to their end or their cycle."""
+    steps = paths.length + paths.away
+    order = np.argsort(steps, kind="stable")
+    return order[steps[order] > 0]
+
+
+def _cycles(paths: Paths, starts: NDArray[np.int64], weights: NDArray[np.float64]) -> tuple[Cycle, ...]:
+    """Return the cycles that some start leads into."""
+    stuck = paths.cycle[starts]
+    shares = np.bincount(stuck[stuck >= 0], weights[stuck >= 0], minlength=len(paths.offsets) - 1)
+    percents = (100 * shares / math.fsum(weights)).tolist()
+    members, offsets = paths.members.tolist(), paths.offsets.tolist()
+    cycles = []
+    for number in np.flatnonzero(shares).tolist():
+        states = members[offsets[number] : offsets[number + 1]]
+        lowest = states.index(min(states))
+        cycles.append(Cycle((*states[lowest:], *states[:lowest]), percents[number]))
+    return tuple(sorted(cycles, key=lambda cycle: (-cycle.percent, cycle.states)))
+
+
+def _mean(values: NDArray[Any], weights: NDArray[np.float64]) -> float:
+    """Return the weighted mean, correctly rounded sums: 100 % is 100."""
+    return math.fsum((values * weights).tolist()) / math.fsum(weights.tolist())
+
+
+def _means(columns: NDArray[np.float64], weights: NDArray[np.float64]) -> tuple[float, ...]:
+    """Return the weighted mean of each column of [N, C]."""
+    return tuple(_mean(column, weights) for column in columns.T)
+
+
+def _stochastic(
+    chosen: _Chosen,
+    starts: NDArray[np.int64],
+    weights: NDArray[np.float64],
+    limit: int,
+    discount: float,
+    known: bool,
+) -> Outcome:
+    p = chosen.probability
+    expected = (p[..., None] * chosen.rewards).sum(axis=1)
+    gains = np.column_stack([np.ones(len(p)), (p * chosen.penalty).sum(axis=1), expected])
+    chances, sums = kernel.expect(chosen.next_state, p, chosen.terminated, chosen.success, gains, limit)
+    values = np.zeros_like(expected)
+    weight = discount * p * ~chosen.terminated
+    kernel.discounted(
+        chosen.next_state, weight, expected, values, TOLERANCE * (1 - discount) / max(discount, 0.5)
+    )
+    finished, ended = _means(chances[starts], weights)
+    length, penalties, *returns = _means(sums[starts], weights)
+    return Outcome(
+        starts=len(starts),
+        finish_percent=100 * finished if known else float("nan"),
+        timeout_percent=100 * (1 - ended),
+        mean_length=length,
+        mean_penalties=penalties,
+        mean_returns=tuple(returns),
+        values=_means(values[starts], weights),
+        cycles=(),
+    )

@@ -1,0 +1,86 @@
+"""The best that can be done: value iteration, over joint actions or one agent's own."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import EnvironmentNotUsable
+from runner.mdp import Mdp
+from runner.planning import kernel
+
+TOLERANCE: Final = 1e-10
+"""How far a value may be from the true one."""
+
+
+def optimal_values(mdp: Mdp, discount: float) -> NDArray[np.float64]:
+    """Return what all agents together can get at most from each state, [S], to within 1e-10.
+
+    Value iteration, in place: Sutton and Barto, Reinforcement Learning, 2nd edition, section 4.4. The
+    horizon is infinite: an episode that the environment cuts off counts as if it went on.
+
+    Raises:
+        EnvironmentNotUsable: the discount is not below 1.
+    """
+    weight = _weight(mdp, discount)
+    reward = (mdp.probability * mdp.summed_rewards).sum(axis=-1)
+    return _iterated(mdp.next_state, weight, reward, discount)
+
+
+def greedy_policy(mdp: Mdp, discount: float, values: NDArray[np.float64]) -> NDArray[np.int32]:
+    """Return the joint action that leads to the most of these values, [S]; the first of equals.
+
+    Values that differ by rounding only count as equal.
+    """
+    reward = (mdp.probability * mdp.summed_rewards).sum(axis=-1)
+    worth = reward + (_weight(mdp, discount) * values[mdp.next_state]).sum(axis=-1)
+    close = worth >= worth.max(axis=1, keepdims=True) - 1e-8
+    return np.asarray(close.argmax(axis=1), np.int32)
+
+
+def best_response(
+    mdp: Mdp, policy: NDArray[np.int32], learner: int, learners: int, discount: float
+) -> NDArray[np.float64]:
+    """Return what one learner can get at most from each state while all others keep to a policy, [S].
+
+    Args:
+        mdp: the environment.
+        policy: [S]: the joint action of each state.
+        learner: whose own action is free, and whose reward counts.
+        learners: how many there are; 1 is all agents together, whose best response is the optimum.
+        discount: below 1.
+
+    Raises:
+        EnvironmentNotUsable: the discount is not below 1.
+    """
+    widths = mdp.action_counts if learners > 1 else (mdp.joint_actions,)
+    stride = int(np.prod(widths[learner + 1 :], dtype=np.int64))
+    own = policy // stride % widths[learner]
+    joint = (policy - own * stride)[:, None] + np.arange(widths[learner]) * stride
+    rows = np.arange(mdp.states)[:, None]
+    reward = (mdp.probability * mdp.rewards_of(learners)[..., learner]).sum(axis=-1)
+    weight = _weight(mdp, discount)[rows, joint]
+    return _iterated(mdp.next_state[rows, joint], weight, reward[rows, joint], discount)
+
+
+def _weight(mdp: Mdp, discount: float) -> NDArray[np.float64]:
+    """Return the discounted probability [S, J, K] that an outcome comes and the episode goes on."""
+    if not 0 <= discount < 1:
+        raise EnvironmentNotUsable(
+            f"found discount {discount}, expected one from 0 up to below 1: "
+            "else a process without an end has no value."
+        )
+    return np.asarray(discount * mdp.probability * ~mdp.terminated)
+
+
+def _iterated(
+    next_state: NDArray[np.int32], weight: NDArray[np.float64], reward: NDArray[np.float64], discount: float
+) -> NDArray[np.float64]:
+    values = np.zeros(len(next_state))
+    tolerance = TOLERANCE * (1 - discount) / max(discount, 0.5)
+    kernel.iterate_values(
+        np.ascontiguousarray(next_state), np.ascontiguousarray(weight), reward, values, tolerance
+    )
+    return values
