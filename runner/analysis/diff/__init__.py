@@ -45,6 +45,7 @@ __all__ = [
     "TableDiff",
     "TransitionChange",
     "Update",
+    "can_compare_steps",
     "diff",
 ]
 
@@ -103,7 +104,7 @@ def diff(
     if same:
         return RunDiff(**facts)
     seen = None
-    if _can_compare_steps(a, b):
+    if can_compare_steps(a, b):
         parting = training_parting(a, b)
         cause = None if parting is None else cause_of(parting, a, b)
         facts |= {"parting": parting, "cause": cause}
@@ -124,7 +125,8 @@ def _same_sizes(a: Recording, b: Recording) -> bool:
     return a.mdp.next_state.shape[:2] == b.mdp.next_state.shape[:2]
 
 
-def _can_compare_steps(a: Recording, b: Recording) -> bool:
+def can_compare_steps(a: Recording, b: Recording) -> bool:
+    """Return whether both have steps, of as many states and actions."""
     return _same_sizes(a, b) and all(recording.count(schema.TRAIN_STEP) for recording in (a, b))
 
 

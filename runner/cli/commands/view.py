@@ -13,6 +13,7 @@ from runner.cli.output import say
 
 if TYPE_CHECKING:
     from runner.export.rerun.spots import Spot
+    from runner.runs import Run
 
 
 class _Spot(click.ParamType):  # type: ignore[type-arg,unused-ignore]
@@ -74,10 +75,11 @@ def command(
     everything: bool,
     recordings: Path | None,
 ) -> None:
-    """Look at RUN in the Rerun viewer, at the right spot; at two runs side by side.
+    """Look at RUN in the Rerun viewer, at the right spot; at two runs side by side, where they part.
 
     The run is exported first, unless it was before; which steps, is chosen as for `export rerun`, and the
-    episode of --at is among them. It ends when the viewer is closed, or by Ctrl-C.
+    episode of --at is among them; with two runs and no --at, the one in which they part. It ends when the
+    viewer is closed, or by Ctrl-C.
 
     \b
     Examples:
@@ -96,11 +98,29 @@ def command(
 
     runs = [find(name, recordings) for name in run_names]
     request = request_of(episodes, evaluations, every, everything)
-    place = with_spot(runs[0], request, spot)
+    parting = None if len(runs) == 1 or spot is not None else _parting(runs)
+    place = with_spot(runs[0], request, spot or parting)
+    if parting is not None:
+        _tell_steps(place.time, with_spot(runs[1], request, parting).time)
     path, selections = exported(runs, place.request)
     for selection in selections:
         tell(selection)
     _show(path, place, web, port, screenshot, picture_size)
+
+
+def _parting(runs: list[Run]) -> tuple[int, ...] | None:
+    """Return where two runs part, and say it."""
+    from runner.export.rerun.spots import where_they_part
+
+    spot, told = where_they_part(runs)
+    say(told)
+    return spot
+
+
+def _tell_steps(first: int, second: int) -> None:
+    """Say where on the timeline two runs part: trials before it that differ shift the second one's."""
+    also = "" if first == second else f" in the first run, step {second:,} in the second"
+    say(f"On the timeline that is step {first:,}{also}.")
 
 
 def _show(path: Path, place: Spot, web: bool, port: int, screenshot: Path | None, picture_size: str) -> None:

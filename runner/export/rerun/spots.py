@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from runner.analysis.diff import can_compare_steps
+from runner.analysis.diff.sections import where_in_words
+from runner.analysis.diff.trajectory import evaluation_partings, training_parting
 from runner.errors import RecordingError
 from runner.export.rerun.selection import Evaluation, Request, episodes_of, evaluations_of, select
 from runner.recording import schema
@@ -39,6 +43,30 @@ def with_spot(run: Run, request: Request, spot: tuple[int, ...] | None) -> Spot:
         topic = schema.PHASES[phase][0]
         record = next(recording.blocks(topic, step, step + 1))[0]
     return Spot(int(record["log_time"]) // schema.STEP_NANOSECONDS, _including(request, more))
+
+
+def where_they_part(runs: Sequence[Run]) -> tuple[tuple[int, ...] | None, str]:
+    """Return where two runs part, as `with_spot` takes it, and a sentence about it.
+
+    That is the first step of training that differs, or else the first evaluation's. None where they do not
+    part, or where it cannot be known.
+    """
+    with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
+        if not can_compare_steps(a, b):
+            return (
+                None,
+                "Where they part cannot be told: states or actions differ, or steps were not recorded.",
+            )
+        parting = training_parting(a, b)
+        if parting is None or None in (parting.a_step, parting.b_step):
+            further = parting is not None
+            parting = next(evaluation_partings(a, b), None)
+            if parting is None:
+                ends = ", as far as the shorter goes" if further else ""
+                return None, f"They never part: every step is the same{ends}."
+    if parting.after is None:
+        return (parting.episode, parting.t), f"They part {where_in_words(parting)}."
+    return (parting.after, parting.episode, parting.t), f"They part {where_in_words(parting)}."
 
 
 def _train_step(recording: Recording, episode: int, t: int) -> tuple[str, int, Request]:
