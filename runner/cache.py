@@ -9,6 +9,8 @@ from typing import Final
 CACHE_VARIABLE: Final = "XDG_CACHE_HOME"
 EXPORTS: Final = "rerun"
 """The folder in it of exports for the Rerun viewer; their names begin with the ids of their runs."""
+RESTORED: Final = "restored"
+"""The folder in it of recordings restored from archives; their names begin with the ids of their runs."""
 
 
 def cache_folder() -> Path:

@@ -224,19 +224,19 @@ def list_runs(recordings: Path) -> list[Run]:
     Raises:
         StorageError: the folder is there and cannot be read.
     """
-    runs = [run for folder in run_folders(recordings) for run in runs_in(folder)]
+    runs = [run for entry in run_entries(recordings) for run in runs_in(recordings / entry)]
     return sorted(runs, key=lambda run: (run.created, run.run_id), reverse=True)
 
 
-def run_folders(recordings: Path) -> list[Path]:
-    """Return the folders in which there may be a run: all but the hidden ones.
+def run_entries(recordings: Path) -> list[str]:
+    """Return the names of the folders in which there may be a run: all but the hidden ones.
 
     Raises:
         StorageError: the recordings folder is there and cannot be read.
     """
     try:
         with os.scandir(recordings) as entries:
-            return [Path(entry.path) for entry in entries if entry.name[0] != "." and entry.is_dir()]
+            return [entry.name for entry in entries if entry.name[0] != "." and entry.is_dir()]
     except FileNotFoundError:
         return []
     except OSError as error:

@@ -18,6 +18,7 @@ ORDER = """
     mdp
     words learning planning recording observer
     provenance runs
+    catalogue
     frames packing
     analysis
     archive

@@ -43,6 +43,15 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "diff": ("runner.cli.commands.diff", "Tell what differs between two runs, and where they part."),
         "compare": ("runner.cli.commands.compare", "Compare groups of runs, with statistics over seeds."),
     },
+    "Tidy": {
+        "tag": ("runner.cli.commands.tag", "Tag a run, or take tags away."),
+        "note": ("runner.cli.commands.note", "Write a note on a run."),
+        "rename": ("runner.cli.commands.rename", "Give a run another name."),
+        "du": ("runner.cli.commands.du", "Tell what uses the disk, and what could be freed."),
+        "rm": ("runner.cli.commands.rm", "Remove runs."),
+        "prune": ("runner.cli.commands.prune", "Remove the runs that are old, unfinished or unwanted."),
+        "reindex": ("runner.cli.commands.reindex", "Read all runs again, and make their index anew."),
+    },
     "Check": {
         "verify": ("runner.cli.commands.verify", "Check every step of a run by doing it again."),
         "repair": ("runner.cli.commands.repair", "Make a damaged recording whole; tell what was lost."),

@@ -23,12 +23,13 @@ class RunName(click.ParamType):  # type: ignore[type-arg]  # generic in newer ve
         incomplete: str,
     ) -> list[CompletionItem]:
         """Return the ids and names that begin so, the newest first; paths, once there is a slash."""
-        from runner.runs import list_runs, recordings_folder
+        from runner.catalogue.finding import candidates
+        from runner.runs import recordings_folder
 
         if "/" in incomplete or "\\" in incomplete:
             return [CompletionItem(incomplete, type="file")]
         try:
-            runs = list_runs(recordings_folder(ctx.params.get("recordings")))
+            runs = candidates(recordings_folder(ctx.params.get("recordings")))
         except RunnerError:
             return []
         found = {"@latest": "the newest run"} if runs else {}
@@ -52,6 +53,28 @@ recordings_option: Final = click.option(
     help="The folder of runs.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
 )
 
+
+def _folders(
+    ctx: click.Context,  # noqa: ARG001
+    param: click.Parameter,  # noqa: ARG001
+    value: tuple[Path, ...],
+) -> tuple[Path, ...]:
+    from runner.runs import recordings_folder
+
+    return value or (recordings_folder(),)
+
+
+folders_option: Final = click.option(
+    "--recordings",
+    type=click.Path(file_okay=False, path_type=Path),
+    metavar="DIR",
+    multiple=True,
+    callback=_folders,
+    help="A folder of runs; may be given several times.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
+)
+
+filter_argument: Final = click.argument("words", metavar="[FILTER]...", nargs=-1)
+
 json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs to read.")
 
 set_option: Final = click.option(
@@ -65,6 +88,8 @@ set_option: Final = click.option(
 
 def find(name: str, recordings: Path | None) -> Any:
     """Return the run of a name, or of a path, in the chosen folder."""
-    from runner.runs import find_run, recordings_folder
+    from runner.catalogue.finding import find_run
+    from runner.cli.output import say
+    from runner.runs import recordings_folder
 
-    return find_run(name, recordings_folder(recordings))
+    return find_run(name, recordings_folder(recordings), say)

@@ -2,97 +2,119 @@
 
 from __future__ import annotations
 
-import contextlib
-from datetime import UTC, datetime
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.cli.options import json_option, recordings_option
-from runner.cli.output import UNKNOWN, age, draw, number, print_json, say, size, table
-from runner.runs import list_runs, recordings_folder
+from runner.cli.options import filter_argument, folders_option, json_option
+from runner.cli.output import print_json, say
 
 if TYPE_CHECKING:
-    from runner.runs import Run
+    from runner.catalogue.filters import Filter
+    from runner.catalogue.index import Index
+
+ON_A_TERMINAL: Final = 50
+"""Runs that are listed there unless it is said how many."""
 
 
 @click.command("ls")
-@recordings_option
+@filter_argument
+@folders_option
+@click.option("--sort", default="", metavar="FIELD,...", help="By these fields; -FIELD: the largest first.")
+@click.option("--columns", metavar="FIELD,...", help="Show these fields.")
+@click.option(
+    "--limit",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help=f"At most so many runs, 0 for all.  [default: {ON_A_TERMINAL} in a terminal's table, else all]",
+)
+@click.option("--offset", type=click.IntRange(min=0), default=0, metavar="N", help="Leave out the first N.")
+@click.option("-q", "--quiet", is_flag=True, help="Print ids only.")
+@click.option("--csv", "as_csv", is_flag=True, help="Print CSV.")
 @json_option
-def command(recordings: Path | None, as_json: bool) -> None:
-    """List the runs of the recordings folder, the newest first.
+def command(
+    words: tuple[str, ...],
+    recordings: tuple[Path, ...],
+    sort: str,
+    columns: str | None,
+    limit: int | None,
+    offset: int,
+    quiet: bool,
+    as_csv: bool,
+    as_json: bool,
+) -> None:
+    """List the runs that fit FILTER, or all, the newest first.
+
+    A filter is of words, looked for in id, name, configuration, tags and note; of FIELD:VALUE, FIELD:>VALUE
+    and FIELD:[LOW TO HIGH]; of AND, OR, NOT and parentheses. Text is compared as a whole, * and ? stand for
+    any; FIELD:* is: known. The fields:
+
+    \b
+      id name config seed status tag note created age episodes steps finish_percent
+      mean_length mean_penalties seconds bytes digest mode environment host git
+      archive folder, and config.PATH for any value of the configuration
 
     Shown are the training episodes done (of those to do, where some are missing), how many percent of the
-    last evaluation's trials finished, the size of the recording, and how long ago the run began.
+    last evaluation's trials finished, the size of the recording, how long ago the run began, and which run
+    recorded the same content before.
 
     \b
     Examples:
       dualtaxi ls
-      dualtaxi ls --recordings /data/runs --json
+      dualtaxi ls tutorial NOT tag:keep
+      dualtaxi ls 'status:finished config.discount:>0.9' --sort -finish_percent --limit 5
+      dualtaxi ls 'created:[2026-01-01 TO *] (seed:<3 OR age:<12h)' --columns id,seed,config,digest
+      dualtaxi ls --quiet name:quick
     """  # noqa: D301 - Click wants the backspace itself
-    folder = recordings_folder(recordings)
-    runs = list_runs(folder)
-    if as_json:
-        print_json([_as_json(run) for run in runs])
-    elif runs:
-        _draw(runs)
-    else:
-        say(f"No runs in {folder} yet. `dualtaxi run CONFIG` makes one.")
+    from runner.catalogue.filters import parse
+    from runner.cli import listing
+
+    if sum((quiet, as_csv, as_json)) > 1:
+        raise click.UsageError("--quiet, --csv and --json are three ways to print; choose one.")
+    chosen = parse(" ".join(words))
+    shown = listing.columns_of(columns) if columns else None
+    if limit is None and not (quiet or as_csv or as_json) and sys.stdout.isatty():
+        limit = ON_A_TERMINAL
+    rows, total = _found(recordings, chosen, sort, limit, offset)
+    if quiet:
+        click.echo("".join(f"{row['id']}\n" for row in rows), nl=False)
+    elif as_json:
+        print_json([listing.as_json(row, shown or listing.PROGRAMS) for row in rows])
+    elif as_csv:
+        listing.print_csv(rows, shown or listing.PROGRAMS)
+    elif rows:
+        listing.print_table(rows, shown or listing.usual_columns(rows, len(recordings)))
+    _tell_the_rest(rows, total, offset, chosen, recordings)
 
 
-def _as_json(run: Run) -> dict[str, Any]:
-    last = run.summary.get("last_evaluation") or {}
-    return {
-        "run_id": run.run_id,
-        "name": run.name,
-        "config": _config_name(run),
-        "seed": run.seed,
-        "status": run.status,
-        "episodes": run.summary.get("episodes"),
-        "episodes_to_do": run.facts.get("config", {}).get("episodes"),
-        "finish_percent": last.get("finish_percent"),
-        "bytes": _bytes(run),
-        "created": run.facts["created"],
-        "path": str(run.recording.absolute()),
-        "content_digest": run.summary.get("content_digest"),
-    }
+def _found(
+    recordings: tuple[Path, ...], chosen: Filter, sort: str, limit: int | None, offset: int
+) -> tuple[list[dict[str, Any]], int]:
+    """Return the rows to show, and how many fit the filter."""
+    from runner.catalogue.index import look, order_of
+    from runner.cli.listing import with_originals
+
+    order = order_of(sort)
+
+    def work(index: Index) -> tuple[list[dict[str, Any]], int]:
+        rows = with_originals(index.select(chosen, *order, limit=limit or None, offset=offset), index)
+        return rows, index.count(chosen) if limit or offset else len(rows)
+
+    return look(recordings, work, say)
 
 
-def _draw(runs: list[Run]) -> None:
-    rows = [_as_json(run) for run in runs]
-    renamed = any(row["name"] != row["config"] for row in rows)
-    columns = ("id", "name", *(["config"] if renamed else []), "seed", "status")
-    drawn = table(
-        *columns,
-        *("episodes", "finished %", "size", "age"),
-        left=("id", "name", "config", "status"),
-        shrinking=("name", "config"),
-    )
-    now = datetime.now(UTC)
-    for run, row in zip(runs, rows, strict=True):
-        done, to_do = row["episodes"], row["episodes_to_do"]
-        told = UNKNOWN if done is None else f"{done:,}"
-        drawn.add_row(
-            row["run_id"],
-            row["name"],
-            *([row["config"]] if renamed else []),
-            str(row["seed"]),
-            row["status"],
-            told if done == to_do or to_do is None else f"{told} of {to_do:,}",
-            number(row["finish_percent"]),
-            UNKNOWN if row["bytes"] is None else size(row["bytes"]),
-            age((now - run.created).total_seconds()),
-        )
-    draw(drawn)
-
-
-def _config_name(run: Run) -> str:
-    return str(run.facts.get("config", {}).get("name", UNKNOWN))
-
-
-def _bytes(run: Run) -> int | None:
-    """Return the size of the recording now; None if there is none."""
-    with contextlib.suppress(OSError):
-        return run.recording.stat().st_size
-    return None
+def _tell_the_rest(
+    rows: list[dict[str, Any]], total: int, offset: int, chosen: Filter, recordings: tuple[Path, ...]
+) -> None:
+    """Say what is not shown, and why nothing is."""
+    folders = ", ".join(map(str, recordings))
+    if len(rows) < total:
+        behind = offset + len(rows)
+        more = f", --offset {behind} the next" if len(rows) > 0 and behind < total else ""
+        say(f"Shown are {len(rows):,} of {total:,} runs; --limit 0 shows all{more}.")
+    elif not rows and chosen.condition is not None:
+        say(f"No run in {folders} fits.")
+    elif not rows:
+        say(f"No runs in {folders} yet. `dualtaxi run CONFIG` makes one.")

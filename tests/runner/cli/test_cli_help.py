@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import itertools
 import pkgutil
 import shlex
 import subprocess
@@ -44,16 +45,18 @@ def test_every_option_is_explained(path, command):
             assert parameter.help, parameter.name
 
 
+def _typed(line):
+    """Return the words of the command in a line, up to a pipe or another file."""
+    words = shlex.shlex(line.split("   ")[0], posix=True, punctuation_chars="|<>")
+    words.whitespace_split, words.commenters = True, ""
+    return list(itertools.takewhile(lambda word: not set(word) <= set("|<>"), words))
+
+
 def _examples():
     for path, command in EVERY:
         for line in inspect.cleandoc(command.help or "").splitlines():
-            words = (
-                shlex.split(line.split("|")[0].split(">")[0].strip().split("   ")[0])
-                if "dualtaxi" in line
-                else []
-            )
-            if words[:1] == ["dualtaxi"]:
-                yield pytest.param(words[1:], id=" ".join(path) + ": " + line.strip())
+            if line.strip().startswith("dualtaxi "):
+                yield pytest.param(_typed(line.strip())[1:], id=" ".join(path) + ": " + line.strip())
 
 
 @pytest.mark.parametrize("words", list(_examples()))

@@ -1,0 +1,52 @@
+"""A run found by its name among very many: the index knows what they are called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NamedTuple
+
+from runner.catalogue.index import look
+from runner.errors import RunNotFound
+from runner.runs import Run, run_at_once, runs_in, the_one
+
+
+class Candidate(NamedTuple):
+    """A run as the index knows it."""
+
+    root: str
+    entry: str
+    run_id: str
+    name: str
+    seed: int
+    milliseconds: int
+
+    @property
+    def created(self) -> datetime:
+        """When it began, in UTC."""
+        return datetime.fromtimestamp(self.milliseconds / 1000, UTC)
+
+
+def candidates(recordings: Path, tell: Callable[[str], None] = lambda _: None) -> list[Candidate]:
+    """Return what the runs of a folder are called, the newest first.
+
+    Raises:
+        StorageError: the folder is there and cannot be read.
+    """
+    return look([recordings], lambda index: [Candidate(*facts) for facts in index.names()], tell)
+
+
+def find_run(name: str, recordings: Path, tell: Callable[[str], None] = lambda _: None) -> Run:
+    """Return what `runner.runs.find_run` does, without reading every run's files.
+
+    Raises:
+        RunNotFound: no run answers to the name, or several do.
+    """
+    known = run_at_once(name, recordings)
+    if known is not None:
+        return known
+    found = the_one(name, candidates(recordings, tell), recordings)
+    for run in runs_in(Path(found.root, found.entry)):
+        return run
+    raise RunNotFound(f"run {found.run_id} was removed just now.")

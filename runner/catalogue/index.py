@@ -1,0 +1,346 @@
+"""The index: one SQLite file in the user's cache, of every recordings folder that was looked at.
+
+It is brought up to date whenever it is asked: each run's files are looked at (their size and time), and
+read where they changed. It is made at one stroke and thrown away when it is damaged or of another version;
+where it cannot be used, the folders are looked at without it. It keeps a journal, not a write-ahead log:
+users' caches stand on network disks too, and a transaction here is short.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeVar
+
+from peewee import DatabaseError, OperationalError, SchemaManager, SqliteDatabase, chunked, fn
+
+from runner.cache import cache_folder
+from runner.catalogue.fields import SETTING, Kind, field_of
+from runner.catalogue.filters import Filter, matches, setting_path
+from runner.catalogue.rows import Row, row_of
+from runner.errors import RunnerError, nearest
+from runner.labels import LABELS_FILE
+from runner.runs import RECORDING_FILE, RUN_FILE, run_entries, runs_in
+
+Found = TypeVar("Found")
+Tell = Callable[[str], None]
+
+INDEX_FILE: Final = "catalogue.sqlite"
+_APPLICATION: Final = 0x44546178  # "DTax"
+_VERSION: Final = 1
+"""Of the columns in `rows` and what is put in them; another one is thrown away."""
+_BUSY_SECONDS: Final = 60
+_SETTLED_NS: Final = 2 * 10**9
+"""Files that changed so recently may change again without a trace: they are read again next time."""
+_RUN_FILES: Final = (RUN_FILE, LABELS_FILE, RECORDING_FILE)
+
+
+@dataclass
+class Changes:
+    """What bringing the index up to date came upon."""
+
+    read: int = 0
+    """Folders that were read."""
+    gone: int = 0
+    """Folders that are no more."""
+    problems: list[str] = field(default_factory=list)
+    """Folders with files of a run of which nothing can be made."""
+
+
+class Index:
+    """The index of some recordings folders, up to date when it was opened."""
+
+    def __init__(self, database: SqliteDatabase, roots: Sequence[Path]) -> None:
+        self._database = database
+        self.roots = [os.path.abspath(root) for root in roots]  # noqa: PTH100 - links stay what they are
+        self.changes = Changes()
+        database.register_function(matches, "matches", 2, deterministic=True)
+
+    def refresh(self) -> None:
+        """Read what changed in the folders since the index last saw them.
+
+        Raises:
+            StorageError: a recordings folder cannot be read.
+        """
+        for root in dict.fromkeys(self.roots):
+            self._refresh(root)
+
+    def forget(self) -> None:
+        """Forget all about these folders, and about those that are no more."""
+        known = [root for (root,) in self._tuples(Row.select(Row.root).distinct())]
+        stale = [root for root in known if root in self.roots or not os.path.isdir(root)]  # noqa: PTH112
+        self._delete(Row.root.in_(stale))
+
+    def select(
+        self, chosen: Filter, *order: Any, limit: int | None = None, offset: int = 0
+    ) -> list[dict[str, Any]]:
+        """Return the rows that pass a filter, by column; the newest first unless another order is given."""
+        self._check_settings(chosen)
+        query = self._of(chosen).order_by(*order, Row.created.desc(), Row.id, Row.root)
+        if limit is not None or offset:
+            query = query.limit(-1 if limit is None else limit).offset(offset)
+        return list(query.dicts().bind(self._database))
+
+    def count(self, chosen: Filter) -> int:
+        """Return how many rows pass a filter."""
+        self._check_settings(chosen)
+        (counted,) = self._tuples(self._of(chosen, fn.COUNT(Row.entry)))
+        return int(counted[0])
+
+    def names(self) -> list[tuple[Any, ...]]:
+        """Return root, entry, id, name, seed and creation (ms) of every run, the newest first."""
+        columns = (Row.root, Row.entry, Row.id, Row.name, Row.seed, Row.created)
+        query = self._of(Filter(None), *columns).order_by(Row.created.desc(), Row.id.desc())
+        return list(query.tuples().bind(self._database))
+
+    def originals(self) -> dict[str, tuple[str, str, str]]:
+        """Return root, entry and id of the run that was first, for each content recorded twice or more."""
+        recorded = Row.select(Row.digest).where(Row.digest.is_null(False) & Row.root.in_(self.roots))
+        several = recorded.group_by(Row.digest).having(fn.COUNT(Row.entry) > 1)
+        if not list(self._tuples(several.limit(1))):
+            return {}
+        first = self._of(Filter(Row.digest.in_(several)), Row.digest, Row.root, Row.entry, Row.id)
+        found = self._tuples(first.order_by(Row.created.desc(), Row.id.desc(), Row.root.desc()))
+        return {digest: (root, entry, run_id) for digest, root, entry, run_id in found}
+
+    def _of(self, chosen: Filter, *columns: Any) -> Any:
+        known = Row.root.in_(self.roots) & Row.id.is_null(False)
+        return Row.select(*columns).where(known if chosen.condition is None else known & chosen.condition)
+
+    def _tuples(self, query: Any) -> Iterator[tuple[Any, ...]]:
+        """Return what a query finds as SQLite has it: many rows, quickly."""
+        found: Iterator[tuple[Any, ...]] = self._database.execute(query)  # type: ignore[no-untyped-call]
+        return found
+
+    def _check_settings(self, chosen: Filter) -> None:
+        """Refuse a filter that asks for a value which no configuration has.
+
+        Raises:
+            RunnerError: it does; the nearest is told.
+        """
+        for path in sorted(chosen.settings):
+            kind = fn.json_type(Row.settings, setting_path(path))
+            some = self._of(Filter(None), Row.entry).limit(1)
+            having = some.where(kind.is_null(False))
+            if not list(self._tuples(having)) and list(self._tuples(some)):
+                raise RunnerError(
+                    f"filter: no run's configuration has {path!r}.{nearest(path, self._settings())}"
+                )
+
+    def _settings(self) -> set[str]:
+        import json
+
+        newest = self._of(Filter(None), Row.settings).order_by(Row.created.desc()).limit(200)
+        return {path for (settings,) in self._tuples(newest) for path in json.loads(settings)}
+
+    def _refresh(self, root: str) -> None:
+        known = self._known(root)
+        found = dict(_scan(root))
+        now = time.time_ns()
+        changed = [
+            _read(root, entry, seen, now)
+            for entry, seen in found.items()
+            if known.get(entry, ("",))[0] != seen.fingerprint
+        ]
+        self.changes.read += len(changed)
+        died = [
+            entry
+            for entry, (mark, status) in known.items()
+            if status == "running" and self._died(root, entry, mark, found)
+        ]
+        gone = [entry for entry in known if entry not in found]
+        self.changes.gone += len(gone)
+        if changed or died or gone:
+            self._write(root, changed, died, gone)
+        problems = Row.select(Row.entry, Row.problem).where((Row.root == root) & Row.problem.is_null(False))
+        self.changes.problems += [problem for _, problem in self._tuples(problems.order_by(Row.entry))]
+
+    def _known(self, root: str) -> dict[str, tuple[str, str | None]]:
+        rows = Row.select(Row.entry, Row.fingerprint, Row.status).where(Row.root == root)
+        return {entry: (fingerprint, status) for entry, fingerprint, status in self._tuples(rows)}
+
+    def _died(self, root: str, entry: str, fingerprint: str, found: dict[str, Seen]) -> bool:
+        """Return whether a run that ran when last seen, and said nothing since, runs no more."""
+        if entry not in found or found[entry].fingerprint != fingerprint:
+            return False
+        return all(run.status != "running" for run in runs_in(Path(root, entry)))
+
+    def _write(self, root: str, changed: list[dict[str, Any]], died: list[str], gone: list[str]) -> None:
+        with self._database.atomic():
+            for rows in chunked(changed, 500):
+                Row.insert_many(rows).on_conflict_replace().execute(self._database)
+            for entries in chunked(died, 500):
+                ended = Row.update(status="interrupted").where((Row.root == root) & Row.entry.in_(entries))
+                ended.execute(self._database)
+            for entries in chunked(gone, 500):
+                Row.delete().where((Row.root == root) & Row.entry.in_(entries)).execute(self._database)
+
+    def _delete(self, condition: Any) -> None:
+        Row.delete().where(condition).execute(self._database)
+
+
+class Seen(NamedTuple):
+    """A run's folder as it looks from outside."""
+
+    fingerprint: str
+    changed: int
+    """When one of its files last did, in nanoseconds since 1970."""
+    size: int | None
+    """Bytes of its recording."""
+
+
+def look(
+    roots: Sequence[Path], work: Callable[[Index], Found], tell: Tell = lambda _: None, anew: bool = False
+) -> Found:
+    """Return what some work finds in the index of these folders, brought up to date before.
+
+    Args:
+        roots: recordings folders; one that is missing has no runs.
+        work: done once, or once more if the index turns out to be damaged.
+        tell: told what a user is to know of the index itself.
+        anew: whether to forget first what is known of these folders.
+
+    Raises:
+        StorageError: a recordings folder cannot be read.
+    """
+    for _ in range(2):
+        try:
+            with contextlib.closing(_opened(tell)) as database:
+                return _look(database, roots, work, anew)
+        except (OperationalError, OSError) as error:
+            tell(f"The index {index_path()} cannot be used ({error}); the folders are read without it.")
+            break
+        except DatabaseError as error:
+            tell(f"The index {index_path()} is damaged ({error}); it is made anew.")
+            _replace()
+    with contextlib.closing(_made(":memory:")) as database:
+        return _look(database, roots, work, anew)
+
+
+def order_of(text: str) -> list[Any]:
+    """Return the order that a list of fields asks for, `-FIELD` with the largest first.
+
+    What is not known comes last. A value of the configuration is a field too: `config.discount`.
+
+    Raises:
+        RunnerError: there is no such field.
+    """
+    order = []
+    for name in filter(None, (part.strip() for part in text.split(","))):
+        falling, wanted = name.startswith("-"), name.removeprefix("-")
+        if wanted.startswith(SETTING):
+            column = fn.json_extract(Row.settings, setting_path(wanted.removeprefix(SETTING)))
+        else:
+            found = field_of(wanted)
+            column = getattr(Row, found.column or found.name)
+            falling ^= found.kind is Kind.AGE
+        order.append(column.desc(nulls="LAST") if falling else column.asc(nulls="LAST"))
+    return order
+
+
+def index_path() -> Path:
+    """Return the path of the index."""
+    return cache_folder() / INDEX_FILE
+
+
+def _look(
+    database: SqliteDatabase, roots: Sequence[Path], work: Callable[[Index], Found], anew: bool
+) -> Found:
+    index = Index(database, roots)
+    if anew:
+        index.forget()
+    index.refresh()
+    return work(index)
+
+
+def _scan(root: str) -> Iterator[tuple[str, Seen]]:
+    """Yield the folders that have a run's files, by name."""
+    for entry in run_entries(Path(root)):
+        marks, changed, size = [], 0, None
+        for name in _RUN_FILES:
+            try:
+                facts = os.stat(f"{root}{os.sep}{entry}{os.sep}{name}")  # noqa: PTH116 - Path takes thrice as long
+            except OSError:
+                marks.append("")
+                continue
+            marks.append(f"{facts.st_mtime_ns}.{facts.st_size}.{facts.st_ino}")
+            changed = max(changed, facts.st_mtime_ns)
+            size = facts.st_size if name == RECORDING_FILE else None
+        if (marks[0] or marks[2]) and entry.isprintable():
+            yield entry, Seen(" ".join(marks), changed, size)
+
+
+def _read(root: str, entry: str, seen: Seen, now: int) -> dict[str, Any]:
+    """Return the row of a folder, read now."""
+    folder = Path(root, entry)
+    settled = seen.changed + _SETTLED_NS < now
+    place = {"root": root, "entry": entry, "fingerprint": seen.fingerprint if settled else ""}
+    for run in runs_in(folder):
+        return _EMPTY | place | row_of(run, seen.size)
+    return (
+        _EMPTY
+        | place
+        | {"problem": f"{folder}: neither {RUN_FILE} nor {RECORDING_FILE} can be read as a run's."}
+    )
+
+
+_EMPTY: Final[dict[str, Any]] = dict.fromkeys(Row._meta.sorted_field_names)
+
+
+def _opened(tell: Tell) -> SqliteDatabase:
+    """Return the index, opened; made first if it is missing, foreign or of another version."""
+    path = index_path()
+    if not path.exists():
+        _replace()
+    for _ in range(2):
+        database = _connected(os.fspath(path))
+        if (database.application_id, database.user_version) == (_APPLICATION, _VERSION):
+            return database
+        database.close()
+        tell(f"The index {path} is of another version; it is made anew.")
+        _replace()
+    raise OSError("it changes under our hands")
+
+
+def _replace() -> None:
+    """Put an empty index in place of what is there, unless another process just did."""
+    from filelock import FileLock
+
+    path = index_path()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    before = _identity(path)
+    with FileLock(path.with_suffix(".lock"), timeout=_BUSY_SECONDS):
+        if _identity(path) != before:
+            return
+        fresh = path.with_suffix(f".{secrets.token_hex(4)}.tmp")
+        _made(os.fspath(fresh)).close()
+        path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
+        fresh.replace(path)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    with contextlib.suppress(OSError):
+        facts = path.stat()
+        return facts.st_ino, facts.st_ctime_ns
+    return None
+
+
+def _connected(path: str) -> SqliteDatabase:
+    """Return the database of a path, its writers taking turns."""
+    pragmas = {"busy_timeout": _BUSY_SECONDS * 1000, "synchronous": "normal"}
+    database = SqliteDatabase(path, pragmas=pragmas, lock_type="IMMEDIATE", timeout=_BUSY_SECONDS)
+    database.connect()
+    return database
+
+
+def _made(path: str) -> SqliteDatabase:
+    """Return a new, empty index."""
+    database = _connected(path)
+    SchemaManager(Row, database).create_all()
+    database.application_id, database.user_version = _APPLICATION, _VERSION
+    return database

@@ -1,0 +1,168 @@
+"""What the index knows of a run: one row, the columns of a table in SQLite."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+from peewee import BigIntegerField, CompositeKey, Field, FloatField, Model, TextField
+
+from runner.runs import Run
+
+SEEDS: Final = 2**64
+_LARGEST: Final = 2**63 - 1
+_MODES: Final = {("joint", "team"): "cooperative", ("per_agent", "individual"): "competitive"}
+_DEPTH: Final = 20
+_TEXT: Final = 4000
+"""The most characters kept of a text, and the most settings of a configuration."""
+
+
+class SeedField(Field):
+    """A seed, from 0 to 2^64 - 1, kept in order as SQLite's signed integers."""
+
+    field_type = "BIGINT"
+
+    def db_value(self, value: int | None) -> int | None:
+        """Return what is stored of a seed."""
+        return None if value is None else value - 2**63
+
+    def python_value(self, value: int | None) -> int | None:
+        """Return the seed that is stored."""
+        return None if value is None else value + 2**63
+
+
+class Row(Model):
+    """A run's folder as it was last read; a folder without a readable run has a `problem` and no `id`."""
+
+    root = TextField()
+    """The recordings folder, absolute."""
+    entry = TextField()
+    """The run's folder in it."""
+    fingerprint = TextField()
+    """What tells whether its files changed."""
+    problem = TextField(null=True)
+
+    id = TextField(null=True)
+    name = TextField(null=True)
+    config = TextField(null=True)
+    seed = SeedField(null=True)
+    status = TextField(null=True)
+    tags = TextField(null=True)
+    """A tag a line."""
+    note = TextField(null=True)
+    words = TextField(null=True)
+    """Id, name, configuration's name, tags and note, each on lines of its own."""
+    created = BigIntegerField(null=True)
+    """Milliseconds since 1970, UTC."""
+    episodes = BigIntegerField(null=True)
+    episodes_to_do = BigIntegerField(null=True)
+    steps = BigIntegerField(null=True)
+    train_steps = BigIntegerField(null=True)
+    eval_steps = BigIntegerField(null=True)
+    finish_percent = FloatField(null=True)
+    mean_length = FloatField(null=True)
+    mean_penalties = FloatField(null=True)
+    seconds = FloatField(null=True)
+    bytes = BigIntegerField(null=True)
+    digest = TextField(null=True)
+    mode = TextField(null=True)
+    environment = TextField(null=True)
+    host = TextField(null=True)
+    git = TextField(null=True)
+    archive = TextField(null=True)
+    settings = TextField(null=True)
+    """The configuration as a JSON object of paths and plain values."""
+
+    class Meta:
+        """How the table is made."""
+
+        table_name = "runs"
+        primary_key = CompositeKey("root", "entry")
+        without_rowid = True
+        indexes = ((("root", "entry", "fingerprint", "status"), False), (("digest",), False))
+
+
+def row_of(run: Run, size: int | None) -> dict[str, Any]:
+    """Return what is kept of a run, by column; the place and the fingerprint are not in it.
+
+    Args:
+        run: as its folder says now.
+        size: bytes of its recording; None if there is none.
+    """
+    facts, config, summary = run.facts, run.facts.get("config", {}), run.summary
+    last = _mapping(summary.get("last_evaluation"))
+    made_by = _mapping(facts.get("provenance"))
+    train, evaluation = whole(summary.get("train_steps")), whole(summary.get("eval_steps"))
+    called = text(config.get("name"))
+    return {
+        "id": run.run_id,
+        "name": text(run.name),
+        "config": called,
+        "seed": run.seed,
+        "status": text(run.status),
+        "tags": "\n".join(run.tags),
+        "note": text(run.note),
+        "words": text("\n".join([run.run_id, run.name, called or "", *run.tags, run.note]), 3 * _TEXT),
+        "created": math.floor(run.created.timestamp() * 1000),
+        "episodes": whole(summary.get("episodes")),
+        "episodes_to_do": whole(config.get("episodes")),
+        "steps": None if train is None or evaluation is None else train + evaluation,
+        "train_steps": train,
+        "eval_steps": evaluation,
+        **{key: number(last.get(key)) for key in ("finish_percent", "mean_length", "mean_penalties")},
+        "seconds": number(summary.get("seconds")),
+        "bytes": size,
+        "digest": text(summary.get("content_digest")),
+        "mode": _mode(config),
+        "environment": text(_mapping(config.get("env")).get("id")),
+        "host": text(made_by.get("host") or _mapping(facts.get("owner")).get("host")),
+        "git": text(made_by.get("git")),
+        "archive": text(run.archive.get("target")),
+        "settings": json.dumps(dict(_flat(config))),
+    }
+
+
+def text(value: Any, most: int = _TEXT) -> str | None:
+    """Return a text that SQLite can hold, cut off where it is too long; None if it is none."""
+    if not isinstance(value, str):
+        return None
+    return value[:most].encode(errors="replace").decode()
+
+
+def whole(value: Any) -> int | None:
+    """Return a whole number that SQLite can hold; None if it is none."""
+    return value if type(value) is int and abs(value) <= _LARGEST // 2 else None
+
+
+def number(value: Any) -> float | None:
+    """Return a finite number; None if it is none."""
+    if type(value) not in (int, float):
+        return None
+    try:
+        return float(value) if math.isfinite(value) else None
+    except OverflowError:
+        return None
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _mode(config: Mapping[str, Any]) -> str | None:
+    tables, rewards = config.get("tables"), config.get("rewards")
+    return _MODES.get((tables, rewards)) if isinstance(tables, str) and isinstance(rewards, str) else None
+
+
+def _flat(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Yield the plain values in a configuration by path: `evaluation.every`; lists by position."""
+    if isinstance(value, Mapping | list):
+        parts = enumerate(value) if isinstance(value, list) else value.items()
+        for (key, part), _ in zip(parts, range(_TEXT), strict=False):
+            if depth < _DEPTH:
+                yield from _flat(part, f"{path}.{key}" if path else str(key), depth + 1)
+    elif isinstance(value, str):
+        yield path, text(value)
+    elif value is None or isinstance(value, bool) or number(value) is not None:
+        yield path, value

@@ -1,0 +1,154 @@
+"""What uses the disk: the files in runs' folders, and what is cached for them."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from runner.cache import EXPORTS, RESTORED, cache_folder
+from runner.labels import LABELS_FILE, LOCK_FILE
+from runner.runs import OWNER_LOCK, RECORDING_FILE, RUN_FILE
+
+REMOVED: Final = ".removed-"
+"""What the folder of a run is called from the moment it is removed until its files are."""
+
+_OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, OWNER_LOCK))
+_LEFT_OVER: Final = re.compile(
+    r"recording\.(anew|repairing|rerecording)|recording\.damaged-\d+\.mcap|(run|labels)\.[0-9a-f]{8}\.tmp"
+)
+_ID: Final = re.compile(r"\w+")
+
+
+@dataclass
+class Contents:
+    """What is in a run's folder, in bytes; links to elsewhere and files with other names count as nothing."""
+
+    recording: int = 0
+    other: int = 0
+    """All else, what is strange too."""
+    left_over: int = 0
+    """Of that: what a repair or an interrupted command left behind."""
+    freed: int = 0
+    """What removing the run's own files would free."""
+    strange: list[str] = field(default_factory=list)
+    """Names that are no run's: files of the user's own, folders, links."""
+
+
+def contents_of(folder: Path) -> Contents:
+    """Return what is in a run's folder.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    found = Contents()
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            try:
+                facts = entry.stat(follow_symlinks=False)
+            except FileNotFoundError:
+                continue
+            own = stat.S_ISREG(facts.st_mode) and belongs(entry.name)
+            size = _size_within(entry.path) if stat.S_ISDIR(facts.st_mode) else facts.st_size
+            if entry.name == RECORDING_FILE and own:
+                found.recording = size
+            else:
+                found.other += size
+            if own:
+                found.freed += size if facts.st_nlink == 1 else 0
+                found.left_over += size if _LEFT_OVER.fullmatch(entry.name) else 0
+            else:
+                found.strange.append(entry.name)
+    found.strange.sort()
+    return found
+
+
+def belongs(name: str) -> bool:
+    """Return whether a file of this name in a run's folder is the run's."""
+    return name in _OWN or _LEFT_OVER.fullmatch(name) is not None
+
+
+def cached(part: str) -> Counter[str]:
+    """Return the bytes cached for each run, by its id; what is for several counts for the first.
+
+    Args:
+        part: the folder in the cache, `EXPORTS` or `RESTORED`.
+    """
+    found: Counter[str] = Counter()
+    for name, size in _sizes(cache_folder() / part):
+        run_id = _ID.match(name)
+        found[run_id[0] if run_id else name] += size
+    return found
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a run uses of the disk, in bytes."""
+
+    row: dict[str, Any]
+    """The run, as the index has it."""
+    contents: Contents
+    exports: int
+    restored: int
+
+    @property
+    def total(self) -> int:
+        """All of it."""
+        return self.contents.recording + self.contents.other + self.exports + self.restored
+
+
+def usages(rows: Sequence[dict[str, Any]]) -> list[Usage]:
+    """Return what runs use of the disk, the largest first."""
+    exports, restored = cached(EXPORTS), cached(RESTORED)
+    found = [Usage(row, _contents(row), exports[row["id"]], restored[row["id"]]) for row in rows]
+    return sorted(found, key=lambda usage: (-usage.total, usage.row["id"]))
+
+
+def strays(root: Path) -> list[Path]:
+    """Return the folders of runs that were being removed when the command doing so was ended."""
+    try:
+        with os.scandir(root) as entries:
+            return sorted(
+                Path(entry.path)
+                for entry in entries
+                if entry.name.startswith(REMOVED) and entry.is_dir(follow_symlinks=False)
+            )
+    except OSError:
+        return []
+
+
+def _contents(row: dict[str, Any]) -> Contents:
+    try:
+        return contents_of(Path(row["root"], row["entry"]))
+    except OSError:
+        return Contents()  # removed just now
+
+
+def _sizes(folder: Path) -> Iterator[tuple[str, int]]:
+    """Yield name and bytes of what is in a folder; nothing if it is not there."""
+    try:
+        with os.scandir(folder) as entries:
+            for entry in entries:
+                is_folder = entry.is_dir(follow_symlinks=False)
+                yield (
+                    entry.name,
+                    _size_within(entry.path) if is_folder else entry.stat(follow_symlinks=False).st_size,
+                )
+    except OSError:
+        return
+
+
+def _size_within(folder: str) -> int:
+    total = 0
+    for place, _, names in os.walk(folder):
+        for name in names:
+            try:
+                total += os.lstat(os.path.join(place, name)).st_size  # noqa: PTH118
+            except OSError:
+                continue
+    return total

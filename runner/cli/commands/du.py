@@ -1,0 +1,143 @@
+"""`dualtaxi du`: what uses the disk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli.options import filter_argument, folders_option, json_option
+from runner.cli.output import UNKNOWN, draw, facts, print_json, say, size, table, title
+
+if TYPE_CHECKING:
+    from runner.catalogue.index import Index
+    from runner.catalogue.usage import Usage
+
+
+@click.command("du")
+@filter_argument
+@folders_option
+@click.option(
+    "--limit",
+    type=click.IntRange(min=0),
+    default=20,
+    show_default=True,
+    metavar="N",
+    help="Show the N largest runs, 0 for all.",
+)
+@json_option
+def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as_json: bool) -> None:
+    """Tell what the runs that fit FILTER (as in `dualtaxi ls`), or all, use of the disk; the largest first.
+
+    Told are recordings; exports that `view` made, and recordings restored from archives, both kept in the
+    user's cache and made again when needed; and what else is in the runs' folders. Below stand the totals,
+    and what could be freed.
+
+    \b
+    Examples:
+      dualtaxi du
+      dualtaxi du status:finished age:>30d --limit 5
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.catalogue.filters import parse
+    from runner.catalogue.index import look
+    from runner.catalogue.usage import usages
+    from runner.cli.listing import with_originals
+
+    chosen = parse(" ".join(words))
+
+    def work(index: Index) -> list[dict[str, Any]]:
+        return with_originals(index.select(chosen), index)
+
+    found = usages(look(recordings, work, say))
+    freeable = _freeable(found, recordings)
+    if as_json:
+        print_json(
+            {"runs": [_as_json(usage) for usage in found], "total": _totals(found), "freeable": freeable}
+        )
+    elif found:
+        _draw(found, freeable, limit or len(found))
+    else:
+        say(f"No run in {', '.join(map(str, recordings))} fits." if words else "No runs yet.")
+
+
+def _as_json(usage: Usage) -> dict[str, Any]:
+    row = usage.row
+    told = {key: row[key] for key in ("name", "status", "same_as")}
+    path = str(Path(row["root"], row["entry"]))
+    return {"run_id": row["id"], **told, "path": path, **_totals([usage])}
+
+
+def _totals(found: Sequence[Usage]) -> dict[str, int]:
+    return {
+        "recording": sum(usage.contents.recording for usage in found),
+        "exports": sum(usage.exports for usage in found),
+        "restored": sum(usage.restored for usage in found),
+        "other": sum(usage.contents.other for usage in found),
+        "total": sum(usage.total for usage in found),
+    }
+
+
+def _freeable(found: Sequence[Usage], recordings: Sequence[Path]) -> dict[str, int]:
+    """Return the bytes that could be freed, by what they are; not those of runs that are to stay."""
+    from runner.catalogue.usage import contents_of, strays
+    from runner.labels import KEEP
+
+    free = [u for u in found if KEEP not in u.row["tags"].split() and u.row["status"] != "running"]
+    cut_off = [contents_of(stray) for root in recordings for stray in strays(root)]
+    return {
+        "same_content": sum(u.contents.freed for u in free if u.row["same_as"]),
+        "unfinished": sum(u.contents.freed for u in free if u.row["status"] in ("interrupted", "failed")),
+        "left_over": sum(u.contents.left_over for u in free),
+        "cached": sum(u.exports + u.restored for u in found),
+        "half_removed": sum(contents.recording + contents.other for contents in cut_off),
+    }
+
+
+def _draw(found: Sequence[Usage], freeable: dict[str, int], limit: int) -> None:
+    kinds = ("recording", "exports", "restored", "other", "total")
+    drawn = table(
+        "id",
+        "name",
+        "status",
+        *kinds,
+        "same as",
+        left=("id", "name", "status", "same as"),
+        shrinking=("name",),
+    )
+    for usage in found[:limit]:
+        row = usage.row
+        bytes_of = [_bytes(number) for number in _totals([usage]).values()]
+        drawn.add_row(row["id"], row["name"], row["status"], *bytes_of, row["same_as"] or "")
+    if found[limit:]:
+        others = [_bytes(number) for number in _totals(found[limit:]).values()]
+        drawn.add_row(f"{len(found) - limit:,} more", "", "", *others, "")
+    drawn.add_row("all", "", "", *[_bytes(number) for number in _totals(found).values()], "", style="bold")
+    draw(drawn)
+    told = {
+        _FREED_BY[kind][0]: f"{size(number)}  {_FREED_BY[kind][1]}"
+        for kind, number in freeable.items()
+        if number
+    }
+    if told:
+        draw(title("Could be freed"), facts(told))
+
+
+_FREED_BY = {
+    "same_content": (
+        "recorded before",
+        "the same content is there already: `dualtaxi rm` those with `same as`",
+    ),
+    "unfinished": (
+        "unfinished",
+        "`dualtaxi prune --status interrupted --status failed`, if not to be resumed",
+    ),
+    "left_over": ("left over", "damaged originals that a repair kept, and what interrupted commands left"),
+    "cached": ("cached", "made again when needed; remove the folder dualtaxi in your cache"),
+    "half_removed": ("half removed", "the next `dualtaxi rm` or `prune` removes the rest"),
+}
+
+
+def _bytes(number: int) -> str:
+    return size(number) if number else UNKNOWN

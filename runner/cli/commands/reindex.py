@@ -1,0 +1,78 @@
+"""`dualtaxi reindex`: the index of runs, made anew."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from runner.cli.options import folders_option, json_option
+from runner.cli.output import duration, facts, print_json, say
+
+if TYPE_CHECKING:
+    from runner.catalogue.index import Index
+
+
+@dataclass(frozen=True)
+class _Found:
+    runs: int
+    copies: int
+    statuses: dict[str, int]
+    problems: list[str]
+
+
+@click.command("reindex")
+@folders_option
+@json_option
+@click.pass_context
+def command(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> None:
+    """Read every run of the recordings folder again, and make its index anew.
+
+    It is never needed: `ls` and the other commands look at what changed by themselves, and nothing is kept in
+    the index alone. Exit code 1 if there are folders with files of a run of which nothing can be made.
+
+    \b
+    Examples:
+      dualtaxi reindex
+      dualtaxi reindex --recordings /data/runs --recordings recordings
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.catalogue.index import index_path, look
+
+    began = time.monotonic()
+    found = look(recordings, _found, say, anew=True)
+    took = time.monotonic() - began
+    if as_json:
+        told = {"runs": found.runs, "same_content": found.copies, "statuses": found.statuses}
+        print_json(told | {"problems": found.problems, "seconds": round(took, 3), "index": str(index_path())})
+    else:
+        _print(found, took, str(index_path()))
+    ctx.exit(1 if found.problems else 0)
+
+
+def _found(index: Index) -> _Found:
+    from runner.catalogue.filters import Filter
+    from runner.cli.listing import with_originals
+
+    rows = with_originals(index.select(Filter(None)), index)
+    statuses = [row["status"] for row in rows]
+    return _Found(
+        runs=len(rows),
+        copies=sum(row["same_as"] is not None for row in rows),
+        statuses={status: statuses.count(status) for status in sorted(set(statuses))},
+        problems=index.changes.problems,
+    )
+
+
+def _print(found: _Found, took: float, index: str) -> None:
+    from runner.cli.output import draw
+
+    standing = ", ".join(f"{count:,} {status}" for status, count in found.statuses.items())
+    told = {"runs": f"{found.runs:,}" + (f": {standing}" if standing else "")}
+    if found.copies:
+        told["same"] = f"{found.copies:,} of them recorded what another did before"
+    draw(facts(told | {"took": duration(took), "index": index}))
+    for problem in found.problems:
+        say(problem)

@@ -1,0 +1,43 @@
+"""`dualtaxi rename`: another name for a run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import click
+
+from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.output import print_json
+
+
+@click.command("rename")
+@run_argument
+@click.argument("name", required=False)
+@click.option("--original", is_flag=True, help="Call it again as in the beginning.")
+@recordings_option
+@json_option
+def command(run_name: str, name: str | None, original: bool, recordings: Path | None, as_json: bool) -> None:
+    """Give a run another name. Its id stays, and so does what its recording says.
+
+    The name stands in labels.json beside the recording.
+
+    \b
+    Examples:
+      dualtaxi rename @latest patient
+      dualtaxi rename patient --original
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.api import checked_name
+    from runner.cli.working import relabel
+
+    if original == (name is not None):
+        raise click.UsageError("expected a NAME, or --original.")
+    called = checked_name(name) or ""
+    run = find(run_name, recordings)
+    before, first = run.name, str(run.facts["name"])
+    labels = relabel(run, lambda was: replace(was, name="" if called == first else called))
+    now = labels.name or first
+    if as_json:
+        print_json({"run_id": run.run_id, "name": now})
+    else:
+        click.echo(f"{run.run_id}  {now}" + (f", was {before}" if now != before else ""))

@@ -1,0 +1,44 @@
+"""`dualtaxi rm`: remove runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.options import RunName, find, json_option, recordings_option
+from runner.cli.removing import carry_out, dry_run_option, force_option, yes_option
+from runner.errors import RunnerError
+from runner.runs import recordings_folder
+
+
+@click.command("rm")
+@click.argument("run_names", metavar="RUN...", nargs=-1, required=True, type=RunName())
+@recordings_option
+@yes_option
+@dry_run_option
+@force_option
+@json_option
+def command(
+    run_names: tuple[str, ...], recordings: Path | None, yes: bool, dry_run: bool, force: bool, as_json: bool
+) -> None:
+    """Remove runs with their recordings, after showing them and asking.
+
+    A run that is running, or tagged `keep`, is refused, and so is one whose folder holds files that no run
+    writes; then nothing is removed. No link is followed. Archives stay.
+
+    \b
+    Examples:
+      dualtaxi rm k3v9m2xq p7
+      dualtaxi rm @latest --dry-run
+      dualtaxi ls --quiet status:failed | xargs dualtaxi rm --yes
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.catalogue.removal import plan
+
+    root = recordings_folder(recordings)
+    runs = {run.folder.resolve(): run for run in (find(name, recordings) for name in run_names)}
+    removals = [plan(run, root, force) for run in runs.values()]
+    refused = [f"run {each.run.run_id} stays: {each.refusal}." for each in removals if each.refusal]
+    if refused:
+        raise RunnerError("\n".join([*refused, "Nothing was removed."]))
+    carry_out(removals, {}, force, yes, dry_run, as_json)

@@ -1,0 +1,113 @@
+"""What the commands that remove runs share: showing what would go, asking, doing it, telling."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from runner.cli.output import UNKNOWN, age, draw, number, print_json, say, size, table
+from runner.errors import RunnerError
+
+if TYPE_CHECKING:
+    from runner.catalogue.removal import Removal
+
+yes_option: Final = click.option("--yes", "-y", is_flag=True, help="Do not ask.")
+force_option: Final = click.option(
+    "--force", is_flag=True, help="Also remove files and folders in a run's folder that no run writes."
+)
+dry_run_option: Final = click.option(
+    "--dry-run", is_flag=True, help="Tell what would go and how much is freed, and leave it."
+)
+
+
+def carry_out(
+    removals: Sequence[Removal], kept: dict[str, str], force: bool, yes: bool, dry_run: bool, as_json: bool
+) -> None:
+    """Show what is to go, ask, remove it and tell what was freed.
+
+    Args:
+        removals: what is to go; none of them refused.
+        kept: what stays for all that, id to why; for programs.
+        force: remove strange files as well.
+        yes: do not ask.
+        dry_run: remove nothing.
+        as_json: tell it as JSON.
+
+    Raises:
+        RunnerError: there is nobody to ask.
+    """
+    from runner.catalogue.removal import clean, remove, total
+
+    if removals and not as_json:
+        _draw(removals)
+    if removals and not dry_run:
+        _ask(removals, yes)
+        for removal in removals:
+            remove(removal, force)
+        for root in {removal.root for removal in removals}:
+            clean(root)
+    if as_json:
+        print_json(_as_json(removals, kept, dry_run))
+    elif dry_run:
+        say(f"Nothing was removed; it would free {size(total(removals))}.")
+    else:
+        runs = "1 run" if len(removals) == 1 else f"{len(removals):,} runs"
+        click.echo(f"Removed {runs}, freed {size(total(removals))}.")
+
+
+def _ask(removals: Sequence[Removal], yes: bool) -> None:
+    from runner.catalogue.removal import total
+
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise RunnerError("there is no terminal to ask on; --yes removes without asking, --dry-run tells.")
+    runs = "this run" if len(removals) == 1 else f"these {len(removals):,} runs"
+    click.confirm(f"Remove {runs} for good, and free {size(total(removals))}?", abort=True, err=True)
+
+
+def _as_json(removals: Sequence[Removal], kept: dict[str, str], dry_run: bool) -> dict[str, Any]:
+    from runner.catalogue.removal import total
+
+    runs = [
+        {
+            "run_id": removal.run.run_id,
+            "name": removal.run.name,
+            "status": removal.run.status if dry_run else removal.run.facts["status"],
+            "path": str(removal.run.folder.absolute()),
+            "bytes": removal.freed,
+        }
+        for removal in removals
+    ]
+    told = {"dry_run": dry_run, "freed": total(removals)}
+    return {**told, "removed": runs, "kept": [{"run_id": key, "why": why} for key, why in kept.items()]}
+
+
+def _draw(removals: Sequence[Removal]) -> None:
+    from datetime import UTC, datetime
+
+    headings = ("id", "name", "seed", "status", "finished %", "age", "frees")
+    drawn = table(*headings, left=("id", "name", "status"), shrinking=("name",))
+    now = datetime.now(UTC)
+    for removal in removals:
+        run = removal.run
+        last = run.summary.get("last_evaluation") or {}
+        drawn.add_row(
+            run.run_id,
+            run.name,
+            str(run.seed),
+            run.status,
+            number(last.get("finish_percent")) if last else UNKNOWN,
+            age((now - run.created).total_seconds()),
+            size(removal.freed),
+        )
+    draw(drawn)
+    for removal in removals:
+        if removal.run.archive:
+            say(
+                f"The archive of {removal.run.run_id} at {removal.run.archive.get('target', 'its place')} "
+                "stays; only what points to it goes."
+            )
