@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from runner.errors import RunnerError
     from runner.recording.reader import Recording, open_recording
     from runner.runs import Run, find_run, list_runs
+    from runner.wrappers.many import record_parallel, record_vector
     from runner.wrappers.single import record
 
 __version__ = "0.1.0"
@@ -36,6 +37,8 @@ __all__ = [
     "list_runs",
     "open_recording",
     "record",
+    "record_parallel",
+    "record_vector",
     "run",
     "run_all",
 ]
@@ -49,6 +52,8 @@ _HOME = {
     "list_runs": "runner.runs",
     "open_recording": "runner.recording.reader",
     "record": "runner.wrappers.single",
+    "record_parallel": "runner.wrappers.many",
+    "record_vector": "runner.wrappers.many",
     "run": "runner.api",
     "run_all": "runner.api",
 }

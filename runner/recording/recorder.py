@@ -119,6 +119,10 @@ class Recorder:
         """Bytes in the file so far."""
         return self._file.size if self._file is not None else 0
 
+    def blank(self, topic: Topic, n: int) -> NDArray[np.void]:
+        """Return n records of a fixed-width topic of their own, with every constant byte set."""
+        return schema.blank_records(topic, self._lanes[topic].sizes, n)
+
     def block(self, topic: Topic) -> NDArray[np.void]:
         """Return the free records of the topic's open block, to be filled from the first on."""
         lane = self._lanes[topic]

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
 from blake3 import blake3
@@ -28,7 +28,6 @@ from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.writer import RecordingFile
 from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder
 from runner.wrappers.described import Described, as_json
-from runner.wrappers.rows import Rows
 
 MADE_BY: Final = "runner.record"
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
@@ -92,7 +91,28 @@ class Plan:
                 raise ConfigError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
 
 
-class Loop:
+class Putting(Protocol):
+    """What puts down the steps of one phase."""
+
+    @property
+    def filled(self) -> int:
+        """Steps that the recorder has not taken yet."""
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """The steps of the phase so far, and the number of the episode under way, or to come."""
+
+    def open(self) -> None:
+        """Take blocks from the recorder."""
+
+    def commit(self) -> None:
+        """Hand all steps to the recorder."""
+
+
+R = TypeVar("R", bound=Putting)
+
+
+class Loop(Generic[R]):
     """A loop that is being recorded; safe to use from several threads.
 
     Args:
@@ -105,15 +125,15 @@ class Loop:
         StorageError: the recordings folder cannot be written.
     """
 
-    def __init__(self, described: Described, plan: Plan, rows: Callable[[Recorder, str], Rows]) -> None:
+    def __init__(self, described: Described, plan: Plan, rows: Callable[[Recorder, str], R]) -> None:
         from runner.api import checked_name
 
         config = plan.mapping(described)
         checked_name(plan.name)
         self._started = time.monotonic()
         self._make_rows = rows
-        self._rows: dict[str, Rows] = {}
-        self._active: Rows | None = None
+        self._rows: dict[str, R] = {}
+        self._active: R | None = None
         self.described = described
         self.plan = plan
         self.lock = threading.RLock()
@@ -169,7 +189,7 @@ class Loop:
 
     # --- what is recorded -----------------------------------------------------------------------------
 
-    def rows(self, phase: str) -> Rows:
+    def rows(self, phase: str) -> R:
         """Return what puts down the steps of a phase.
 
         Raises:
@@ -182,7 +202,7 @@ class Loop:
                 self._rows[phase] = self._make_rows(self._recorder, phase)
         return self._rows[phase]
 
-    def activate(self, rows: Rows) -> None:
+    def activate(self, rows: R) -> None:
         """Say whose steps come now; times go on in the order in which steps are taken. Holds the lock."""
         if self.closed:
             raise RunnerError(
@@ -195,7 +215,7 @@ class Loop:
         self._active = rows
 
     @property
-    def active(self) -> Rows | None:
+    def active(self) -> R | None:
         """Whose steps came last."""
         return self._active
 

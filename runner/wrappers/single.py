@@ -6,22 +6,23 @@ import contextlib
 import os
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Literal, Self
+from typing import Any, Generic, Literal, Self
 
 import gymnasium
 
 from runner.errors import ConfigError
 from runner.runs import Run
 from runner.wrappers.described import describe
-from runner.wrappers.loop import Loop, Plan
-from runner.wrappers.rows import ROWS
+from runner.wrappers.loop import Loop, Plan, R
+from runner.wrappers.rows import ROWS, Rows
 
 
-class Recorded:
+class Recorded(Generic[R]):
     """What every recorded environment offers beside the environment; a context manager."""
 
-    _loop: Loop
+    _loop: Loop[R]
     _phase: str
+    _rows: R
 
     @property
     def run(self) -> Run:
@@ -61,10 +62,10 @@ class Recorded:
             self._enter(before)
 
     def _enter(self, phase: str) -> None:
-        self._loop.rows(phase)
         self._phase = phase
+        self._rows = self._loop.rows(phase)
 
-    def _own(self, loop: Loop) -> None:
+    def _own(self, loop: Loop[R]) -> None:
         """Begin a recording; should it never be closed, it is when the process ends."""
         self._loop = loop
         weakref.finalize(self, loop.close, "interrupted")
@@ -79,10 +80,10 @@ class Recorded:
             self._loop.close("failed", f"{type(error).__name__}: {error}")
 
 
-class RecordedEnv(Recorded, gymnasium.Wrapper[Any, Any, Any, Any]):
+class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     """A Gymnasium environment whose every reset and step is recorded; made by `record`."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], loop: Loop, phase: str = "train") -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], loop: Loop[Rows], phase: str = "train") -> None:
         gymnasium.Wrapper.__init__(self, env)
         self._env_step = env.step
         self._lock = loop.lock
@@ -92,8 +93,7 @@ class RecordedEnv(Recorded, gymnasium.Wrapper[Any, Any, Any, Any]):
         self._enter(phase)
 
     def _enter(self, phase: str) -> None:
-        self._phase = phase
-        self._rows = self._loop.rows(phase)
+        super()._enter(phase)
         self._take = self._rows.take
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -159,7 +159,7 @@ def record(
     info: Sequence[str] = (),
     frames_every: int = 0,
     frame_format: str = "png",
-    into: Recorded | None = None,
+    into: RecordedEnv | None = None,
     phase: str = "train",
     **packing: Any,
 ) -> RecordedEnv:
@@ -195,7 +195,7 @@ def record(
     if into is not None:
         return _beside(env, into, phase)
     described = describe(env, env.observation_space, env.action_space)
-    plan = _plan(recordings, name, seed, config, info, frames_every, frame_format, packing)
+    plan = plan_of(recordings, name, seed, config, info, frames_every, frame_format, packing)
     if frames_every and env.render_mode != "rgb_array":
         raise ConfigError(
             f"frames_every: found an environment with render_mode={env.render_mode!r}, expected "
@@ -207,7 +207,7 @@ def record(
     return recorded
 
 
-def _beside(env: gymnasium.Env[Any, Any], into: Recorded, phase: str) -> RecordedEnv:
+def _beside(env: gymnasium.Env[Any, Any], into: RecordedEnv, phase: str) -> RecordedEnv:
     """Return an environment recorded into the run of another one."""
     loop = into._loop
     spaces = loop.described.observation, loop.described.action
@@ -218,7 +218,7 @@ def _beside(env: gymnasium.Env[Any, Any], into: Recorded, phase: str) -> Recorde
     return RecordedEnv(env, loop, phase)
 
 
-def _plan(
+def plan_of(
     recordings: str | os.PathLike[str] | None,
     name: str | None,
     seed: int,

@@ -1,0 +1,170 @@
+"""What recording somebody's own loop costs: against the loop alone, and against Minari's DataCollector.
+
+All in one run, turn by turn: the same environment, seed and actions. Time is the process's processor time
+for a loop and its ending, so that other threads count too; `added` is the calling thread's own.
+Minari is no part of the project: `pip install "minari[hdf5]"` for its figures.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import statistics
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+
+import runner
+from benchmarks.figures import Figure, figure
+from benchmarks.processes import run
+
+Env = gymnasium.Env[Any, Any]
+TARGETS = {"Taxi-v4": (36, 30), "CartPole-v1": (60, 45)}
+"""Bytes a step: at least, aim."""
+
+MEMORY = """
+import sys, runner
+from gymnasium import Env, spaces
+
+class Quick(Env):
+    observation_space, action_space, t = spaces.Discrete(500), spaces.Discrete(6), 0
+    def reset(self, *, seed=None, options=None):
+        self.t = 0
+        return 0, {}
+    def step(self, action):
+        self.t += 1
+        return self.t * 7 % 500, -1, False, self.t == 200, {}
+
+with runner.record(Quick(), sys.argv[1]) as env:
+    env.reset()
+    for k in range(int(sys.argv[2])):
+        if env.step(k % 6)[3]:
+            env.reset()
+"""
+"""A loop whose environment takes no time."""
+
+
+def measure(quick: bool) -> list[Figure]:
+    """Return added time and bytes a step, the ratios to Minari, and the memory of a long loop."""
+    steps, repetitions = (20_000, 3) if quick else (100_000, 5)
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        os.environ["MINARI_DATASETS_PATH"] = str(Path(folder, "minari"))
+        figures = []
+        for name in ("Taxi-v4", "CartPole-v1"):
+            figures += _environment(name, Path(folder), steps, repetitions)
+        for name, kind in (("Blackjack-v1", "short"), ("Taxi-v4", "long")):
+            figures += _against_minari(name, kind, Path(folder), steps // 10, repetitions)
+        figures += _memory(Path(folder), 10_000_000 if not quick else 1_000_000)
+    return figures
+
+
+def drive(env: Env, steps: int) -> None:
+    """Play at random."""
+    env.action_space.seed(1)
+    env.reset(seed=1)
+    sample, step = env.action_space.sample, env.step
+    for _ in range(steps):
+        _, _, terminated, truncated, _ = step(sample())
+        if terminated or truncated:
+            env.reset()
+
+
+def _environment(name: str, folder: Path, steps: int, repetitions: int) -> list[Figure]:
+    """Return what recording an environment adds to a step, and takes on disk."""
+    added, whole, size = [], [], 0.0
+    for _ in range(repetitions):
+        with contextlib.closing(gymnasium.make(name)) as env:
+            alone = _times(lambda env=env: drive(env, steps))  # type: ignore[misc]
+        with runner.record(gymnasium.make(name), folder / "recordings") as env:
+            recorded = _times(lambda env=env: drive(env, steps))  # type: ignore[misc]
+        size = env.run.summary["bytes"] / steps
+        added.append((recorded[0] - alone[0]) / steps * 1e6)
+        whole.append((recorded[1] - alone[1]) / steps * 1e6)
+    targets = (5, 2) if name == "Taxi-v4" else None
+    return [
+        figure(
+            f"added to a step, {name}",
+            added,
+            "us",
+            targets,
+            higher_is_better=False,
+            detail=f"processor time of the loop's thread; of all threads {statistics.median(whole):.2f} us",
+        ),
+        figure(f"  on disk, {name}", [size], "bytes/step", TARGETS[name], higher_is_better=False),
+    ]
+
+
+def _times(work: Callable[[], object]) -> tuple[float, float]:
+    """Return the processor time of this thread and of the process."""
+    thread, process = time.thread_time(), time.process_time()
+    work()
+    return time.thread_time() - thread, time.process_time() - process
+
+
+def _against_minari(name: str, kind: str, folder: Path, steps: int, repetitions: int) -> list[Figure]:
+    """Return how many times less recording costs than Minari's collector, to the file's end."""
+    try:
+        import minari
+    except ImportError:
+        return []
+    ratios, ours, theirs = [], [], []
+    for _ in range(repetitions):
+        alone = _whole(lambda: contextlib.nullcontext(gymnasium.make(name)), steps)
+        with_ours = _whole(lambda: runner.record(gymnasium.make(name), folder / "recordings"), steps)
+        with_theirs = _whole(lambda: _collector(minari, name), steps)
+        ours.append((with_ours - alone) / steps * 1e6)
+        theirs.append((with_theirs - alone) / steps * 1e6)
+        ratios.append(theirs[-1] / ours[-1])
+    return [
+        figure(
+            f"less than Minari's collector, {kind} episodes",
+            ratios,
+            "x",
+            (8, 20),
+            detail=f"{name}: {statistics.median(ours):.2f} us added to a step, all threads and closing; "
+            f"Minari {statistics.median(theirs):.1f} us",
+        )
+    ]
+
+
+@contextlib.contextmanager
+def _collector(minari: Any, name: str) -> Iterator[Env]:
+    env = minari.DataCollector(gymnasium.make(name), record_infos=False)
+    yield env
+    env._flush_to_storage()
+    env.close()
+
+
+def _whole(make: Callable[[], Any], steps: int) -> float:
+    """Return the processor time of a loop, from the first step to the end of the file."""
+    with contextlib.ExitStack() as stack:
+        env = stack.enter_context(make())
+        begin = time.process_time()
+        drive(env, steps)
+        stack.close()
+    return time.process_time() - begin
+
+
+def _memory(folder: Path, steps: int) -> list[Figure]:
+    early, late = (
+        run([sys.executable, "-c", MEMORY, str(folder / "recordings"), str(count)])
+        for count in (steps // 10, steps)
+    )
+    return [
+        figure(
+            f"peak memory, a loop of {steps / 1e6:g} M steps",
+            [late.peak_megabytes],
+            "MB",
+            (250, 250),
+            higher_is_better=False,
+            detail=f"{early.peak_megabytes:.0f} MB for a tenth of them; "
+            f"{late.cpu_seconds / steps * 1e6:.2f} us of processor time a step, all of it",
+        )
+    ]

@@ -1,0 +1,251 @@
+"""`runner.record_vector` and `runner.record_parallel`: vector environments, and PettingZoo's games."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Literal, Self
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+
+from runner.errors import ConfigError, EnvironmentNotUsable
+from runner.mdp import MAX_AGENTS
+from runner.wrappers.described import Described, describe, kind_of
+from runner.wrappers.loop import Loop
+from runner.wrappers.single import Recorded, plan_of
+from runner.wrappers.staged import AgentRows, VectorRows
+
+
+class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any]):
+    """A vector environment whose every reset and step is recorded; made by `record_vector`."""
+
+    def __init__(self, env: VectorEnv[Any, Any, Any], loop: Loop[VectorRows], mode: AutoresetMode) -> None:
+        VectorWrapper.__init__(self, env)
+        self._mode = mode
+        self._over = np.zeros(env.num_envs, np.bool_)
+        self._own(loop)
+        self._enter("train")
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Take a step in every environment, and record it."""
+        result = self.env.step(actions)
+        observations, rewards, terminated, truncated, infos = result
+        ended, cut = np.array(terminated, np.bool_), np.array(truncated, np.bool_)
+        next_step = self._mode == AutoresetMode.NEXT_STEP
+        only_reset = self._over if next_step else np.zeros_like(self._over)
+        final = infos.get("final_obs") if self._mode == AutoresetMode.SAME_STEP else None
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            self._rows.take(actions, observations, rewards, ended, cut, only_reset, final)
+        self._over = ended | cut
+        if self._loop.plan.info:
+            self._loop.info(self._phase, infos)
+        return result
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset all environments, or those of `options["reset_mask"]`, and record it."""
+        n, asked = self.env.num_envs, dict(options) if options else {}
+        mask = asked.pop("reset_mask", None)
+        which = np.ones(n, np.bool_) if mask is None else np.array(mask, np.bool_)
+        result = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            self._rows.reset(result[0], seeds, which)
+        self._over = self._over & ~which
+        self._loop.reset_info(self._phase, result[1], asked, None)
+        return result
+
+    def close(self, **kwargs: Any) -> None:
+        """Close the environments and the recording, as finished."""
+        try:
+            self.env.close(**kwargs)
+        finally:
+            self._loop.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> Literal[False]:
+        try:
+            self.env.close()
+        finally:
+            self._leave(raised[1])
+        return False
+
+
+def record_vector(
+    envs: VectorEnv[Any, Any, Any],
+    recordings: str | os.PathLike[str] | None = None,
+    *,
+    name: str | None = None,
+    seed: int = 0,
+    config: Mapping[str, Any] | None = None,
+    info: Sequence[str] = (),
+    **packing: Any,
+) -> RecordedVector:
+    """Return a vector environment, recording whatever any loop does with it.
+
+        with runner.record_vector(gymnasium.make_vec("CartPole-v1", 8), config={"lr": 3e-4}) as envs:
+            observations, infos = envs.reset(seed=0)
+
+    All environments are recorded into one run; step number n of it was taken in environment n modulo
+    their number. Each way of resetting by itself (`AutoresetMode`) is recorded as what it is.
+
+    Args:
+        envs: a vector environment.
+        recordings: as all others, as for `record`.
+        name: what the run is called.
+        seed: what the run is listed with.
+        config: your own settings.
+        info: fields of the vector's infos to record.
+        packing: as for `record`.
+
+    Raises:
+        EnvironmentNotUsable: a space cannot be recorded, or has values of varying size.
+        ConfigError: an argument cannot be used.
+        StorageError: the recordings folder cannot be written.
+    """
+    mode = envs.metadata.get("autoreset_mode")
+    if not isinstance(mode, AutoresetMode):
+        raise EnvironmentNotUsable(
+            f'found metadata["autoreset_mode"] {mode!r}, expected one of gymnasium.vector.AutoresetMode: '
+            "without it nobody knows which steps are resets."
+        )
+    described = describe(envs, envs.single_observation_space, envs.single_action_space)
+    described = replace(described, environments=envs.num_envs, mdp=None, agents=("agent",))
+    plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
+    loop = Loop(described, plan, lambda recorder, phase: VectorRows(recorder, described, phase))
+    return RecordedVector(envs, loop, mode)
+
+
+class RecordedParallel(Recorded[AgentRows]):
+    """A PettingZoo parallel environment whose every reset and step is recorded; made by `record_parallel`.
+
+    What it does not have itself it has of the environment: `agents`, `action_space`, ...
+    """
+
+    def __init__(self, env: Any, loop: Loop[AgentRows]) -> None:
+        self.env = env
+        self._own(loop)
+        self._enter("train")
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "env":
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    @property
+    def unwrapped(self) -> Any:
+        """The environment inside of all wrappers."""
+        return self.env.unwrapped
+
+    def step(self, actions: Mapping[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
+        """Take a step of all agents, and record it."""
+        result = self.env.step(actions)
+        observations, rewards, terminated, truncated, infos = result
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            over = not self.env.agents
+            self._rows.take(actions, observations, rewards, terminated, truncated, over)
+        if self._loop.plan.info:
+            self._loop.info(self._phase, _by_field(infos))
+        return result  # type: ignore[no-any-return]
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        """Reset the environment, and record it."""
+        result = self.env.reset(seed=seed, options=options)
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            self._rows.reset(result[0], seed)
+        self._loop.reset_info(self._phase, _by_field(result[1]), options, seed)
+        return result  # type: ignore[no-any-return]
+
+    def close(self) -> None:
+        """Close the environment and the recording, as finished."""
+        try:
+            self.env.close()
+        finally:
+            self._loop.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> Literal[False]:
+        try:
+            self.env.close()
+        finally:
+            self._leave(raised[1])
+        return False
+
+
+def record_parallel(
+    env: Any,
+    recordings: str | os.PathLike[str] | None = None,
+    *,
+    name: str | None = None,
+    seed: int = 0,
+    config: Mapping[str, Any] | None = None,
+    info: Sequence[str] = (),
+    **packing: Any,
+) -> RecordedParallel:
+    """Return a PettingZoo parallel environment, recording whatever any loop does with it.
+
+    Each agent of `possible_agents` has its own reward column and its own part of observation and action;
+    a step says which agents acted and for which it was the last.
+
+    Args:
+        env: a `pettingzoo.ParallelEnv`; `pettingzoo.utils.aec_to_parallel` makes one of a game in turns.
+        recordings: as all others, as for `record`.
+        name: what the run is called.
+        seed: what the run is listed with.
+        config: your own settings.
+        info: fields of the agents' infos to record, where they come.
+        packing: as for `record`.
+
+    Raises:
+        EnvironmentNotUsable: a space cannot be recorded, or there are more than 31 agents.
+        ConfigError: an argument cannot be used.
+        StorageError: the recordings folder cannot be written.
+    """
+    if not all(hasattr(env, part) for part in ("possible_agents", "observation_space", "action_space")):
+        raise ConfigError(
+            f"found {type(env).__name__}, expected a PettingZoo ParallelEnv with possible_agents"
+        )
+    described = _game(env)
+    plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
+    loop = Loop(described, plan, lambda recorder, phase: AgentRows(recorder, described, phase))
+    return RecordedParallel(env, loop)
+
+
+def _game(env: Any) -> Described:
+    """Return what is to be said of a PettingZoo parallel environment."""
+    agents = tuple(env.possible_agents)
+    if not 1 <= len(agents) <= MAX_AGENTS:
+        raise EnvironmentNotUsable(f"found {len(agents)} possible agents, expected 1 to {MAX_AGENTS}.")
+    observation = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
+    action = spaces.Dict({agent: env.action_space(agent) for agent in agents})
+    name = env.metadata.get("name") if isinstance(getattr(env, "metadata", None), Mapping) else None
+    return Described(
+        kind=kind_of(observation, action),
+        observation=observation,
+        action=action,
+        env_id=str(name or type(env).__name__),
+        kwargs={},
+        step_limit=0,
+        agents=agents,
+    )
+
+
+def _by_field(infos: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the infos of agents by field, then by agent."""
+    fields: dict[str, dict[str, Any]] = {}
+    for agent, info in infos.items():
+        for key, value in info.items():
+            fields.setdefault(key, {})[agent] = value
+    return fields

@@ -1,0 +1,231 @@
+"""Vector environments, each way of resetting by itself; games of several agents."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import runner
+from dualtaxi.parallel import DualTaxiParallelEnv
+from runner.errors import EnvironmentNotUsable
+from runner.recording import schema
+from runner.recording.integrity import check_integrity
+from runner.recording.reader import Recording, open_recording
+from tests.runner.wrappers.loops import make, play
+
+N = 3
+NAMES = ("CartPole-v1", "FrozenLake-v1", "Rooms")
+
+
+def vector(name: str, mode: AutoresetMode) -> SyncVectorEnv:
+    return SyncVectorEnv([lambda: make(name)] * N, autoreset_mode=mode)
+
+
+def drive(envs: Any, steps: int) -> list[Any]:
+    """Play at random, with resets by mask where the environments do not reset themselves."""
+    envs.action_space.seed(2)
+    seen = [envs.reset(seed=7)[0]]
+    disabled = envs.metadata["autoreset_mode"] == AutoresetMode.DISABLED
+    for _ in range(steps):
+        result = envs.step(envs.action_space.sample())
+        seen.append(result[:4])
+        over = result[2] | result[3]
+        if disabled and over.any():
+            seen.append(envs.reset(options={"reset_mask": over})[0])
+    return seen
+
+
+def alike(left: Any, right: Any) -> bool:
+    if isinstance(left, dict):
+        return all(alike(left[key], right[key]) for key in left)
+    if isinstance(left, tuple):
+        return all(map(alike, left, right))
+    return bool(np.array_equal(left, right))
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_vector_loop_is_recorded_and_undisturbed(tmp_path, name, mode):
+    with runner.record_vector(vector(name, mode), tmp_path, chunk_steps=256) as envs:
+        seen = drive(envs, 300)
+    assert all(map(alike, seen, drive(vector(name, mode), 300)))
+    check_integrity(envs.run.recording)
+    with open_recording(envs.run.recording) as recording:
+        ended = recording.episodes("train")
+        assert recording.environments == N
+        assert len(ended) > 10
+        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        resets = np.concatenate(list(recording.blocks(recording.topic("/train/reset"))))
+        assert len(steps) == 300 * N
+        for number, episode in enumerate(ended):
+            check_episode(recording, number, episode)
+    assert steps["step"].tolist() == list(range(len(steps)))
+    assert resets["seed"][:N].tolist() == [7, 8, 9]
+    only_resets = int((steps["t"] == schema.NEVER).sum())
+    assert (only_resets > 0) == (mode == AutoresetMode.NEXT_STEP)
+    over = int((steps["terminated"] | steps["truncated"]).sum())
+    assert len(ended) == over
+    assert N + over - N <= len(resets) <= N + over
+    check_follows(steps, resets)
+
+
+def check_episode(recording: Recording, number: int, episode: Any) -> None:
+    """The steps of an episode are those of one environment, whole, and add up."""
+    own = recording.episode_steps("train", number)
+    assert own["t"].tolist() == list(range(int(episode["length"])))
+    assert own["rewards"].sum() == pytest.approx(float(episode["returns"][0]))
+    assert len(set((own["step"] % N).tolist())) == 1
+    assert len(set(own["episode"].tolist())) == 1
+    assert bool(own["terminated"][-1]) == bool(episode["terminated"])
+
+
+def check_follows(steps: Any, resets: Any) -> None:
+    """Each environment's first observation is its reset's; of states, each step goes on from the last."""
+    if "state" not in steps.dtype.names:
+        return
+    first = {(int(r["environment"]), int(r["episode"])): int(r["observation"]) for r in resets}
+    for i in range(N):
+        own = steps[i::N]
+        own = own[own["t"] != schema.NEVER]
+        begins = own["t"] == 0
+        assert [first[i, int(e)] for e in own["episode"][begins]] == own["state"][begins].tolist()
+        inside = ~begins[1:]
+        assert own["state"][1:][inside].tolist() == own["next_state"][:-1][inside].tolist()
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_the_last_observation_of_an_episode_is_its_own(tmp_path, mode):
+    """CartPole ends where the pole or the cart is too far off, not where it begins anew."""
+    with runner.record_vector(vector("CartPole-v1", mode), tmp_path) as envs:
+        drive(envs, 300)
+    with open_recording(envs.run.recording) as recording:
+        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+    last = steps["next_observation"][steps["terminated"]]
+    assert len(last) > 20
+    assert ((np.abs(last[:, 2]) > 0.2094) | (np.abs(last[:, 0]) > 2.4)).all()
+
+
+def test_what_a_vector_cannot_record_is_refused(tmp_path):
+    with pytest.raises(EnvironmentNotUsable, match="Text space"):
+        runner.record_vector(vector("RoomsText", AutoresetMode.NEXT_STEP), tmp_path)
+    envs = vector("CartPole-v1", AutoresetMode.NEXT_STEP)
+    envs.metadata = {}
+    with pytest.raises(EnvironmentNotUsable, match="AutoresetMode"):
+        runner.record_vector(envs, tmp_path)
+
+
+def parallel(env: Any, episodes: int) -> list[Any]:
+    """Play at random; agents may leave before the others."""
+    generator, seen = np.random.default_rng(3), []
+    for k in range(episodes):
+        seen.append(("reset", env.reset(seed=k)[0]))
+        while env.agents:
+            actions = {agent: int(generator.integers(env.action_space(agent).n)) for agent in env.agents}
+            seen.append((actions, *env.step(actions)[:4]))
+    return seen
+
+
+def test_a_parallel_game_is_recorded_and_undisturbed(tmp_path):
+    with runner.record_parallel(DualTaxiParallelEnv(max_steps=40), tmp_path) as game:
+        seen = parallel(game, 4)
+    alone = parallel(DualTaxiParallelEnv(max_steps=40), 4)
+    assert [entry[0] for entry in seen] == [entry[0] for entry in alone]
+    check_integrity(game.run.recording)
+    played = [entry for entry in seen if entry[0] != "reset"]
+    with open_recording(game.run.recording) as recording:
+        steps = list(recording.transitions("train"))
+        ended = recording.episodes("train")
+        first = list(recording.resets("train"))
+        assert recording.run["agents"] == '["taxi_1", "taxi_2"]'
+    assert len(steps) == len(played)
+    for one, (actions, observations, rewards, _, _) in zip(steps, played, strict=True):
+        for i, agent in enumerate(("taxi_1", "taxi_2")):
+            assert one["action"][agent] == actions[agent]
+            assert one["next_observation"][agent] == observations[agent]
+            assert one["rewards"][i] == rewards[agent]
+        assert one["acted"] == 3
+    assert ended["length"].tolist() == [40] * 4
+    assert ended["truncated"].all()
+    assert [int(one["seed"]) for one in first] == [0, 1, 2, 3]
+
+
+class Leaving:
+    """Three agents of which one leaves at each step; made as PettingZoo asks for."""
+
+    metadata = {"name": "leaving_v0"}  # noqa: RUF012 - as PettingZoo has it
+    possible_agents = ("a", "b", "c")
+
+    def __init__(self) -> None:
+        self.agents: list[str] = []
+
+    def observation_space(self, agent: str) -> Any:
+        return gymnasium.spaces.Box(0, 9, (2,), np.float32)
+
+    def action_space(self, agent: str) -> Any:
+        return gymnasium.spaces.Discrete(5)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.agents = list(self.possible_agents)
+        return {agent: np.zeros(2, np.float32) for agent in self.agents}, {a: {} for a in self.agents}
+
+    def step(self, actions: Any) -> Any:
+        there = list(self.agents)
+        gone = self.agents.pop(0)
+        values = {agent: np.full(2, len(there), np.float32) for agent in there}
+        ends = {agent: agent == gone for agent in there}
+        never = dict.fromkeys(there, False)
+        return values, dict.fromkeys(there, 1.0), ends, never, {agent: {"left": gone} for agent in there}
+
+    def close(self) -> None:
+        pass
+
+
+def test_agents_that_leave_are_told(tmp_path):
+    with runner.record_parallel(Leaving(), tmp_path, info=["left"]) as game:
+        parallel(game, 2)
+    with open_recording(game.run.recording) as recording:
+        steps = list(recording.transitions("train"))
+        ended = recording.episodes("train")
+        infos = list(recording.decoded(schema.TRAIN_INFO))
+    assert [int(one["acted"]) for one in steps[:3]] == [0b111, 0b110, 0b100]
+    assert [int(one["agents_terminated"]) for one in steps[:3]] == [0b001, 0b010, 0b100]
+    assert [bool(one["terminated"]) for one in steps[:3]] == [False, False, True]
+    assert steps[1]["next_observation"]["a"].tolist() == [0, 0]
+    assert steps[1]["next_observation"]["b"].tolist() == [2, 2]
+    assert ended["returns"].tolist() == [[1, 2, 3]] * 2
+    assert infos[1]["json"] == '{"info": {"left": {"b": "b", "c": "b"}}}'
+
+
+def test_a_vector_of_one_is_as_the_environment_alone(tmp_path):
+    with runner.record(make("FrozenLake-v1"), tmp_path) as env:
+        list(play(env, 200))
+    mode = AutoresetMode.SAME_STEP
+    one = SyncVectorEnv([lambda: make("FrozenLake-v1")], autoreset_mode=mode)
+    with runner.record_vector(one, tmp_path) as envs:
+        actions = make("FrozenLake-v1").action_space
+        actions.seed(5)
+        envs.reset(seed=5)
+        for _ in range(200):
+            envs.step(np.array([actions.sample()]))
+    digests = [run.summary["topic_digests"]["/train/step"] for run in (env.run, envs.run)]
+    assert digests[0] == digests[1]
+
+
+def test_rooms_of_every_kind_of_space_come_back_from_a_vector(tmp_path):
+    mode = AutoresetMode.NEXT_STEP
+    with runner.record_vector(vector("Rooms", mode), tmp_path) as envs:
+        envs.action_space.seed(0)
+        seen = [envs.reset(seed=1)[0]]
+        seen += [envs.step(envs.action_space.sample())[0] for _ in range(5)]
+    with open_recording(envs.run.recording) as recording:
+        steps = next(recording.blocks(recording.topic("/train/step")))["next_observation"]
+    for k, observation in enumerate(seen[1:]):
+        rows = steps[k * N : (k + 1) * N]
+        assert np.array_equal(rows["position"], observation["position"])
+        assert np.array_equal(rows["doors"], observation["doors"])
+        assert np.array_equal(rows["room"]["0"], observation["room"][0])
+        assert np.array_equal(rows["room"]["1"], observation["room"][1])
