@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import shlex
 import sys
 from pathlib import Path
 
@@ -12,13 +13,19 @@ import gymnasium
 import gymnasium.envs.registration
 import matplotlib
 import pytest
+from click.testing import CliRunner
 
 import runner
+from runner.cli import cli
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("README.md")])
 _EXAMPLE = re.compile(r"^```python[ \t]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 """A block marked python; one marked `python no-test` is not run."""
+
+
+_COMMANDS = re.compile(r"^```sh run[ \t]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+"""A block of commands that are run, one a line; a backslash at the end goes on with the next."""
 
 
 def examples(page: Path) -> list[tuple[int, str]]:
@@ -61,5 +68,26 @@ def test_examples_run(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch)
             exec(code, names)
 
 
+def commands(page: Path) -> list[list[str]]:
+    """Return the words of each command of a page that is to be run."""
+    blocks = [block.replace("\\\n", "") for block in _COMMANDS.findall(page.read_text(encoding="utf-8"))]
+    return [shlex.split(line, comments=True) for block in blocks for line in block.splitlines() if line]
+
+
+WITH_COMMANDS = [page for page in PAGES if commands(page)]
+
+
+@pytest.mark.parametrize("page", WITH_COMMANDS, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "configs").symlink_to(ROOT / "configs", target_is_directory=True)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DUALTAXI_RECORDINGS", raising=False)
+    for program, *words in commands(page):
+        assert program == "dualtaxi"
+        done = CliRunner().invoke(cli, words)
+        assert done.exit_code == (words[0] == "diff"), f"{words}: {done.output}"
+
+
 def test_there_are_examples() -> None:
     assert ROOT / "docs" / "reading.md" in WITH_EXAMPLES
+    assert ROOT / "docs" / "compare.md" in WITH_COMMANDS

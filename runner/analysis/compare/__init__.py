@@ -151,7 +151,7 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
         [_group(label, values, thresholds, sign) for label, values in present],
         [_pair(*a, *b, sign) for a, b in itertools.combinations(present, 2)],
         thresholds.tolist(),
-        [*notes, *_ends(groups, metric, line, moment)],
+        [*notes, *_ends(groups, metric, line, moment), *_reached(present, moment)],
     )
 
 
@@ -190,6 +190,16 @@ def _ends(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> li
         return []
     listed = ", ".join(f"after {end:,} episodes in {label}" for label, end in told.items())
     return [f"the last evaluation is {listed}; --at {min(told.values())} compares after as many"]
+
+
+def _reached(present: Sequence[tuple[str, dict[int, tuple[str, float]]]], moment: Moment) -> list[str]:
+    """Return how many runs of each group reach the level, if it is about one."""
+    if moment.level is None:
+        return []
+    counts = {
+        label: sum(value < statistics.NEVER for _, value in values.values()) for label, values in present
+    }
+    return [f"{label}: {counts[label]} of {len(values)} runs reach it" for label, values in present]
 
 
 def _thresholds(values: Sequence[float], sign: float) -> Values:

@@ -16,7 +16,8 @@ _LEVELS = 5
 EXPLANATION = (
     "IQM: interquartile mean, of the middle half of the seeds. In brackets: 95 % percentile bootstrap "
     "intervals (Agarwal et al. 2021). Differences are taken seed by seed, as runs of one seed share their "
-    "draws. P: the probability that any run of A does better than any of B, of the seeds compared."
+    "draws. P: the probability that a run of A does better than one of B, over all pairs of their seeds, "
+    "equal ones counted half; at 0 or 1 its interval has no width, as no pair speaks against it."
 )
 
 
@@ -47,7 +48,7 @@ def _told(metric: MetricResult, pair: PairResult) -> str:
         first, second, count = pair.b, pair.a, pair.losses
     equal = f", equal at {pair.ties}" if pair.ties else ""
     by = ""
-    if not math.isnan(pair.iqm.value):
+    if math.isfinite(pair.iqm.value):
         by = f"; IQM of {pair.a} - {pair.b}: {number(pair.iqm.value, True)}, 95 % {interval(pair.iqm, True)}"
     return (
         f"{metric.title}, in {metric.unit}: {first} is {word} than {second} at {count} of {len(pair.seeds)} "
@@ -116,11 +117,11 @@ def _profile(metric: MetricResult) -> Grid:
 
 
 def number(value: float, signed: bool = False) -> str:
-    """Return a number with three or more digits that count; `never` for what is not reached."""
+    """Return a number with three or more digits that count; a level that is not reached is infinite."""
     if math.isnan(value):
         return "–"
     if math.isinf(value):
-        return "never" if value > 0 else "-never"
+        return ("+∞" if value > 0 else "-∞") if signed else "never"
     digits = 0 if abs(value) >= 1000 else 1 if abs(value) >= 100 else 2
     return f"{value:{'+' if signed else ''},.{digits}f}"
 
