@@ -76,7 +76,8 @@ class MissingExtra(RunnerError):
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
         super().__init__(
-            f"{purpose} needs {package}, which is not installed: pip install 'dualtaxi[{extra}]'"
+            f"{purpose} needs {package}, which is not installed: pip install 'dualtaxi[{extra}]', "
+            f"or from a clone of the project: pip install -e '.[{extra}]'"
         )
 
 

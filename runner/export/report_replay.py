@@ -161,10 +161,13 @@ def typical_trial(recording: Recording) -> tuple[int, int]:
     require_steps(recording)
     after = last_whole_evaluation(recording)
     if after is None:
-        raise RecordingError(
-            f"{recording.path}: has no whole evaluation; choose a training episode by --episode."
-        )
+        raise RecordingError(f"{recording.path}: has no whole evaluation; choose a training episode.")
     return after, ranked_trials(recording, after)[1]
+
+
+def last_episode(recording: Recording) -> int:
+    """Return the number of the last training episode that ended; 0 if none did."""
+    return max(0, recording.count(schema.TRAIN_EPISODE) - 1)
 
 
 def last_whole_evaluation(recording: Recording) -> int | None:

@@ -422,6 +422,7 @@ class Recording:
 
         Raises:
             RecordingError: they are damaged, or more than 131,072; `iter_metrics` gives them one by one.
+            ValueError: there is no such phase.
         """
         found: list[dict[str, Any]] = []
         for metrics in self.iter_metrics(phase):
@@ -431,7 +432,14 @@ class Recording:
         return found
 
     def iter_metrics(self, phase: str) -> Iterator[dict[str, Any]]:
-        """Yield the metrics of a phase, in order."""
+        """Yield the metrics of a phase (`train` or `eval`), in order.
+
+        Raises:
+            RecordingError: they are damaged.
+            ValueError: there is no such phase.
+        """
+        if phase not in schema.PHASES:
+            raise ValueError(f"found phase {phase!r}, expected one of: {', '.join(schema.PHASES)}.")
         topic = schema.TRAIN_METRICS_TOPIC if phase == "train" else schema.EVAL_METRICS_TOPIC
         for time, payload in self.messages(topic):
             where = f"{self.path}: {topic.name} at {time} ns"

@@ -23,8 +23,6 @@ PROFILE: Final = "dualtaxi"
 STEP_NANOSECONDS: Final = 100_000_000
 """Logical time of one environment step: 0.1 s, so that playback at 1x shows ten steps a second."""
 
-MAX_LOG_STEPS: Final = 2**63 // STEP_NANOSECONDS - 1
-
 
 @dataclass(frozen=True)
 class Field:

@@ -68,7 +68,8 @@ def command(
     """Make a short film of a recorded episode of RUN, for slides and READMEs.
 
     Each frame has step, actions, rewards and events written below it. Without a choice it is the typical
-    trial of the last evaluation: the median by success, return and length.
+    trial of the last evaluation: the median by success, return and length; in a run that has no whole
+    evaluation, the last training episode.
 
     \b
     Examples:
@@ -79,13 +80,22 @@ def command(
     if episode is not None and chosen is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
     from runner.export.gif import require_packages, write_gif
-    from runner.export.report_replay import training_episode, trial, typical_trial
+    from runner.export.report_replay import (
+        last_episode,
+        last_whole_evaluation,
+        training_episode,
+        trial,
+        typical_trial,
+    )
     from runner.export.report_runs import parse_trial, shortcomings, state_of, write_new
     from runner.recording.reader import open_recording
 
     require_packages()
     said: list[int] = []
     with open_recording(find(run_name, recordings).recording) as recording:
+        if episode is None and chosen is None and last_whole_evaluation(recording) is None:
+            episode = last_episode(recording)
+            say(f"There is no whole evaluation: this is the last training episode, {episode:,}.")
         if episode is not None:
             shown = training_episode(recording, episode, steps)
         else:

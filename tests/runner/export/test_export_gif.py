@@ -103,6 +103,13 @@ def test_a_run_without_steps_says_how_to_get_them(pictured, tmp_path):
     assert "dualtaxi rerecord" in result.stderr
 
 
+def test_a_run_without_evaluations_shows_its_last_training_episode(pictured, tmp_path):
+    result = gif(pictured("lake", evaluation=None).recording, "-o", tmp_path / "film.gif")
+    assert result.exit_code == 0, result.stderr
+    assert "training episode 39" in result.stdout
+    assert "no whole evaluation" in result.stderr
+
+
 def test_a_file_is_replaced_only_when_asked(pictured, tmp_path):
     path = tmp_path / "film.gif"
     path.write_text("mine")
@@ -116,4 +123,5 @@ def test_a_missing_package_is_named(pictured, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "resvg_py", None)
     result = gif(pictured("lake").recording, "-o", tmp_path / "film.gif")
     assert "resvg-py" in result.stderr
-    assert "dualtaxi[plots]" in result.stderr
+    assert "pip install 'dualtaxi[plots]'" in result.stderr
+    assert "pip install -e '.[plots]'" in result.stderr

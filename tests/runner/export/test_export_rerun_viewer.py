@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 
 import numpy as np
@@ -33,12 +34,12 @@ def _cache(tmp_path, monkeypatch):
 
 
 def drawn(path, step):
-    """Return the views of a file by name, drawn; skip where nothing can be drawn."""
+    """Return the views of a file by name, drawn; skip where nothing can be drawn, but fail in CI."""
     try:
         with viewer.headless(path, step) as client:
             return {view.name: view for view in client.get_state().views}
     except viewer.ViewerError as error:
-        if "finds no graphics" in str(error):
+        if "finds no graphics" in str(error) and "DUALTAXI_CI" not in os.environ:
             pytest.skip(f"no graphics to draw with: apt-get install {viewer.MESA_PACKAGES}")
         raise
 

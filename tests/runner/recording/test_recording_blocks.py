@@ -11,6 +11,7 @@ from runner.errors import RecordingError
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.store import RecordStore
+from tests.runner.recording.making import LAKE, make_run
 
 topics = st.sampled_from(schema.BLOCK_TOPICS)
 places = st.integers(0, 2200)
@@ -93,3 +94,11 @@ def test_the_recording_describes_itself(recording, taxis):
     assert recording.finished
     assert recording.size == taxis.recording.stat().st_size == taxis.summary["bytes"]
     assert recording.mdp.agents == ("taxi_1", "taxi_2")
+
+
+def test_metrics_of_no_phase_are_refused(tmp_path):
+    with (
+        open_recording(make_run(tmp_path, LAKE).recording) as opened,
+        pytest.raises(ValueError, match="found phase 'bogus', expected one of: train, eval"),
+    ):
+        opened.metrics("bogus")
