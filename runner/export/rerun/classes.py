@@ -22,9 +22,11 @@ from runner.export.rerun.scene import (
     PASSENGER_COLOUR,
     Marks,
     Scene,
+    action_labels,
     agent_label,
 )
 from runner.mdp import Mdp
+from runner.words import action_names
 
 MOST_CLASSES: Final = 60_000
 MOST_REWARDS: Final = 2_000
@@ -75,6 +77,8 @@ class Vocabulary:
     chosen: int
     """What is said of the chosen action if it was not explored."""
     explored: int
+    stops: tuple[NDArray[np.int64], ...]
+    """[own actions] an agent: the letter of an action that is no move, such as a pickup; -1 for a move."""
 
     def of_t(self, t: NDArray[Any]) -> NDArray[np.uint16]:
         """Return the class of each `t`."""
@@ -130,10 +134,34 @@ def vocabulary_of(
             colour = MOVER_COLOURS[i % len(MOVER_COLOURS)] if whose else INK
             told.append((classes.add([f"reward{whose} {_signed(r)}" for r in distinct], colour), distinct))
     unmarked = classes.add(["", "●", "greedy", "explored"], [INK, INK, GOOD_COLOUR, BAD_COLOUR])
+    stops = tuple(_stops(classes, scene, agent) for agent in range(len(mdp.agents))) if scene else ()
     levels = _levels(classes, value_range)
     return Vocabulary(
-        classes, mark, passenger, riding, t, tuple(told), levels, *range(unmarked, unmarked + 4)
+        classes,
+        mark,
+        passenger,
+        riding,
+        t,
+        tuple(told),
+        levels,
+        unmarked=unmarked,
+        greedy=unmarked + 1,
+        chosen=unmarked + 2,
+        explored=unmarked + 3,
+        stops=stops,
     )
+
+
+def _stops(classes: Classes, scene: Scene, agent: int) -> NDArray[np.int64]:
+    names = action_labels(scene.mdp)[agent]
+    numbers = np.full(len(names), -1)
+    if action_names(scene.mdp) is None:
+        return numbers
+    colour = MOVER_COLOURS[agent % len(MOVER_COLOURS)]
+    for own, action in enumerate(scene.description["actions"]):
+        if not any(action.get("move") or ()):
+            numbers[own] = classes.add([names[own][0].upper()], colour)
+    return numbers
 
 
 def _levels(classes: Classes, value_range: tuple[float, float]) -> Levels:

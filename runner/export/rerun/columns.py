@@ -107,6 +107,17 @@ def column(descriptor: Any, n: int, values: NDArray[Any]) -> Any:
     return _Column(descriptor, pa.ListArray.from_arrays(_offsets(n, count), pa.array(items)))
 
 
+def lists(archetype: Any, lengths: NDArray[np.int64], **parts: NDArray[Any]) -> list[Any]:
+    """Return the columns of rows of so many instances each; each part is [all instances, ...]."""
+    offsets = pa.array(np.concatenate(([0], np.cumsum(lengths))).astype(np.int32))
+    columns = []
+    for name, flat in parts.items():
+        items = pa.FixedSizeListArray.from_arrays(flat.reshape(-1), type=_POINT) if flat.ndim == 2 else flat
+        descriptor = getattr(archetype, f"descriptor_{name}")()
+        columns.append(_Column(descriptor, pa.ListArray.from_arrays(offsets, pa.array(items))))
+    return columns
+
+
 def scalars(values: NDArray[np.float64]) -> list[Any]:
     """Return the column of series, [n, series]."""
     return [column(rr.Scalars.descriptor_scalars(), len(values), values)]

@@ -6,17 +6,31 @@ own table it is the other way round.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
 from runner.export.rerun import filling
-from runner.export.rerun.columns import Batch, Sender, centres, images, ink, instances, place, rgba, texts
+from runner.export.rerun.classes import Vocabulary
+from runner.export.rerun.columns import (
+    Batch,
+    Sender,
+    centres,
+    images,
+    ink,
+    instances,
+    lists,
+    place,
+    rgba,
+    texts,
+)
 from runner.export.rerun.scene import BAD_COLOUR, MOVER_COLOURS, Placements, Scene, own_actions
 
 LABEL_Y: Final = -2.6
+_LETTER_RISE: Final = 0.6
+"""How much higher a point must be for its letter, which is written below it, to stand in its cell."""
 _ASIDE: Final = 0.21
 """From the centre of a pixel to the arrow of either of two agents."""
 
@@ -30,12 +44,14 @@ class MapWriter(Sender):
         path: str,
         scene: Scene,
         pictures: Placements,
+        words: Vocabulary,
         learners: tuple[str, ...],
     ) -> None:
         super().__init__(stream, path)
         self._scene = scene
         self._mdp = scene.mdp
         self._pictures = pictures
+        self._words = words
         self._learners = learners
         self._own = own_actions(self._mdp)
         self._moves = [self._agent_moves(agent) for agent in range(len(self._mdp.agents))]
@@ -54,8 +70,7 @@ class MapWriter(Sender):
         )
         for i, learner in enumerate(self._learners):
             shown = self._agents(i)
-            apart = [(k - (len(shown) - 1) / 2) * 2 * _ASIDE for k in range(len(shown))]
-            origins = np.concatenate([middle + np.array([[x, 0.0]], np.float32) for x in apart])
+            origins = self._beside(len(shown)).reshape(-1, 2)
             tints = [rgba(MOVER_COLOURS[k % len(MOVER_COLOURS)]) for k in shown for _ in middle]
             self.static(
                 f"map/{learner}",
@@ -68,6 +83,10 @@ class MapWriter(Sender):
             self.static(
                 f"map/{learner}/here",
                 rr.Boxes2D.from_fields(colors=[rgba(BAD_COLOUR)], radii=0.1, draw_order=50.0),
+            )
+            self.static(
+                f"map/{learner}/stops",
+                rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0),
             )
             self.static(f"map/{learner}/label", rr.Points2D.from_fields(radii=0.0, show_labels=True))
 
@@ -82,8 +101,9 @@ class MapWriter(Sender):
             here = instances(rr.Boxes2D, n, centers=middle[pixel][:, None])
             self.send(f"map/{learner}/here", times, here)
             if len(rows):
-                moves = self._arrows(i, thoughts.greedy_maps[:, i][:, order])
-                self._renew(batch, learner, thoughts.value_maps[:, i][:, order], moves)
+                greedy = thoughts.greedy_maps[:, i][:, order]
+                self.send(f"map/{learner}/stops", batch.times(rows), self._stops(i, greedy))
+                self._renew(batch, learner, thoughts.value_maps[:, i][:, order], self._arrows(i, greedy))
 
     def _renew(
         self, batch: Batch, learner: str, values: NDArray[np.float32], moves: NDArray[np.float32]
@@ -128,6 +148,27 @@ class MapWriter(Sender):
         arrows = np.empty((len(greedy), len(shown), greedy.shape[1], 2), np.float32)
         filling.arrows(greedy, own, np.stack([self._moves[agent] for agent in shown]), arrows)
         return arrows.reshape(len(greedy), -1, 2)
+
+    def _stops(self, learner: int, greedy: NDArray[np.int32]) -> list[Any]:
+        """Return the columns of the letters of greedy actions that are no moves."""
+        shown = self._agents(learner)
+        own = [greedy if len(shown) == 1 else self._own[greedy, agent] for agent in shown]
+        letters = [self._words.stops[agent][part] for agent, part in zip(shown, own, strict=True)]
+        classes = np.where((greedy >= 0)[:, None], np.stack(letters, axis=1), -1)
+        row, agent, pixel = np.nonzero(classes >= 0)
+        return lists(
+            rr.Points2D,
+            np.bincount(row, minlength=len(greedy)),
+            positions=self._beside(len(shown))[agent, pixel] - np.array([0.0, _LETTER_RISE], np.float32),
+            class_ids=classes[row, agent, pixel].astype(np.uint16),
+        )
+
+    def _beside(self, agents: int) -> NDArray[np.float32]:
+        """Return where the greedy action of each of so many agents is shown, [agents, pixels, 2]."""
+        middle = centres(self._pictures.height, self._pictures.width)
+        x = (np.arange(agents) - (agents - 1) / 2) * 2 * _ASIDE
+        aside = np.stack((x, np.zeros(agents)), axis=1).astype(np.float32)
+        return np.asarray(middle[None] + aside[:, None])
 
     def _agent_moves(self, agent: int) -> NDArray[np.float32]:
         """Return the arrow of each own action of an agent, [actions, 2]."""

@@ -42,7 +42,7 @@ class StepWriter(Sender):
         self._events = EventWriter(stream, path, phase, mdp)
         self._grid = GridWriter(stream, path, scene, marks, words) if scene and marks else None
         pictures = scene.placements if scene else None
-        self._maps = MapWriter(stream, path, scene, pictures, learners) if scene and pictures else None
+        self._maps = MapWriter(stream, path, scene, pictures, words, learners) if scene and pictures else None
 
     def dress(self) -> None:
         """Log what never changes."""

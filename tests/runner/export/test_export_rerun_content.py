@@ -139,17 +139,23 @@ class TestSteps:
         time = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
         for learner, name in enumerate(agents_of(recording)):
             table = exported.table(f"/{phase}/map/{name}")
+            letters = exported.table(f"/{phase}/map/{name}/stops")["Points2D:class_ids"]
+            still = np.array([not any(action["move"] or ()) for action in scene.description["actions"]])
             context = pictures.context[steps["state"]]
             changed = np.append(True, context[1:] != context[:-1]) | (steps["t"] == 0)
             assert table["step"] == time[changed].tolist()
             for k in range(0, len(table["step"]), max(1, len(table["step"]) // 3)):
                 step = steps[np.searchsorted(time, table["step"][k])]
                 trained = int(step["step"]) if phase == "train" else table["step"][k] - int(step["step"]) - 1
-                q = tables_at(recording, trained)[learner].max(axis=1)
+                seen = tables_at(recording, trained)[learner]
+                q = seen.max(axis=1)
                 shown = np.array(table["DepthImage:buffer"][k][0], np.uint8).view(np.float32)
                 order = pictures.order(learner if len(agents_of(recording)) > 1 else 0)
                 states = pictures.states[pictures.context[step["state"]]][order]
                 assert np.array_equal(shown[states >= 0], q[states[states >= 0]].astype(np.float32))
+                greedy = seen[states[states >= 0]].argmax(axis=1)
+                own = greedy if len(agents_of(recording)) > 1 else own_actions(recording.mdp)[greedy]
+                assert len(letters[k]) == still[own].sum()
 
     def test_events_are_in_the_log(self, exported, phase):
         mdp, steps = exported.recording.mdp, exported.steps(phase)
