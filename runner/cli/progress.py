@@ -72,3 +72,24 @@ def facts_in_words(progress: Progress, speed: float | None) -> str:
     if progress.evaluations:
         facts.append(f"finish {number(progress.evaluations[-1]['finish_percent'], 0)} %")
     return "  ".join([*facts, size(progress.bytes_written)])
+
+
+@contextlib.contextmanager
+def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Give what is called with how many are done: it keeps a line up to date, where there is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    columns = (
+        rich_progress.BarColumn(bar_width=BAR_WIDTH),
+        rich_progress.TextColumn(f"{{task.completed:,}} {what}", markup=False),
+        rich_progress.TimeRemainingColumn(compact=True),
+    )
+    with rich_progress.Progress(
+        *columns, console=Console(stderr=True), transient=True, refresh_per_second=REDRAWS_A_SECOND
+    ) as bar:
+        task = bar.add_task("", total=total or None)
+        yield lambda done: bar.update(task, completed=done)

@@ -11,6 +11,11 @@ from runner.errors import nearest
 
 FORMS: Final[dict[str, tuple[str, str]]] = {
     "rerun": ("runner.cli.commands.export_rerun", "For the Rerun viewer: every view of chosen episodes."),
+    "parquet": ("runner.cli.commands.export_parquet", "Steps, episodes and measures as Parquet."),
+    "csv": ("runner.cli.commands.export_csv", "Steps, episodes and measures as CSV."),
+    "minari": ("runner.cli.commands.export_minari", "A Minari dataset, for offline learning."),
+    "tensorboard": ("runner.cli.commands.export_tensorboard", "An event file for TensorBoard."),
+    "mlflow": ("runner.cli.commands.export_mlflow", "A run in an MLflow store."),
     "gif": ("runner.cli.commands.export_gif", "A short film of an episode, for slides and READMEs."),
 }
 """Form -> its module, which has the command as `command`, and its short help."""

@@ -1,0 +1,73 @@
+"""`dualtaxi export minari`: a dataset for offline reinforcement learning."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.commands.export_rerun import EpisodeRanges
+from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.output import say
+from runner.cli.progress import counting
+
+
+@click.command("minari")
+@run_argument
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=Path("minari"),
+    show_default=True,
+    metavar="FOLDER",
+    help="The folder of datasets, as MINARI_DATASETS_PATH names it.",
+)
+@click.option(
+    "--phase",
+    type=click.Choice(["train", "eval"]),
+    default="train",
+    show_default=True,
+    help="Whose episodes.",
+)
+@click.option(
+    "--episodes", type=EpisodeRanges(), metavar="RANGES", help="Episodes, such as 0:20,49980:50000."
+)
+@click.option("--force", is_flag=True, help="Replace the dataset if it exists.")
+@recordings_option
+def command(
+    run_name: str,
+    output: Path,
+    phase: str,
+    episodes: tuple[tuple[int, int | None], ...] | None,
+    force: bool,
+    recordings: Path | None,
+) -> None:
+    """Export the episodes of RUN as a Minari dataset: observations, actions, rewards, how each ended.
+
+    An observation is a state, an action a joint action, a reward the sum over the learners; where there are
+    several, the infos have theirs.
+
+    \b
+    Examples:
+      dualtaxi export minari @latest --phase eval
+      dualtaxi export minari k3v9m2xq --episodes 49000: -o datasets
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.export.minari import OURS, dataset_id, require_packages, write_dataset
+    from runner.export.places import new_folder, require_steps, shortcomings
+    from runner.recording import schema
+    from runner.recording.reader import open_recording
+
+    require_packages()
+    with open_recording(find(run_name, recordings).recording) as recording:
+        require_steps(recording)
+        path = output / dataset_id(recording)
+        total = recording.count(schema.PHASES[phase][1])
+        with new_folder(path, force, OURS) as folder, counting("episodes", total) as report:
+            written = write_dataset(recording, folder, phase, episodes or (), report)
+        for note in (*shortcomings(recording), *written.notes):
+            say(note)
+    click.echo(
+        f"{path}  {written.episodes:,} episodes, {written.steps:,} steps; read it by: "
+        f"MINARI_DATASETS_PATH={output} and minari.load_dataset('{path.name}')"
+    )

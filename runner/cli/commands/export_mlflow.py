@@ -1,0 +1,53 @@
+"""`dualtaxi export mlflow`: a run in an MLflow store."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.output import say
+
+
+@click.command("mlflow")
+@run_argument
+@click.option(
+    "--tracking-uri",
+    "tracking",
+    envvar="MLFLOW_TRACKING_URI",
+    default="sqlite:///mlflow.db",
+    show_default="$MLFLOW_TRACKING_URI, or sqlite:///mlflow.db",
+    metavar="URI",
+    help="The store: a database or a server.",
+)
+@click.option("--experiment", default="dualtaxi", show_default=True, help="The experiment; made if missing.")
+@click.option("--with-recording", is_flag=True, help="Store the recording as an artifact, too.")
+@click.option("--force", is_flag=True, help="Write the run anew, and delete what is there of it.")
+@recordings_option
+def command(
+    run_name: str, tracking: str, experiment: str, with_recording: bool, force: bool, recordings: Path | None
+) -> None:
+    """Export RUN into MLflow: parameters, metrics over training steps, tags, and run.json as an artifact.
+
+    A run that is there already is left as it is: it is known by its id and content digest, kept as tags.
+
+    \b
+    Examples:
+      dualtaxi export mlflow @latest
+      dualtaxi export mlflow k3v9m2xq --tracking-uri http://127.0.0.1:5000 --with-recording
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.export.mlflow import export, require_packages
+    from runner.export.places import shortcomings
+    from runner.recording.reader import open_recording
+
+    require_packages()
+    with open_recording(find(run_name, recordings).recording) as recording:
+        done = export(recording, tracking, experiment, with_recording, force)
+        for note in (*shortcomings(recording), *done.notes):
+            say(note)
+    if done.already:
+        say("The run is there already with this content; nothing was written. --force writes it anew.")
+    click.echo(
+        f"{tracking}  experiment {experiment}, run {done.mlflow_run}, {done.metrics:,} metrics written"
+    )

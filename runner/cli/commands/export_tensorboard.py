@@ -1,0 +1,50 @@
+"""`dualtaxi export tensorboard`: an event file for TensorBoard."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.output import say
+
+
+@click.command("tensorboard")
+@run_argument
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="The folder to write.  [default: tensorboard/NAME-RUN]",
+)
+@click.option("--force", is_flag=True, help="Replace the folder if it exists.")
+@recordings_option
+def command(run_name: str, output: Path | None, force: bool, recordings: Path | None) -> None:
+    """Export RUN for TensorBoard: every measure, and length and return of each training episode.
+
+    Each number stands at its training step. TensorBoard itself keeps them as 32-bit numbers, and shows a
+    thousand of a curve unless told otherwise.
+
+    \b
+    Examples:
+      dualtaxi export tensorboard @latest
+      dualtaxi export tensorboard k3v9m2xq -o logs/patient --force
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.export.places import new_folder, shortcomings
+    from runner.export.tensorboard import OURS, require_packages, write_events
+    from runner.recording.reader import open_recording
+
+    require_packages()
+    run = find(run_name, recordings)
+    path = output or Path("tensorboard", f"{run.facts['name']}-{run.run_id}")
+    with open_recording(run.recording) as recording:
+        with new_folder(path, force, OURS) as folder:
+            count = write_events(recording, folder)
+        for shortcoming in shortcomings(recording):
+            say(shortcoming)
+    click.echo(
+        f"{path}  {count:,} numbers; look at them by: "
+        f"tensorboard --logdir {path.parent} --samples_per_plugin scalars=100000"
+    )

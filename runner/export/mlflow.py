@@ -1,0 +1,188 @@
+"""A run into MLflow: parameters, metrics over training steps, tags, and what it is as an artifact."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import tempfile
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+from runner.errors import MissingExtra, RunnerError
+from runner.export.scalars import created, measures, seconds_of
+from runner.recording.reader import Recording
+
+RUN_TAG: Final = "dualtaxi.run_id"
+DIGEST_TAG: Final = "dualtaxi.content_digest"
+_STATUS: Final = {"finished": "FINISHED", "interrupted": "KILLED", "failed": "FAILED"}
+_AT_ONCE: Final = 1000
+_PARAMS_AT_ONCE: Final = 100
+_LONGEST: Final = 6000
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What came of an export."""
+
+    mlflow_run: str
+    metrics: int
+    already: bool
+    """Whether the run was there before; then nothing was written."""
+    notes: tuple[str, ...] = ()
+
+
+def require_packages() -> None:
+    """Raise an error that says what is missing, if MLflow's client is not installed.
+
+    Raises:
+        MissingExtra: it is not.
+    """
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    try:
+        with _quiet():
+            import mlflow  # noqa: F401
+            import sqlalchemy  # noqa: F401
+    except ImportError as error:
+        raise MissingExtra("mlflow-skinny", "mlflow", "export mlflow") from error
+
+
+def export(
+    recording: Recording, tracking: str, experiment: str, with_recording: bool = False, force: bool = False
+) -> Exported:
+    """Write a run into an MLflow store; one that is there with the same content is left as it is.
+
+    Args:
+        recording: the run's.
+        tracking: the store: `sqlite:///mlflow.db`, or the address of a server.
+        experiment: the name of the experiment, made if it is missing.
+        with_recording: also store the recording as an artifact.
+        force: write it anew, and delete what is there of it.
+
+    Raises:
+        RunnerError: the store cannot be used.
+        RecordingError: the recording is damaged.
+    """
+    from mlflow.exceptions import MlflowException
+
+    with _quiet():
+        try:
+            return _export(recording, tracking, experiment, with_recording, force)
+        except (MlflowException, ImportError, OSError) as error:
+            raise RunnerError(f"{tracking}: MLflow cannot use it ({error}).") from error
+        except Exception as error:
+            if type(error).__module__.partition(".")[0] == "sqlalchemy":
+                raise RunnerError(f"{tracking}: the database cannot be used ({error}).") from error
+            raise
+
+
+def params_of(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return a resolved configuration as flat text: `evaluation.trials` is `100`; lists as JSON."""
+    flat: dict[str, str] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            flat |= {f"{key}.{inner}": text for inner, text in params_of(value).items()}
+        else:
+            flat[key] = value if isinstance(value, str) else json.dumps(value)
+    return flat
+
+
+def _export(
+    recording: Recording, tracking: str, experiment: str, with_recording: bool, force: bool
+) -> Exported:
+    from mlflow.tracking import MlflowClient
+
+    client = MlflowClient(tracking_uri=tracking, registry_uri=tracking)
+    found = client.get_experiment_by_name(experiment)
+    into = client.create_experiment(experiment) if found is None else found.experiment_id
+    known = client.search_runs([into], f"tags.`{RUN_TAG}` = '{recording.run['run_id']}'")
+    same = [one for one in known if one.data.tags.get(DIGEST_TAG) == _digest(recording)]
+    if same and not force:
+        return Exported(same[0].info.run_id, 0, already=True)
+    if known and not force:
+        raise RunnerError(
+            f"{tracking}: experiment {experiment!r} has the run {recording.run['run_id']} "
+            "with other content; --force replaces it."
+        )
+    made = client.create_run(into, start_time=round(created(recording) * 1000), tags=_tags(recording))
+    try:
+        exported = _fill(client, made.info.run_id, recording, with_recording)
+    except BaseException:
+        client.delete_run(made.info.run_id)
+        raise
+    for one in known:
+        client.delete_run(one.info.run_id)
+    return exported
+
+
+def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) -> Exported:
+    from mlflow.entities import Metric, Param
+
+    params = params_of(recording.config)
+    fitting = [Param(key, text) for key, text in params.items() if len(text) <= _LONGEST]
+    notes = [
+        f"{key} is longer than MLflow's {_LONGEST:,} characters; it is in run.json alone."
+        for key, text in params.items()
+        if len(text) > _LONGEST
+    ]
+    for start in range(0, len(fitting), _PARAMS_AT_ONCE):
+        client.log_batch(run_id, params=fitting[start : start + _PARAMS_AT_ONCE])
+    began, count, last = created(recording), 0, 0.0
+    rows = (
+        (f"{found.phase}/{name}", value, began + seconds_of(found.position), found.step)
+        for found in measures(recording)
+        for name, value in found.values.items()
+    )
+    while some := list(islice(rows, _AT_ONCE)):
+        client.log_batch(
+            run_id, [Metric(key, value, round(at * 1000), step) for key, value, at, step in some]
+        )
+        count, last = count + len(some), max(last, *(at for _, _, at, _ in some))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "run.json")
+        path.write_text(json.dumps(recording.run_facts(), indent=1), encoding="utf-8")
+        client.log_artifact(run_id, str(path))
+    if with_recording:
+        client.log_artifact(run_id, str(recording.path))
+    status = _STATUS.get(recording.result.get("status", "interrupted"), "KILLED")
+    client.set_terminated(run_id, status, round(max(last, began) * 1000))
+    return Exported(run_id, count, False, tuple(notes))
+
+
+def _digest(recording: Recording) -> str:
+    return str(recording.result.get("content_digest", ""))
+
+
+def _tags(recording: Recording) -> dict[str, str]:
+    run = recording.run
+    return {
+        "mlflow.runName": f"{run['name']}, seed {run['seed']}",
+        "mlflow.source.name": "dualtaxi",
+        "mlflow.user": "",
+        RUN_TAG: run["run_id"],
+        DIGEST_TAG: _digest(recording),
+        "dualtaxi.job": run["job"],
+        "dualtaxi.seed": run["seed"],
+        "dualtaxi.status": recording.result.get("status", "interrupted"),
+    }
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep MLflow's own notices from the user's terminal."""
+    loggers = [logging.getLogger(name) for name in ("mlflow", "alembic")]
+    levels = [logger.level for logger in loggers]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            for logger in loggers:
+                logger.setLevel(logging.ERROR)
+            yield
+        finally:
+            for logger, level in zip(loggers, levels, strict=True):
+                logger.setLevel(level)

@@ -1,0 +1,90 @@
+"""Where an export goes: a folder that appears when it is whole, and replaces only what an export wrote."""
+
+from __future__ import annotations
+
+import contextlib
+import fnmatch
+import secrets
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from runner.errors import MissingExtra, RecordingError, RunnerError, StorageError
+from runner.export.report_runs import has_steps
+from runner.recording.reader import Recording
+
+
+@contextlib.contextmanager
+def new_folder(path: Path, force: bool, ours: Sequence[str]) -> Iterator[Path]:
+    """Give a hidden folder beside a place; put it there when all went well.
+
+    Args:
+        path: the place.
+        force: replace a folder that is there, if it holds nothing but files of ours.
+        ours: patterns of the paths of the files that the export writes.
+
+    Raises:
+        RunnerError: something is there and is not to be replaced.
+        StorageError: the folder cannot be written.
+    """
+    _check_place(path, force, ours)
+    fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    old = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    try:
+        fresh.mkdir(parents=True)
+        yield fresh
+        if path.exists():
+            path.rename(old)
+        fresh.rename(path)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
+    finally:
+        for folder in (fresh, old):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _check_place(path: Path, force: bool, ours: Sequence[str]) -> None:
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise RunnerError(f"{path}: found a file, expected a place for a folder; choose another by -o.")
+    if not force:
+        raise RunnerError(f"{path}: exists already; --force replaces it, or choose another by -o.")
+    for file in path.rglob("*"):
+        name = file.relative_to(path).as_posix()
+        if not file.is_dir() and not any(fnmatch.fnmatchcase(name, pattern) for pattern in ours):
+            raise RunnerError(
+                f"{path}: holds {name}, which no export wrote; --force leaves such a folder alone."
+            )
+
+
+def require_pyarrow(purpose: str) -> None:
+    """Raise an error that says what is missing, if what writes tables is not installed.
+
+    Raises:
+        MissingExtra: it is not.
+    """
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError as error:
+        raise MissingExtra("pyarrow", "archive", purpose) from error
+
+
+def require_steps(recording: Recording) -> None:
+    """Refuse a recording without steps.
+
+    Raises:
+        RecordingError: it has none.
+    """
+    if not has_steps(recording):
+        raise RecordingError(f"{recording.path}: found no steps to export; `dualtaxi rerecord` records them.")
+
+
+def shortcomings(recording: Recording) -> list[str]:
+    """Return what whoever exports a run should know of it, a sentence each."""
+    said = []
+    status = recording.result.get("status", "interrupted")
+    if status != "finished":
+        said.append(f"The run is {status}: exported is what there is, up to its last whole chunk.")
+    said += [f"Of {topic} some messages were lost in a repair; they are missing." for topic in recording.lost]
+    return said

@@ -1,0 +1,109 @@
+"""A run's measures as named numbers over training steps: what metric stores and spreadsheets take.
+
+    train/mean_length, train/percent_filled/taxi_1, train/reward_counts/-1, train/epsilon, ...
+    eval/finish_percent, eval/mean_return/taxi_1, eval/events/taxi_1.drop_off, eval/training/epsilon, ...
+
+What is unknown (a mean over no episode, success where the environment does not say what it is) is left
+out, so every number is one that was recorded, unchanged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from runner.errors import RecordingError
+from runner.frames import agents_of, event_names_of
+from runner.recording.reader import Recording
+from runner.recording.schema import STEP_NANOSECONDS
+
+_OF_TRAINING = ("mean_length", "zero_cells", "percent_filled", "epsilon", "step_size", "discount")
+_OF_EVALUATION = ("trials", "successes", "finish_percent", "mean_penalties", "terminations")
+
+
+@dataclass(frozen=True)
+class Measures:
+    """The numbers of one moment."""
+
+    phase: str
+    """`train` or `eval`."""
+    position: int
+    """Environment steps executed before, of training and evaluation together: the logical time."""
+    step: int
+    """Training steps taken."""
+    episode: int
+    """Training episodes done."""
+    values: Mapping[str, float]
+    """By name, without the phase."""
+
+
+def measures(recording: Recording) -> Iterator[Measures]:
+    """Yield the reports of training, then the evaluations, one by one, in order.
+
+    Raises:
+        RecordingError: the recording is damaged.
+    """
+    agents, events = agents_of(recording), event_names_of(recording)
+    for phase in ("train", "eval"):
+        for metrics in recording.iter_metrics(phase):
+            values = training_values(metrics, agents)
+            if phase == "eval":
+                values = evaluation_values(metrics, agents, events) | {
+                    f"training/{name}": value for name, value in values.items()
+                }
+            position = metrics["log_time"] // STEP_NANOSECONDS
+            yield Measures(phase, position, metrics["step"], metrics["episode"], values)
+
+
+def training_values(metrics: Mapping[str, Any], agents: Sequence[str]) -> dict[str, float]:
+    """Return how training stood, by name."""
+    values: dict[str, float] = {}
+    for name in _OF_TRAINING:
+        values |= _named(name, metrics[name], agents)
+    pairs = zip(metrics["rewards"], metrics["reward_counts"], strict=True)
+    return values | {f"reward_counts/{reward:g}": float(count) for reward, count in pairs}
+
+
+def evaluation_values(
+    metrics: Mapping[str, Any], agents: Sequence[str], events: Sequence[str]
+) -> dict[str, float]:
+    """Return what came of an evaluation, by name."""
+    values: dict[str, float] = {}
+    for name in _OF_EVALUATION:
+        if name != "successes" or metrics[name] >= 0:
+            values |= _named(name, metrics[name], agents)
+    values |= _named("mean_length", metrics["eval_mean_length"], agents)
+    values |= _named("mean_return", metrics["mean_returns"], agents)
+    return values | _named("events", metrics["events"], events)
+
+
+def created(recording: Recording) -> float:
+    """Return when the run began, in seconds since 1970.
+
+    Raises:
+        RecordingError: it says no time.
+    """
+    try:
+        return datetime.fromisoformat(recording.run["created"]).timestamp()
+    except (ValueError, OverflowError) as error:
+        raise RecordingError(
+            f"{recording.path}: found {recording.run['created']!r}, expected the time it was made."
+        ) from error
+
+
+def seconds_of(position: int) -> float:
+    """Return logical time in seconds."""
+    return position * STEP_NANOSECONDS / 1e9
+
+
+def _named(name: str, value: Any, owners: Sequence[str]) -> dict[str, float]:
+    """Return one number, or one for each owner; what is unknown is left out."""
+    found = (
+        {f"{name}/{owner}": float(part) for owner, part in zip(owners, value, strict=True)}
+        if isinstance(value, list)
+        else {name: float(value)}
+    )
+    return {key: number for key, number in found.items() if math.isfinite(number)}

@@ -1,0 +1,323 @@
+"""What is exported, read back by the tool it is for, is what was recorded, exactly."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+from click.testing import CliRunner
+
+from runner.cli import cli
+from runner.export.scalars import measures
+from runner.recording import schema
+from runner.recording.reader import open_recording
+from tests.runner.recording.making import LAKE, TAXIS, make_run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("tools")
+
+
+@pytest.fixture(scope="module")
+def taxis(folder):
+    return make_run(folder, TAXIS)
+
+
+@pytest.fixture(scope="module")
+def bare(folder):
+    return make_run(folder, LAKE, recording={"steps": "none"}, name="bare")
+
+
+@pytest.fixture(scope="module")
+def killed(folder, taxis):
+    """A recording that was cut off, alone in its folder."""
+    (folder / "cut").mkdir()
+    path = folder / "cut" / "recording.mcap"
+    path.write_bytes(taxis.recording.read_bytes()[:-30_000])
+    return path
+
+
+@pytest.fixture
+def export(tmp_path, monkeypatch):
+    """The command, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words, code=0):
+        result = CliRunner().invoke(cli, ["export", *map(str, words)])
+        assert result.exit_code == code, result.output
+        return result
+
+    return call
+
+
+def steps_of(path, phase, start=0, stop=None):
+    with open_recording(path) as recording:
+        return np.concatenate([b.copy() for b in recording.blocks_of_episodes(phase, start, stop)])
+
+
+def read_table(path):
+    if path.suffix == ".parquet":
+        return pyarrow.parquet.read_table(path)
+    return pyarrow.csv.read_csv(path)
+
+
+@pytest.mark.parametrize("words", [["csv"], ["csv", "--gz"], ["parquet"]], ids=" ".join)
+def test_tables_hold_every_step_episode_and_measure(export, taxis, words):
+    export(*words, taxis.recording, "-o", "out")
+    ending = ".csv.gz" if "--gz" in words else f".{words[0]}"
+    steps, episodes, metrics = (
+        read_table(Path("out", name + ending)).to_pandas() for name in ("steps", "episodes", "metrics")
+    )
+    for phase in ("train", "eval"):
+        recorded = steps_of(taxis.recording, phase)
+        found = steps[steps["phase"] == phase]
+        for name in ("step", "episode", "t", "state", "action", "next_state", "terminated", "truncated"):
+            assert (found[name].to_numpy() == recorded[name]).all(), name
+        for i, agent in enumerate(("taxi_1", "taxi_2")):
+            assert (found[f"reward_{agent}"].to_numpy() == recorded["rewards"][:, i]).all()
+        assert (found["action_taxi_1"] * 6 + found["action_taxi_2"] == found["action"]).all()
+        with open_recording(taxis.recording) as recording:
+            ended = recording.episodes(phase)
+        found = episodes[episodes["phase"] == phase]
+        for name in ("episode", "length", "success"):
+            assert (found[name].to_numpy() == ended[name]).all(), name
+        assert (found["return_taxi_2"].to_numpy() == ended["returns"][:, 1]).all()
+    assert_measures(taxis, metrics)
+
+
+def assert_measures(run, metrics):
+    with open_recording(run.recording) as recording:
+        expected = [
+            (found.phase, found.step, found.episode, name, value)
+            for found in measures(recording)
+            for name, value in found.values.items()
+        ]
+        (last,) = recording.metrics("eval")[-1:]
+    assert (
+        list(zip(*(metrics[c] for c in ("phase", "step", "episode", "metric", "value")), strict=True))
+        == expected
+    )
+    named = {
+        name: value for phase, step, _, name, value in expected if (phase, step) == ("eval", last["step"])
+    }
+    assert named["finish_percent"] == last["finish_percent"]
+    assert named["mean_return/taxi_2"] == last["mean_returns"][1]
+    assert named["training/percent_filled/taxi_1"] == last["percent_filled"][0]
+    assert named["events/taxi_1.drop_off"] + named["events/taxi_2.drop_off"] == last["successes"]
+
+
+def test_tables_of_chosen_episodes(export, taxis):
+    export("csv", taxis.recording, "-o", "out", "--episodes", "3:5,58:")
+    steps = read_table(Path("out/steps.csv")).to_pandas()
+    assert set(steps["phase"]) == {"train"}
+    assert sorted(set(steps["episode"])) == [3, 4, 58, 59]
+    export("csv", taxis.recording, "-o", "out", "--phase", "eval", "--force")
+    assert set(read_table(Path("out/episodes.csv")).to_pandas()["phase"]) == {"eval"}
+
+
+@pytest.mark.parametrize("phase", ["train", "eval"])
+def test_minari_reads_the_episodes(export, taxis, phase, monkeypatch):
+    minari = pytest.importorskip("minari")
+    told = export("minari", taxis.recording, "--phase", phase)
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("minari").absolute()))
+    dataset = minari.load_dataset(f"taxis-{taxis.run_id}-v0")
+    recorded = steps_of(taxis.recording, phase)
+    with open_recording(taxis.recording) as recording:
+        ended = recording.episodes(phase)
+        mdp = recording.mdp
+    assert dataset.total_episodes == len(ended)
+    assert dataset.total_steps == len(recorded)
+    assert (dataset.observation_space.n, dataset.action_space.n) == (mdp.states, mdp.joint_actions)
+    assert "specify" not in told.stderr
+    assert dataset.spec.env_spec.id == "DualTaxi-v1"
+    for episode, record in zip(dataset.iterate_episodes(), ended, strict=True):
+        steps = recorded[recorded["episode"] == record["episode"]]
+        assert episode.observations.tolist() == [*steps["state"].tolist(), int(steps["next_state"][-1])]
+        assert (episode.actions == steps["action"]).all()
+        assert (episode.rewards == steps["rewards"].sum(axis=1)).all()
+        assert (episode.terminations == steps["terminated"]).all()
+        assert (episode.truncations == steps["truncated"]).all()
+        assert (episode.infos["rewards"][1:] == steps["rewards"]).all()
+
+
+def test_minari_of_chosen_and_of_cut_off_episodes(export, taxis, killed, monkeypatch):
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("minari").absolute()))
+    export("minari", taxis.recording, "--episodes", "7")
+    assert minari.load_dataset(f"taxis-{taxis.run_id}-v0").total_steps == len(
+        steps_of(taxis.recording, "train", 7, 8)
+    )
+    told = export("minari", killed, "--force")
+    assert "interrupted" in told.stderr
+    for episode in minari.load_dataset(f"taxis-{taxis.run_id}-v0").iterate_episodes():
+        assert episode.terminations[-1] or episode.truncations[-1]
+    assert "there are 60" in export("minari", taxis.recording, "--episodes", "60:", "--force", code=2).stderr
+
+
+def test_tensorboard_reads_the_measures(export, taxis):
+    pytest.importorskip("tensorboardX")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    export("tensorboard", taxis.recording, "-o", "a/logs")
+    export("tensorboard", taxis.recording, "-o", "b/logs")
+    (first,), (second,) = (list(Path(place, "logs").iterdir()) for place in "ab")
+    assert first.name == second.name
+    assert first.read_bytes() == second.read_bytes()
+    events = accumulator.EventAccumulator("a/logs", size_guidance={"scalars": 0, "tensors": 0}).Reload()
+    expected: dict[str, list[tuple[float, int, float]]] = {}
+    with open_recording(taxis.recording) as recording:
+        began = taxis.created.timestamp()
+        for found in measures(recording):
+            for name, value in found.values.items():
+                at = began + found.position / 10
+                expected.setdefault(f"{found.phase}/{name}", []).append((at, found.step, np.float32(value)))
+        episodes = recording.episodes("train")
+    for tag, points in expected.items():
+        assert [(e.wall_time, e.step, e.value) for e in events.Scalars(tag)] == points
+    returns = events.Scalars("train/episode/return/taxi_2")
+    assert [event.value for event in returns] == episodes["returns"][:, 1].tolist()
+    assert [event.step for event in returns] == (episodes["last_step"] + 1).tolist()
+    assert set(events.Tags()["scalars"]) - set(expected) == {
+        "train/episode/length",
+        "train/episode/return/taxi_1",
+        "train/episode/return/taxi_2",
+    }
+
+
+def read_mlflow():
+    """Return the runs in the store, as MLflow's client gives them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from mlflow.tracking import MlflowClient
+
+        client = MlflowClient(tracking_uri="sqlite:///mlflow.db", registry_uri="sqlite:///mlflow.db")
+        experiment = client.get_experiment_by_name("dualtaxi")
+        return [read_run(client, run) for run in client.search_runs([experiment.experiment_id])]
+
+
+def read_run(client, run):
+    run_id = run.info.run_id
+    return {
+        "id": run_id,
+        "status": run.info.status,
+        "start": run.info.start_time,
+        "params": run.data.params,
+        "tags": run.data.tags,
+        "files": [file.path for file in client.list_artifacts(run_id)],
+        "facts": json.loads(Path(client.download_artifacts(run_id, "run.json")).read_text()),
+        "history": {
+            name: [(m.timestamp, m.step, m.value) for m in client.get_metric_history(run_id, name)]
+            for name in run.data.metrics
+        },
+    }
+
+
+def test_mlflow_reads_the_run_once(export, taxis):
+    pytest.importorskip("mlflow")
+    export("mlflow", taxis.recording, "--with-recording")
+    (found,) = read_mlflow()
+    assert "already" in export("mlflow", taxis.recording).stderr
+    (again,) = read_mlflow()
+    assert again["id"] == found["id"]
+    assert found["status"] == "FINISHED"
+    assert found["files"] == ["recording.mcap", "run.json"]
+    assert found["facts"]["config"] == taxis.facts["config"]
+    assert found["params"]["evaluation.trials"] == "3"
+    assert found["params"]["env.kwargs.max_episode_steps"] == "90"
+    assert json.loads(found["params"]["env.kwargs.map"]) == TAXIS["env"]["kwargs"]["map"]
+    assert found["tags"]["dualtaxi.content_digest"] == taxis.summary["content_digest"]
+    assert found["start"] == round(taxis.created.timestamp() * 1000)
+    expected: dict[str, list[tuple[int, int, float]]] = {}
+    with open_recording(taxis.recording) as recording:
+        for moment in measures(recording):
+            at = round((taxis.created.timestamp() + moment.position / 10) * 1000)
+            for name, value in moment.values.items():
+                expected.setdefault(f"{moment.phase}/{name}", []).append((at, moment.step, value))
+    assert {name: sorted(points) for name, points in found["history"].items()} == {
+        name: sorted(points) for name, points in expected.items()
+    }
+    export("mlflow", taxis.recording, "--force")
+    (anew,) = read_mlflow()
+    assert anew["id"] != found["id"]
+    assert anew["files"] == ["run.json"]
+
+
+def test_a_store_that_cannot_be_used_is_told(export, taxis):
+    pytest.importorskip("mlflow")
+    assert "cannot" in export("mlflow", taxis.recording, "--tracking-uri", "nonsense://x", code=2).stderr
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "minari"])
+def test_a_run_without_steps_names_what_records_them(export, bare, form):
+    assert "rerecord" in export(form, bare.recording, code=2).stderr
+    assert list(Path().iterdir()) in ([], [Path("minari")])
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "tensorboard"])
+def test_an_interrupted_run_gives_what_there_is(export, killed, form):
+    assert "interrupted" in export(form, killed, "-o", "out").stderr
+    if form != "tensorboard":
+        steps = read_table(Path(f"out/steps.{form}")).to_pandas()
+        recorded = steps_of(killed, "train")
+        assert (steps[steps["phase"] == "train"]["state"].to_numpy() == recorded["state"]).all()
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "tensorboard"])
+def test_a_folder_is_replaced_only_by_force_and_only_if_it_is_ours(export, taxis, form):
+    export(form, taxis.recording, "-o", "out")
+    before = sorted(Path("out").iterdir())
+    assert "--force" in export(form, taxis.recording, "-o", "out", code=2).stderr
+    export(form, taxis.recording, "-o", "out", "--force")
+    assert sorted(Path("out").iterdir()) == before
+    Path("out/mine.txt").write_text("mine")
+    assert "mine.txt" in export(form, taxis.recording, "-o", "out", "--force", code=2).stderr
+    assert Path("out/mine.txt").read_text() == "mine"
+    assert [path.name for path in Path().iterdir()] == ["out"]
+
+
+def test_the_layout_for_foxglove_names_what_a_recording_has(taxis):
+    layout = json.loads((Path(__file__).parents[3] / "docs" / "foxglove-layout.json").read_text())
+    panels = set()
+
+    def walk(node):
+        panels.update({node} if isinstance(node, str) else ())
+        for part in (node["first"], node["second"]) if isinstance(node, dict) else ():
+            walk(part)
+
+    walk(layout["layout"])
+    assert panels == set(layout["configById"])
+    topics = {topic.name: topic for topic in schema.TOPICS}
+    with open_recording(taxis.recording) as recording:
+        for panel in layout["configById"].values():
+            for path in panel.get("paths", []):
+                name, _, field = path["value"].partition(".")
+                topic = topics[name]
+                field, _, index = field.partition("[")
+                (described,) = (one for one in topic.message.fields if one.name == field)
+                assert bool(index) == described.repeated, path
+                assert recording.count(topic)
+            if "topicToRender" in panel:
+                assert panel["topicToRender"] in topics
+
+
+@pytest.mark.parametrize(
+    ("form", "package", "extra"),
+    [
+        ("csv", "pyarrow", "archive"),
+        ("minari", "minari", "minari"),
+        ("minari", "h5py", "minari"),
+        ("tensorboard", "tensorboardX", "tensorboard"),
+        ("mlflow", "mlflow", "mlflow"),
+    ],
+)
+def test_a_missing_package_is_told_with_its_extra(export, taxis, monkeypatch, form, package, extra):
+    monkeypatch.setitem(sys.modules, package, None)
+    assert f"dualtaxi[{extra}]" in export(form, taxis.recording, code=2).stderr
