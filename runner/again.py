@@ -16,6 +16,7 @@ from runner.execution import Report, Session, Stop, describe, recorder_for, run_
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import load_mdp
+from runner.origin import address
 from runner.provenance import provenance
 from runner.recording.contents import survey
 from runner.recording.reader import open_recording
@@ -110,13 +111,12 @@ def evaluation_of(
         tables_at(recording, chosen)  # refused here, before there is a run
         starts = int(np.count_nonzero(recording.mdp.start))
         original = from_mapping(recording.config)
-    known = run.folder.parent.resolve() == recordings.resolve() and run.recording.name == runs.RECORDING_FILE
     return _with(
         original,
         name=f"{run.name[:90]}.evaluated",
         seeds=[seed],
         episodes=0,
-        initial_q={"run": run.run_id if known else str(run.recording.resolve()), "step": chosen},
+        initial_q={"run": address(run, recordings), "step": chosen},
         evaluation={
             "every": 1,
             "trials": starts if trials is None else trials,

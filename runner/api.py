@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.config import ConfigError, ExperimentConfig, from_mapping, load
+from runner.config import ConfigError, ExperimentConfig, RunTable, from_mapping, load
 from runner.job import Job, jobs_of
 from runner.runs import Run, create_run, recordings_folder, unless_empty
 
@@ -92,6 +92,19 @@ def experiment_of(config: Config, overrides: Sequence[str] = (), seed: int | Non
     return load(config, changes)
 
 
+def jobs_in(config: ExperimentConfig, recordings: Path) -> Iterator[Job]:
+    """Yield the jobs of an experiment, one a seed; all begin with the same table, if it is a run's.
+
+    Raises:
+        RunnerError: it begins with the table of a run that is not there.
+    """
+    if isinstance(config.initial_q, RunTable):
+        from runner.origin import settled
+
+        config = settled(config, recordings)
+    return jobs_of(config)
+
+
 def checked_name(name: str | None) -> str | None:
     """Return the name of a run if it can be one.
 
@@ -161,7 +174,7 @@ def _run_jobs(
 ) -> Iterator[Run]:
     """Yield a run a seed; the folder is checked and the run stands on disk before anything heavy."""
     called, folder = checked_name(name), recordings_folder(recordings)
-    for job in jobs_of(config):
+    for job in jobs_in(config, folder):
         yield _run_job(job, folder, called, report)
 
 

@@ -15,19 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner import runs
-from runner.config.model import RunTable
 from runner.errors import Diverged, RunnerError, StorageError
 from runner.job import Job
 from runner.learning.learner import Learner
-from runner.mdp import Mdp, description_bytes, load_mdp
+from runner.mdp import description_bytes, load_mdp
 from runner.observer import Observer
+from runner.origin import configured_tables, settle
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.arrays import pack_array
 from runner.recording.chunks import Packing
 from runner.recording.messages import QTable, encode, encode_log, encode_q_table
 from runner.recording.past import Past
-from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder, storage_error
 from runner.recording.writer import RecordingFile
 from runner.runs import Run
@@ -76,6 +75,7 @@ def run_job(
     started = time.monotonic()
     with _failing(run):
         mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
+        job, run = settle(job, run)
         learner = Learner(job.config, mdp, job.seed, configured_tables(job, run, mdp))
         file = _create(run.folder / runs.RECORDING_FILE)
     with file:
@@ -370,38 +370,3 @@ def _describe(file: RecordingFile, job: Job, run: Run, learner: Learner, made_by
     file.add_attachment("environment.json", "application/json", json.dumps(description, indent=1).encode())
     for name, array in sorted(mdp.arrays().items()):
         file.add_attachment(f"environment/{name}.npy.zst", "application/zstd", pack_array(array))
-
-
-def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
-    """Return the tables of the run that `initial_q` names, if it names one."""
-    start = job.config.initial_q
-    if not isinstance(start, RunTable):
-        return None
-    return _recorded_tables(start, job, run, mdp)
-
-
-def _last_step(recording: Recording) -> int:
-    """Return how many training steps a recording knows of, also one that leaves its steps out."""
-    recorded = recording.count(schema.TRAIN_STEP)
-    ended = recording.count(schema.TRAIN_EPISODE)
-    last = int(recording.episodes("train", ended - 1, ended)[0]["last_step"]) + 1 if ended else 0
-    return max(recorded, last)
-
-
-def _recorded_tables(start: RunTable, job: Job, run: Run, mdp: Mdp) -> list[Any]:
-    """Return another run's tables after its last training step, or the step asked for.
-
-    Raises:
-        RunnerError: there is no such run or step, or its tables have another shape.
-    """
-    from runner.analysis.tables import tables_at
-
-    source = runs.find_run(start.run, run.folder.parent, but=run.run_id)
-    with open_recording(source.recording) as recording:
-        tables = tables_at(recording, _last_step(recording) if start.step is None else start.step)
-    joint = job.config.tables == "joint"
-    shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
-    if [table.shape for table in tables] != shapes:
-        found = [table.shape for table in tables]
-        raise RunnerError(f"initial_q: run {source.run_id} has tables of shape {found}, expected {shapes}.")
-    return tables

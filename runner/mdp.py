@@ -257,7 +257,7 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
     try:
         return gymnasium.make(name, disable_env_checker=True, **kwargs)
     except (AssertionError, LookupError, TypeError, ValueError, gymnasium.error.Error, ImportError) as error:
-        if "competitive" in kwargs and "'competitive'" in str(error):
+        if "competitive" in kwargs and "keyword argument 'competitive'" in str(error):
             raise _one_reward_only(env_id) from error
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
         raise EnvironmentNotUsable(f"environment {env_id!r} cannot be made with {given}: {error}") from error

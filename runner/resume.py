@@ -29,7 +29,6 @@ from runner.execution import (
     Report,
     Session,
     Stop,
-    configured_tables,
     describe,
     evaluation_brief,
     execute,
@@ -38,6 +37,7 @@ from runner.execution import (
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import Mdp, load_mdp
+from runner.origin import configured_tables, settle
 from runner.owner import owner
 from runner.provenance import provenance
 from runner.recording import schema
@@ -111,6 +111,8 @@ def _settled(run: Run) -> Run:
 def _go_on(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
     started = time.monotonic()
     job, described = _job(run)
+    if not described:
+        job, run = settle(job, run)
     path, contents = _place(run, described)
     changes = _changes(run)
     mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)

@@ -50,7 +50,7 @@ class Verification:
     eval_steps: int = 0
     """Evaluation steps that were compared."""
     content_digest: str = ""
-    """Of the whole job; empty if the recording is not whole."""
+    """Of all that was compared; empty if the recording does not state it, or is not whole."""
     notes: tuple[str, ...] = field(default=())
     """What a reader should know though it is not wrong."""
     provenance: dict[str, tuple[str, str]] = field(default_factory=dict)
@@ -163,7 +163,14 @@ def _compare(recording: Recording, rerun: bool, report: Report) -> Verification:
         session.recorder.abandon()
     steps = session.recorder.steps
     found = replace(found, train_steps=steps["train"], eval_steps=steps["eval"])
-    return _compare_result(found, recording, session.summary(topics)) if complete else found
+    if not (complete or _tells_its_digest(recording)):
+        return found
+    return _compare_result(found, recording, session.summary(topics))
+
+
+def _tells_its_digest(recording: Recording) -> bool:
+    """Return whether an interrupted run said what it came to, and holds every step that this counts."""
+    return bool(recording.result.get("content_digest") and recording.result.get("steps_recorded"))
 
 
 def _compare_result(found: Verification, recording: Recording, summary: dict[str, Any]) -> Verification:

@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 ORDER = """
     errors
-    cache documents
+    cache compiled documents
     config owner labels
     job toy_text scene
     mdp
@@ -21,7 +21,7 @@ ORDER = """
     catalogue
     frames packing
     analysis
-    archive
+    archive origin
     execution export
     verify
     resume

@@ -103,6 +103,11 @@ class Pipeline:
         chunk = self._encode(encoded) if self._file is not None else None
         self._work.put(_Work(topic, memoryview(b""), chunk, lambda: None))
 
+    @property
+    def open(self) -> bool:
+        """Whether it takes more: it was not closed."""
+        return self._writer.is_alive()
+
     def close(self) -> None:
         """Wait until everything sent is written, or was given up after a failure; stop the threads."""
         if self._writer.is_alive():

@@ -220,7 +220,9 @@ class Recorder:
         return self._pipeline.hash.topics()
 
     def abandon(self) -> None:
-        """Stop the threads; what was written stays readable."""
+        """Write what was committed, unless writing failed, and stop the threads: the run ends badly."""
+        if self._file is not None and self._pipeline.open and self._pipeline.failure is None:
+            self.flush()
         self._pipeline.close()
 
     def _open(self, topic: Topic) -> _Block:
@@ -244,13 +246,15 @@ class Recorder:
         times = positions * np.uint64(STEP_NANOSECONDS)
         fresh["log_time"] = times
         fresh["publish_time"] = times
+        if known:
+            self._past.compare_block(topic, fresh)
+        else:
+            self._past.check_new(topic, fresh)
         block.filled += len(positions)
         self.counts[topic.name] += len(positions)
         if known:
-            self._past.compare_block(topic, fresh)
             self._close_block(lane, write=False)
             return
-        self._past.check_new(topic, fresh)
         if block.filled == len(block.records):
             self._close_block(lane)
 

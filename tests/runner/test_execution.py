@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+import runner
 from runner.config import ConfigError
 from runner.errors import EnvironmentNotUsable, RunnerError, RunNotFound
 from runner.execution import run_job
@@ -251,6 +252,23 @@ def test_an_error_of_whoever_listens_ends_the_run_as_failed(tmp_path):
     assert (failed.status, failed.summary["error"]) == ("failed", "by whoever listens")
 
 
+def test_an_error_of_whoever_listens_loses_no_step_that_was_taken(tmp_path):
+    config = experiment(TAXIS, recording={"chunk_steps": 65_536})  # no chunk is full when it ends
+    run = create_run(tmp_path, config, 0)
+    taken = []
+
+    def report(progress):
+        taken.append((progress.train_steps, progress.eval_steps))
+        if len(progress.evaluations) == 2:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run_job(Job(config, 0), run, report=report)
+    with open_recording(run.recording) as recording:
+        assert (recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)) == taken[-1]
+        assert min(taken[-1]) > 0
+
+
 @pytest.mark.parametrize(
     ("broken", "error"),
     [
@@ -319,3 +337,21 @@ def test_the_newest_run_of_a_name_is_never_the_one_that_is_asking(tmp_path):
     with open_recording(first.recording) as before, open_recording(second.recording) as after:
         assert next(after.snapshots()).values.tobytes() == list(before.snapshots())[-1].values.tobytes()
     make_run(tmp_path, LAKE, initial_q={"run": "@latest"})
+
+
+@pytest.mark.parametrize("start", [{"run": "lake"}, {"run": "lake@latest", "step": 3}])
+def test_the_run_that_a_table_comes_from_is_settled_when_the_job_is_created(start, tmp_path):
+    """The name may answer to another run by the time that the job is looked at again."""
+    first = make_run(tmp_path, LAKE)
+    second = make_run(tmp_path, LAKE, name="second", initial_q=start)
+    origin = {"run": first.run_id, "step": start.get("step", first.summary["train_steps"])}
+    assert find_run(second.run_id, tmp_path).facts["config"]["initial_q"] == origin
+    with open_recording(second.recording) as recording:
+        assert recording.config["initial_q"] == origin
+
+
+def test_every_seed_begins_with_the_same_table(tmp_path):
+    first = make_run(tmp_path, LAKE)
+    config = experiment(LAKE, initial_q={"run": "lake@latest"}, seeds=[1, 2])
+    runs = list(runner.run_all(config, recordings=tmp_path))
+    assert [run.facts["config"]["initial_q"]["run"] for run in runs] == [first.run_id] * 2

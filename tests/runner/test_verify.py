@@ -10,12 +10,16 @@ import pytest
 from mcap.writer import Writer
 
 from runner import verify as verifying
+from runner.config import from_mapping
 from runner.errors import RecordingError
+from runner.execution import run_job
+from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.contents import survey
 from runner.recording.messages import decode, encode
 from runner.recording.repair import repair
+from runner.runs import create_run
 from runner.verify import verify
 from tests.runner.altering import altered
 from tests.runner.recording.making import TAXIS, make_run
@@ -201,6 +205,23 @@ def test_an_interrupted_recording_is_compared_to_its_end(run, tmp_path):
     with open_recording(cut):
         found = verify(altered_without_result(cut, path, change))
     assert found.difference.field == "mean_length"
+
+
+def test_what_an_interrupted_run_says_at_its_end(run, tmp_path):
+    job = Job(from_mapping(run.facts["config"]), run.seed)
+    times = iter(range(1000))
+    stopped = run_job(job, create_run(tmp_path, job.config, job.seed), stop=lambda: next(times) > 4)
+    assert stopped.status == "interrupted"
+    found = verify(stopped.recording)
+    assert found.sound, found.finding
+    assert found.content_digest == stopped.summary["content_digest"]
+    for key, value in (("content_digest", "0" * 64), ("train_steps", 1)):
+
+        def change(entries, key=key, value=value):
+            return {"json": json.dumps(json.loads(entries["json"]) | {key: value})}
+
+        found = verify(altered(stopped.recording, tmp_path / f"{key}.mcap", None, id, result=change))
+        assert (found.difference.topic, found.difference.field) == ("metadata result", key)
 
 
 def altered_without_result(source, target, change):

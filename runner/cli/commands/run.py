@@ -80,14 +80,13 @@ def command(
       dualtaxi run configs/quick.yaml --set 'seeds={count: 3}' --json
       dualtaxi run configs/cooperative.yaml --live --live-every 100
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.api import checked_name, experiment_of
-    from runner.job import jobs_of
+    from runner.api import checked_name, experiment_of, jobs_in
     from runner.runs import recordings_folder
 
     experiment = experiment_of(config, overrides, seed)
     called, folder = checked_name(name), recordings_folder(recordings)
     watch = _watcher(experiment, live, live_every, live_url)
-    for number, job in enumerate(jobs_of(experiment)):
+    for number, job in enumerate(jobs_in(experiment, folder)):
         run, interrupted = _run_one(job, folder, called, number, watch)
         if as_json:
             print_json(_as_json(run), indent=None)
@@ -120,9 +119,12 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch
     from runner.runs import create_run, unless_empty
 
     run = create_run(folder, job.config, job.seed, name)
+    from runner.mdp import load_mdp
+
     label = f"seed {run.seed}" if len(job.config.seeds) > 1 else ""
     with unless_empty(run):
         if number == 0:
+            load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)  # refused before all else
             _announce(job.config, folder)
         with (
             interruptible(second=signal.SIG_DFL) as interrupt,

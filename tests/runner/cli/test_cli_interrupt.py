@@ -136,3 +136,31 @@ def test_only_an_empty_run_is_removed(tiny, tmp_path, recorded):
         fail()
     assert run.folder.exists() == recorded
     assert bool(getattr(caught.value, "__notes__", [])) != recorded
+
+
+@posix
+@pytest.mark.parametrize("module", ["click", "runner.errors", "runner.api"])
+def test_a_signal_while_the_command_line_is_loaded_is_no_traceback(tiny, tmp_path, module):
+    """The signal comes just when this module is imported."""
+    program = f"""
+import signal, sys
+
+class Signalling:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Signalling())
+from runner.__main__ import main
+sys.argv[1:] = {["run", str(tiny), "--recordings", str(tmp_path / "recordings")]!r}
+main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=_heeding,
+    )
+    assert (done.returncode, done.stdout) == (130, ""), done.stderr
+    assert "Traceback" not in done.stderr

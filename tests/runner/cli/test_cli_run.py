@@ -69,6 +69,13 @@ def test_what_it_tells_to_type_next_works(command, tiny):
             assert command(*line.partition("dualtaxi ")[2].split()).exit_code == 0
 
 
+def test_an_environment_that_cannot_be_used_is_told_before_any_estimate(command, tiny):
+    result = command("run", tiny, "--set", "env.kwargs={sloop: 0.1}")
+    assert result.exit_code == 2
+    assert "sloop" in result.stderr
+    assert "about" not in result.stderr
+
+
 def test_the_estimate_comes_first_and_on_stderr(command, tiny):
     result = command("run", tiny, "--json")
     assert result.stderr.startswith("30 episodes: about ")
