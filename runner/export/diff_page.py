@@ -33,6 +33,7 @@ from runner.words import spoken, states_in_words
 
 _MOST_VALUES: Final = 6
 """Q-values shown of each run: the highest."""
+_GREEDY: Final = "\N{NO-BREAK SPACE}◀\N{NO-BREAK SPACE}greedy"
 
 
 def render_diff(difference: RunDiff, a: Recording, b: Recording) -> str:
@@ -147,7 +148,7 @@ def _values(row: Row) -> Grid:
         int(j) for values in (a, b) for j in np.argsort(-values, kind="stable")[:_MOST_VALUES]
     )
     rows = [
-        (row.actions[j], *(f"{v[j]:.6g}{'  ◀ greedy' if j == int(v.argmax()) else ''}" for v in (a, b)))
+        (row.actions[j], *(f"{v[j]:.6g}{_GREEDY if j == int(v.argmax()) else ''}" for v in (a, b)))
         for j in shown
     ]
     of = f", the highest of {len(row.actions)}" if len(row.actions) > len(shown) else ""

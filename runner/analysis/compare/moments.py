@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -53,7 +54,8 @@ def value_of(
     run: RunSeries, metric: str, line: str, moment: Moment, groups: Sequence[Group]
 ) -> tuple[float | None, str]:
     """Return a run's value of a metric, or None and why it has none."""
-    points = points_of(run, metric, line, aligned=True)
+    read = points_of(run, metric, line, aligned=True)
+    points = {episode: value for episode, value in read.items() if math.isfinite(value)}
     if not points:
         return None, f"has no {metric}{'.' + line if line else ''}"
     if moment.kind == "episode":

@@ -5,19 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
+from runner.errors import RunnerError, nearest
+from runner.frames import agents_of
 from runner.recording.reader import Recording
 
 SERIES = {
     "finish_percent": "finish_percent",
     "mean_length": "eval_mean_length",
     "mean_penalties": "mean_penalties",
-    "training_length": "mean_length",
+    "training.mean_length": "mean_length",
 }
 """A metric's name to the field of an evaluation."""
+BY_AGENT = {"mean_return": "mean_returns", "training.percent_filled": "percent_filled"}
+"""The same for those of which each learner has its own: `mean_return.taxi_1`."""
 
 
 @dataclass(frozen=True)
@@ -51,24 +54,31 @@ def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> li
         a: one run.
         b: another.
         targets: metric to a level, whose first crossing is to be told.
+
+    Raises:
+        RunnerError: they have no metric of that name.
     """
-    left, right = a.metrics("eval"), b.metrics("eval")
-    if not left or not right:
-        return []
-    values = [_values(left), _values(right)]
+    values = [_values(recording) for recording in (a, b)]
     names = [name for name in values[0] if name in values[1]]
+    for name in targets:
+        if names and name not in names:
+            listed = ", ".join(names)
+            raise RunnerError(f"--target: found {name!r}, expected one of {listed}.{nearest(name, names)}")
     return [_metric_diff(name, values[0][name], values[1][name], targets.get(name)) for name in names]
 
 
-def _values(evaluations: list[dict[str, Any]]) -> dict[str, dict[int, float]]:
+def _values(recording: Recording) -> dict[str, dict[int, float]]:
     """Return metric to episode to value; what is unknown (nan) is left out."""
+    agents = agents_of(recording)
     table: dict[str, dict[int, float]] = {}
-    for metrics in evaluations:
+    for metrics in recording.iter_metrics("eval"):
         plain = {name: metrics[key] for name, key in SERIES.items()}
-        several = {f"percent_filled[{i}]": value for i, value in enumerate(metrics["percent_filled"])} | {
-            f"mean_return[{i}]": value for i, value in enumerate(metrics["mean_returns"])
+        own = {
+            f"{name}.{agent}": value
+            for name, key in BY_AGENT.items()
+            for agent, value in zip(agents, metrics[key], strict=False)
         }
-        for name, value in (plain | several).items():
+        for name, value in (plain | own).items():
             if not math.isnan(value):
                 table.setdefault(name, {})[int(metrics["episode"])] = float(value)
     return table

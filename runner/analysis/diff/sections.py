@@ -54,13 +54,16 @@ def in_short(difference: RunDiff) -> str:
     if difference.same_content:
         return "The content is the same, to the last byte."
     settings = [change for change in difference.config if change.path.split(".")[0] not in NOT_CONTENT]
-    said = ["The content differs."]
+    unfinished = [
+        name for name, who in (("A", difference.a), ("B", difference.b)) if who["status"] != "finished"
+    ]
+    said = [f"{' and '.join(unfinished)} did not finish." if unfinished else "The content differs."]
     if settings:
         told = "; ".join(f"{c.path} ({_text(c.a)} in A, {_text(c.b)} in B)" for c in settings[:MOST_NAMED])
         more = f"; and {len(settings) - MOST_NAMED} more" if len(settings) > MOST_NAMED else ""
         said.append(f"Of the settings, {told}{more} {'differ' if len(settings) > 1 else 'differs'}.")
     else:
-        said.append("The settings are the same.")
+        said.append("No setting that determines the content differs.")
     parting = difference.parting
     if parting is not None and parting.step:
         said.append(f"Training is the same for {parting.step:,} steps.")

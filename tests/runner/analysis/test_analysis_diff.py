@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from runner import runs
@@ -24,6 +24,7 @@ from runner.execution import run_job
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording import schema
+from tests.runner.altering import altered
 
 BASE = {
     "name": "base",
@@ -118,6 +119,7 @@ def test_another_reward_is_an_other_environment(compare):
 def test_other_modes_are_compared_as_far_as_they_can_be(compare):
     difference = compare("mode=cooperative", "quirks.second_table_uses_first_action=false")
     assert any("other modes" in note for note in difference.notes)
+    assert not any("return" in metric.name for metric in difference.metrics)
     assert difference.parting is not None
     assert difference.tables == []
     assert difference.metrics
@@ -169,6 +171,44 @@ def test_an_altered_step_is_the_first_difference(record, data):
     assert left[field][0].tolist() != right[field][0].tolist()
 
 
+@pytest.fixture(scope="module")
+def small(folder):
+    """A recording of some thousand steps, to be copied with a step altered."""
+    config = from_mapping(
+        {"episodes": 30, "mode": "competitive", "env": {"kwargs": {"max_episode_steps": 60}}}
+        | {"evaluation": {"every": 15, "trials": 5}, "snapshots": {"every": 10}}
+    )
+    return run_job(Job(config, 0), runs.create_run(folder, config, 0)).recording
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_the_diff_of_an_altered_copy_names_the_step_and_what_was_altered(small, tmp_path, data):
+    with open_recording(small) as recording:
+        at = data.draw(st.integers(0, recording.count(schema.TRAIN_STEP) - 1))
+        bounds = {"state": recording.mdp.states, "next_state": recording.mdp.states, "action": 36}
+    field = data.draw(st.sampled_from(["state", "action", "next_state", "rewards", "terminated", "explored"]))
+
+    def alter(steps):
+        value = steps[field][at]
+        steps[field][at] = (value + 1) % bounds[field] if field in bounds else not value.any()
+        return steps
+
+    copy = altered(small, tmp_path / "copy.mcap", schema.TRAIN_STEP, alter, result=without_digest)
+    with open_recording(small) as a, open_recording(copy) as b:
+        difference = diff(a, b)
+    assert (difference.parting.step, difference.parting.field) == (at, field)
+    assert f"training step {at:,}" in "\n".join(markdown(sections(difference)))
+    assert difference.cause is not None
+    assert difference.overlap.equal_steps >= difference.overlap.compared_steps - 1
+    copy.unlink()
+
+
+def without_digest(entries):
+    """Return a result as of a run whose digest nobody knows, or else the two would be equal by it."""
+    return {"json": json.dumps(json.loads(entries["json"]) | {"content_digest": "altered"})}
+
+
 def test_equal_streams_have_no_difference_however_they_are_cut(record):
     with open_recording(record()) as recording:
         blocks = list(recording.blocks(schema.TRAIN_STEP))
@@ -198,5 +238,8 @@ def test_the_command_says_what_differs_and_ends_with_1(record, folder):
     assert json.loads(as_json.stdout)["cause"]["kind"] == "greedy_action"
     same = run(cli, ["diff", ids[0], ids[2], "--recordings", str(folder)])
     assert same.exit_code == 0, same.output
+    unknown = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--target", "finish=80"])
+    assert unknown.exit_code == 2
+    assert "Did you mean" in unknown.stderr
     wrong = run(cli, ["diff", ids[0], "nothing", "--recordings", str(folder)])
     assert wrong.exit_code == 2
