@@ -6,6 +6,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import gymnasium
 
 Ranges = tuple[tuple[int, int | None], ...]
+_AT_ONCE: Final = 500
 OURS: Final = ("data/main_data.hdf5", "data/metadata.json")
 
 
@@ -95,7 +97,9 @@ def write_dataset(
             report(counts[0])
             yield _buffer(steps, counts[0] - 1)
 
-    storage.update_episodes(buffers())
+    made = buffers()
+    for first in made:  # so many at a time: what HDF5 keeps of a file goes when it is closed
+        storage.update_episodes(chain([first], islice(made, _AT_ONCE - 1)))
     if phase == "train" and recording.count(schema.TRAIN_STEP) > _ended_steps(recording) and not ranges:
         notes.append("The last training episode never ended; it is left out.")
     return Written(counts[0], counts[1], tuple(notes))
