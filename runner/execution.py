@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +22,7 @@ from runner.learning.learner import Learner
 from runner.mdp import description_bytes, load_mdp
 from runner.observer import Observer
 from runner.origin import configured_tables, settle
+from runner.planning import Yardstick
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.arrays import pack_array
@@ -239,6 +241,8 @@ class Session:
         self._measure("eval", schema.EVAL_METRICS_TOPIC, metrics)
         self._evaluated += 1
         self._progress.evaluations.append(metrics)
+        if plan.exact:
+            self._measure_exactly(metrics)
         self._log(f"evaluation after {episode} episodes: {metrics['finish_percent']:.1f} % finished")
         self._tell(now=True)
         return True
@@ -253,6 +257,17 @@ class Session:
         self.recorder.message(topic, encode(topic.message, metrics))
         if self._observer is not None:
             self._observer.metrics(phase, sum(self.recorder.steps.values()), metrics)
+
+    def _measure_exactly(self, metrics: dict[str, Any]) -> None:
+        """Record what the evaluated policy gets from every start state, beside what is possible."""
+        exact = self._yardstick.measure(self._learner.policy, metrics["discount"])
+        position = {name: metrics[name] for name in ("step", "episode", "evaluation")}
+        topic = schema.OPTIMALITY_TOPIC
+        self.recorder.message(topic, encode(topic.message, position | exact))
+
+    @cached_property
+    def _yardstick(self) -> Yardstick:
+        return Yardstick(self._learner.mdp, len(self._learner.agents))
 
     def _snapshot_is_due(self, episode: int) -> bool:
         every = self._config.snapshots.every

@@ -162,6 +162,12 @@ class Evaluation(Section):
         description="The states that trials start in: random, as training episodes do; each of the "
         "environment's start states in turn; or the state of this number.",
     )
+    exact: bool = Field(
+        default=False,
+        description="Whether the greedy policy is measured exactly besides, over all start states and "
+        "against the optimum, from the environment's transition table. Needs a discount below 1 for "
+        "discounted values; with 1 these are not a number.",
+    )
 
 
 class Log(Section):
@@ -304,6 +310,9 @@ class ExperimentConfig(_Settings):
         if (self.tables, self.rewards) == ("joint", "individual"):
             message = "found 'individual', expected 'team': one joint table cannot learn from two rewards"
             raise refusal(("rewards",), message)
+        if self.algorithm == "random" and self.evaluation is not None and self.evaluation.exact:
+            message = "found true, but the algorithm is random: only a greedy policy is measured exactly"
+            raise refusal(("evaluation", "exact"), message)
         if self.quirks.second_table_uses_first_action and self.tables == "joint":
             message = "needs tables: per_agent (or mode: competitive), found tables: joint"
             raise refusal(("quirks", "second_table_uses_first_action"), message)

@@ -89,6 +89,11 @@ class Learner:
             return
         self._policy[:] = (self.tables.greedy.T * np.array(self.model.stride)).sum(axis=1)
 
+    @property
+    def policy(self) -> NDArray[np.int32]:
+        """The joint action of each state, [S], in the evaluation that was begun; -1 for a random one."""
+        return self._policy
+
     def evaluate(
         self, steps: NDArray[np.void], episodes: NDArray[np.void], until_episode: int
     ) -> tuple[int, int]:

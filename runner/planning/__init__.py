@@ -7,5 +7,14 @@ best_response(mdp, policy, learner, learners, 0.9)      the most that one agent 
 
 from runner.planning.evaluation import Cycle, Outcome, evaluate_policy
 from runner.planning.optimum import best_response, greedy_policy, optimal_values
+from runner.planning.yardstick import Yardstick
 
-__all__ = ["Cycle", "Outcome", "best_response", "evaluate_policy", "greedy_policy", "optimal_values"]
+__all__ = [
+    "Cycle",
+    "Outcome",
+    "Yardstick",
+    "best_response",
+    "evaluate_policy",
+    "greedy_policy",
+    "optimal_values",
+]

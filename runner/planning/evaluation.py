@@ -13,7 +13,7 @@ from runner.errors import EnvironmentNotUsable
 from runner.mdp import Mdp
 from runner.planning import kernel
 from runner.planning.kernel import Chain, Paths
-from runner.planning.optimum import TOLERANCE
+from runner.planning.optimum import sweep_tolerance
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Outcome:
     mean_returns: tuple[float, ...]
     """Undiscounted, until the step limit; one a learner."""
     values: tuple[float, ...]
-    """Discounted, without a step limit; one a learner."""
+    """Discounted, without a step limit; one a learner; nan where nothing is discounted."""
     cycles: tuple[Cycle, ...]
     """Where time-outs are stuck, the most frequent first; empty if the environment is not deterministic."""
 
@@ -56,17 +56,15 @@ def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount
         mdp: the environment.
         policy: [S]: the joint action of each state.
         learners: 1, or the number of agents; each has its own return.
-        discount: of the values; below 1.
+        discount: of the values; 1 for none.
 
     Raises:
-        EnvironmentNotUsable: it has no step limit, or the discount is not below 1.
+        EnvironmentNotUsable: it has no step limit.
     """
     if not mdp.step_limit:
         raise EnvironmentNotUsable(
             f"{mdp.env_id}: found no step limit, expected one: without it some episodes never end."
         )
-    if not 0 <= discount < 1:
-        raise EnvironmentNotUsable(f"found discount {discount}, expected one from 0 up to below 1.")
     rows = np.arange(mdp.states)
     chosen = _Chosen(
         mdp.next_state[rows, policy],
@@ -114,8 +112,9 @@ def _deterministic(
     )
     paths = kernel.find_paths(chain)
     lengths, returns, counts = kernel.play_all(chain, paths, starts, limit)
-    values = np.zeros_like(chain.rewards)
-    kernel.discounted_paths(chain, paths, _nearest_first(paths), discount, values)
+    values = np.full_like(chain.rewards, np.nan)
+    if discount < 1:
+        kernel.discounted_paths(chain, paths, _nearest_first(paths), discount, values)
     timed_out = (paths.cycle[starts] >= 0) | (paths.length[starts] > limit)
     return Outcome(
         starts=len(starts),
@@ -150,6 +149,11 @@ def _cycles(paths: Paths, starts: NDArray[np.int64], weights: NDArray[np.float64
     return tuple(sorted(cycles, key=lambda cycle: (-cycle.percent, cycle.states)))
 
 
+def start_mean(mdp: Mdp, values: NDArray[np.float64]) -> float:
+    """Return the mean of values [S] over the states that an episode starts in."""
+    return _mean(values, mdp.start)
+
+
 def _mean(values: NDArray[Any], weights: NDArray[np.float64]) -> float:
     """Return the weighted mean, correctly rounded sums: 100 % is 100."""
     return math.fsum((values * weights).tolist()) / math.fsum(weights.tolist())
@@ -172,11 +176,12 @@ def _stochastic(
     expected = (p[..., None] * chosen.rewards).sum(axis=1)
     gains = np.column_stack([np.ones(len(p)), (p * chosen.penalty).sum(axis=1), expected])
     chances, sums = kernel.expect(chosen.next_state, p, chosen.terminated, chosen.success, gains, limit)
-    values = np.zeros_like(expected)
-    weight = discount * p * ~chosen.terminated
-    kernel.discounted(
-        chosen.next_state, weight, expected, values, TOLERANCE * (1 - discount) / max(discount, 0.5)
-    )
+    values = np.full_like(expected, np.nan)
+    if discount < 1:
+        values[:] = 0.0
+        weight = discount * p * ~chosen.terminated
+        tolerance = sweep_tolerance(discount)
+        kernel.discounted(chosen.next_state, weight, expected, values, tolerance)
     finished, ended = _means(chances[starts], weights)
     length, penalties, *returns = _means(sums[starts], weights)
     return Outcome(

@@ -65,6 +65,11 @@ def best_response(
     return _iterated(mdp.next_state[rows, joint], weight, reward[rows, joint], discount)
 
 
+def sweep_tolerance(discount: float) -> float:
+    """Return by how much the last sweep may change a value so that all are within the tolerance."""
+    return TOLERANCE * (1 - discount) / max(discount, 0.5)
+
+
 def _weight(mdp: Mdp, discount: float) -> NDArray[np.float64]:
     """Return the discounted probability [S, J, K] that an outcome comes and the episode goes on."""
     if not 0 <= discount < 1:
@@ -79,8 +84,11 @@ def _iterated(
     next_state: NDArray[np.int32], weight: NDArray[np.float64], reward: NDArray[np.float64], discount: float
 ) -> NDArray[np.float64]:
     values = np.zeros(len(next_state))
-    tolerance = TOLERANCE * (1 - discount) / max(discount, 0.5)
     kernel.iterate_values(
-        np.ascontiguousarray(next_state), np.ascontiguousarray(weight), reward, values, tolerance
+        np.ascontiguousarray(next_state),
+        np.ascontiguousarray(weight),
+        np.ascontiguousarray(reward),
+        values,
+        sweep_tolerance(discount),
     )
     return values

@@ -440,7 +440,15 @@ class Recording:
         """
         if phase not in schema.PHASES:
             raise ValueError(f"found phase {phase!r}, expected one of: {', '.join(schema.PHASES)}.")
-        topic = schema.TRAIN_METRICS_TOPIC if phase == "train" else schema.EVAL_METRICS_TOPIC
+        yield from self._decoded(
+            schema.TRAIN_METRICS_TOPIC if phase == "train" else schema.EVAL_METRICS_TOPIC
+        )
+
+    def optimality(self) -> Iterator[dict[str, Any]]:
+        """Yield the exact measures of the evaluations, in order; none unless `evaluation.exact` was set."""
+        yield from self._decoded(schema.OPTIMALITY_TOPIC)
+
+    def _decoded(self, topic: schema.Topic) -> Iterator[dict[str, Any]]:
         for time, payload in self.messages(topic):
             where = f"{self.path}: {topic.name} at {time} ns"
             if len(payload) > _METRICS_BYTES:

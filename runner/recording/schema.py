@@ -122,6 +122,29 @@ EVAL_METRICS = MessageType(
         Field(19, "events", _SFIXED64, repeated=True),
     ),
 )
+OPTIMALITY = MessageType(
+    "Optimality",
+    (
+        Field(1, "step", _SFIXED64),
+        Field(2, "episode", _SFIXED64),
+        Field(3, "evaluation", _SFIXED64),
+        Field(4, "starts", _SFIXED64),
+        Field(5, "finish_percent", _DOUBLE),
+        Field(6, "timeout_percent", _DOUBLE),
+        Field(7, "mean_length", _DOUBLE),
+        Field(8, "mean_penalties", _DOUBLE),
+        Field(9, "mean_returns", _DOUBLE, repeated=True),
+        Field(10, "values", _DOUBLE, repeated=True),
+        Field(11, "best_responses", _DOUBLE, repeated=True),
+        Field(12, "optimal_value", _DOUBLE),
+        Field(13, "optimal_finish_percent", _DOUBLE),
+        Field(14, "optimal_mean_length", _DOUBLE),
+        Field(15, "cycle_states", _SFIXED64, repeated=True),
+        Field(16, "cycle_lengths", _SFIXED64, repeated=True),
+        Field(17, "cycle_percents", _DOUBLE, repeated=True),
+    ),
+)
+"""Exact measures of the greedy policy over all start states; cycles by their lowest state."""
 Q_TABLE = MessageType(
     "QTable",
     (
@@ -229,6 +252,7 @@ TRAIN_METRICS_TOPIC = Topic("/train/metrics", 5, TRAIN_METRICS, "train")
 EVAL_METRICS_TOPIC = Topic("/eval/metrics", 6, EVAL_METRICS, "eval")
 Q_TABLE_TOPIC = Topic("/q_table", 7, Q_TABLE)
 LOG_TOPIC = Topic("/log", 8, LOG, digested=False)
+OPTIMALITY_TOPIC = Topic("/eval/optimality", 23, OPTIMALITY, "eval")
 TOPICS: Final = (
     TRAIN_STEP,
     EVAL_STEP,
@@ -238,6 +262,7 @@ TOPICS: Final = (
     EVAL_METRICS_TOPIC,
     Q_TABLE_TOPIC,
     LOG_TOPIC,
+    OPTIMALITY_TOPIC,
 )
 """The topics of a run that the runner itself learned."""
 
@@ -279,7 +304,7 @@ KINDS: Final = {
 ALL_TOPICS: Final = tuple(
     sorted({topic for topics in KINDS.values() for topic in topics}, key=lambda topic: topic.channel)
 )
-MESSAGES: Final = tuple(dict.fromkeys(topic.message for topic in (*TOPICS, *ALL_TOPICS)))
+MESSAGES: Final = tuple(dict.fromkeys(topic.message for topic in ALL_TOPICS))
 """Every message; the id of a schema is its place here, from 1."""
 
 BLOCK_TOPICS: Final = (TRAIN_STEP, EVAL_STEP, TRAIN_EPISODE, EVAL_EPISODE)

@@ -15,6 +15,7 @@ from runner.config import ConfigError
 from runner.errors import EnvironmentNotUsable, RunnerError, RunNotFound
 from runner.execution import run_job
 from runner.job import Job, jobs_of
+from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
@@ -130,7 +131,7 @@ def test_run_json_says_what_was_done(tmp_path):
     summary = said["summary"]
     with open_recording(run.recording) as recording:
         for topic in schema.TOPICS:
-            assert summary["messages"][topic.name] == recording.count(topic)
+            assert summary["messages"].get(topic.name, 0) == recording.count(topic)
         last = recording.metrics("eval")[-1]
         assert summary["train_steps"] == recording.count(schema.TRAIN_STEP) == last["step"]
         assert summary["eval_steps"] == recording.count(schema.EVAL_STEP)
@@ -355,3 +356,25 @@ def test_every_seed_begins_with_the_same_table(tmp_path):
     config = experiment(LAKE, initial_q={"run": "lake@latest"}, seeds=[1, 2])
     runs = list(runner.run_all(config, recordings=tmp_path))
     assert [run.facts["config"]["initial_q"]["run"] for run in runs] == [first.run_id] * 2
+
+
+@pytest.mark.parametrize("mode", ["cooperative", "competitive"])
+def test_exact_measures_are_those_of_a_trial_from_every_start(tmp_path, mode):
+    small = {"map": [*TAXIS["env"]["kwargs"]["map"]], "max_episode_steps": 40}
+    config = experiment(TAXIS, mode=mode, env={"kwargs": small}, episodes=200, epsilon=0.5)
+    starts = int((load_mdp(config.env.id, config.env.kwargs, config.rewards).start > 0).sum())
+    plan = {"every": 100, "trials": starts, "start": "each", "exact": True}
+    run = make_run(tmp_path, config.to_mapping(), evaluation=plan)
+    with open_recording(run.recording) as recording:
+        sampled, exact = recording.metrics("eval"), list(recording.optimality())
+    assert [each["episode"] for each in exact] == [0, 100, 200]
+    for trials, measures in zip(sampled, exact, strict=True):
+        assert measures["starts"] == starts
+        assert measures["finish_percent"] == pytest.approx(trials["finish_percent"])
+        assert measures["timeout_percent"] == pytest.approx(100 * (1 - trials["terminations"] / starts))
+        assert measures["mean_length"] == pytest.approx(trials["eval_mean_length"])
+        assert measures["mean_penalties"] == pytest.approx(trials["mean_penalties"])
+        assert measures["mean_returns"] == pytest.approx(list(trials["mean_returns"]))
+        assert sum(measures["values"]) <= measures["optimal_value"] + 1e-9
+        for own, best in zip(measures["values"], measures["best_responses"], strict=True):
+            assert best >= own - 1e-9

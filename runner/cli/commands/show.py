@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from runner.recording.reader import Recording
     from runner.runs import Run
 
+MOST_CYCLES: Final = 8
+"""So many of the cycles that time-outs are stuck in are told."""
+
 
 @click.command("show")
 @run_argument
@@ -27,7 +30,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
 
     With --json also the whole series: under `eval` an object for each evaluation, with the training
     episodes before it, finish_percent, mean_length, mean_penalties and the count of every event; under
-    `train` one for each report of training.
+    `optimality` its exact measures, if the run takes them; under `train` one for each report of training.
 
     \b
     Examples:
@@ -76,6 +79,7 @@ def describe(run: Run, recording: Recording) -> dict[str, Any]:
         "success_events": environment_of(recording)["success_events"],
         "tables": _tables(recording),
         "eval": evaluation_records(recording),
+        "optimality": [_without_times(measures) for measures in recording.optimality()],
         "train": training_records(recording),
     }
 
@@ -100,7 +104,8 @@ def _identity(run: Run) -> dict[str, Any]:
 def _without_recording(run: Run) -> dict[str, Any]:
     """Return what `run.json` alone tells: the run never came to record anything, or its file is gone."""
     unknown = dict.fromkeys(("content_digest", "train_steps", "eval_steps", "episodes", "seconds"))
-    nothing: dict[str, Any] = {"bytes": 0, "provenance": {}, "tables": [], "eval": [], "train": []}
+    nothing: dict[str, Any] = {"bytes": 0, "provenance": {}}
+    nothing |= {part: [] for part in ("tables", "eval", "optimality", "train")}
     told = {key: run.summary.get(key) for key in unknown}
     return {**_identity(run), **told, **nothing, "config": run.facts.get("config", {})}
 
@@ -126,6 +131,8 @@ def _draw(run: Run, told: dict[str, Any]) -> None:
     parts: list[RenderableType] = [facts(_head(run, told))]
     if told["eval"]:
         parts += [title("Evaluations"), evaluation_table(told["eval"], told["success_events"], console())]
+    if told["optimality"]:
+        parts += [title("Greedy policy, exactly"), facts(_exactly(run, told["optimality"][-1]))]
     if told["tables"]:
         fill = {table["agent"]: _fill_in_words(table) for table in told["tables"]}
         parts += [title("Tables"), facts(fill)]
@@ -153,6 +160,40 @@ def _head(run: Run, told: dict[str, Any]) -> dict[str, str]:
         "digest": told["content_digest"] or f"{UNKNOWN} (told when a run ends properly)",
         "file": f"{run.recording}  {size(told['bytes'])}" if told["bytes"] else "no recording",
     }
+
+
+def _without_times(measures: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in measures.items() if key != "log_time"}
+
+
+def _exactly(run: Run, measures: dict[str, Any]) -> dict[str, str]:
+    """Return what the last exact measures say, beside what is possible."""
+    from runner.frames import agents_of
+    from runner.recording.reader import open_recording
+    from runner.words import states_in_words
+
+    with open_recording(run.recording) as recording:
+        words, agents = states_in_words(recording.mdp), agents_of(recording)
+    gain = " and ".join(
+        f"{best - own:.3f} ({agent})"
+        for agent, own, best in zip(agents, measures["values"], measures["best_responses"], strict=True)
+    )
+    told = {
+        "finishes": f"{measures['finish_percent']:.1f} % of {measures['starts']:,} start states "
+        f"(the optimum {measures['optimal_finish_percent']:.1f} %)",
+        "length": f"{measures['mean_length']:.2f} steps (the optimum {measures['optimal_mean_length']:.2f})",
+        "value": f"{sum(measures['values']):.3f} of {measures['optimal_value']:.3f} that are possible",
+        "to gain": f"{gain}, by a best response",
+    }
+    cycles = list(zip(*(measures[f"cycle_{key}"] for key in ("states", "lengths", "percents")), strict=True))
+    if cycles:
+        lines = [
+            f"{percent:.1f} %  {f'round {length} states' if length > 1 else 'one state'}: {words[state]}"
+            for state, length, percent in cycles[:MOST_CYCLES]
+        ]
+        more = len(cycles) - MOST_CYCLES
+        told["stuck in"] = "\n".join([*lines, *([f"and {more:,} more cycles (--json)"] if more > 0 else [])])
+    return told
 
 
 def _fill_in_words(table: dict[str, Any]) -> str:
