@@ -28,6 +28,7 @@ from runner.learning.learner import Learner
 from runner.mdp import Mdp, load_mdp
 from runner.provenance import provenance
 from runner.recording import schema
+from runner.recording.digest import ContentHash
 from runner.recording.integrity import check_integrity
 from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
@@ -139,6 +140,8 @@ def _lost(recording: Recording) -> Verification | None:
 
 
 def _compare(recording: Recording, rerun: bool, report: Report) -> Verification:
+    if recording.kind != "job":
+        return compare_loop(recording)
     config = from_mapping(recording.config)
     job = Job(config, int(recording.run["seed"]))
     if recording.run["job"] != job.identity:
@@ -171,6 +174,69 @@ def _compare(recording: Recording, rerun: bool, report: Report) -> Verification:
 def _tells_its_digest(recording: Recording) -> bool:
     """Return whether an interrupted run said what it came to, and holds every step that this counts."""
     return bool(recording.result.get("content_digest") and recording.result.get("steps_recorded"))
+
+
+def compare_loop(recording: Recording) -> Verification:
+    """Verify a recording of somebody's own loop, which cannot be done again here.
+
+    Compared are the numbers of its messages, its steps with the environment's outcomes where it is
+    tabular, and its digest with its messages.
+    """
+    finished = "content_digest" in recording.result
+    notes = ["recorded from a loop, which alone can do it again: its steps were not recomputed"]
+    if not finished:
+        notes.append("the run did not end; verified as far as it got")
+    found = Verification(
+        recording.path,
+        train_steps=recording.count(schema.TRAIN_STEP),
+        eval_steps=recording.count(schema.EVAL_STEP),
+        notes=tuple(notes),
+    )
+    digest, odd = ContentHash(), 0
+    for topic in recording.topics:
+        wrong, others = _check_topic(recording, topic, digest)
+        odd += others
+        if wrong:
+            return replace(found, finding=f"{recording.path}: {wrong}")
+    if odd:
+        odd_note = f"{odd:,} steps are no outcome of the environment's table: it has rules beside it"
+        found = replace(found, notes=(*found.notes, odd_note))
+    if not finished:
+        return found
+    return _compare_result(found, recording, {"content_digest": digest.content()})
+
+
+def _check_topic(recording: Recording, topic: schema.Topic, digest: ContentHash) -> tuple[str, int]:
+    """Return what is wrong with a topic's messages, and how many steps the environment's table has not.
+
+    The messages are taken into the digest.
+    """
+    if topic not in recording.dtypes:
+        for time, payload in recording.messages(topic):
+            digest.update(topic, schema.message_record(topic, time, payload))
+        return "", 0
+    number, expected, odd = schema.NUMBERED_BY[topic.message], 0, 0
+    for block in recording.blocks(topic):
+        digest.update(topic, np.ascontiguousarray(block).view(np.uint8).data)
+        if (wrong := np.flatnonzero(block[number] != expected + np.arange(len(block)))).size:
+            found = block[number][wrong[0]]
+            return f"{topic.name}: found {number} {found}, expected {expected + wrong[0]}", odd
+        if topic.message is schema.STEP:
+            odd += _impossible(recording, block)
+        expected += len(block)
+    return "", odd
+
+
+def _impossible(recording: Recording, steps: NDArray[np.void]) -> int:
+    """Return how many steps are not among the outcomes of a tabular environment, if it is one."""
+    if not recording.environment["arrays"]:
+        return 0
+    mdp = recording.mdp
+    state, action = steps["state"], steps["action"]
+    known = (state < mdp.states) & (action < mdp.joint_actions)
+    at = np.where(known, state, 0), np.where(known, action, 0)
+    likely = (mdp.next_state[at] == steps["next_state"][:, np.newaxis]) & (mdp.probability[at] > 0)
+    return int(np.count_nonzero(~(known & likely.any(axis=1))))
 
 
 def _compare_result(found: Verification, recording: Recording, summary: dict[str, Any]) -> Verification:
@@ -256,7 +322,7 @@ def _with_place(path: Path, damage: str) -> str:
 
 def _first_unreadable(recording: Recording) -> str:
     """Return in words which message is the first that cannot be read; empty if all can."""
-    for topic in schema.BLOCK_TOPICS:
+    for topic in recording.dtypes:
         name = schema.NUMBERED_BY[topic.message]
         number = 0
         try:

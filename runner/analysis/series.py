@@ -11,8 +11,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from runner.frames import evaluation_records, training_records
+from runner.errors import RecordingError
+from runner.frames import agents_of, evaluation_records, event_names_of, training_records
+from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.words import event_in_words, spoken
 
@@ -58,6 +61,10 @@ class Group:
 MOST_NAMED: Final = 6
 SHARES: Final = "training.reward"
 """The metric whose lines are shares of a whole."""
+LOGGED: Final = "training.logged."
+"""What somebody's own loop logged under a name of its own."""
+_POINTS: Final = 200
+_MOST_NAMES: Final = 64
 
 TITLES: Final = {
     "finish_percent": ("Evaluation trials that succeed", "percent of trials"),
@@ -65,6 +72,7 @@ TITLES: Final = {
     "mean_penalties": ("Penalties in evaluation trials", "a trial, mean"),
     "mean_return": ("Return of evaluation trials", "summed reward, mean"),
     "training.mean_length": ("Length of training episodes", "steps, running mean"),
+    "training.mean_return": ("Return of training episodes", "summed reward, mean"),
     "training.mean_reward": ("Reward in training", "a step, running mean"),
     "training.percent_filled": ("Q-table filled", "percent of its cells"),
     "training.zero_cells": ("Q-table cells still zero", "cells"),
@@ -76,6 +84,8 @@ TITLES: Final = {
 
 def read_series(recording: Recording) -> RunSeries:
     """Return the metrics of a recording, also of one that was cut off."""
+    if recording.kind != "job":
+        return loop_series(recording)
     evaluations = evaluation_records(recording)
     training = [(record["episode"], _training(record)) for record in training_records(recording)]
     training += [(record["episode"], _training(record["training"])) for record in evaluations]
@@ -87,6 +97,29 @@ def read_series(recording: Recording) -> RunSeries:
         config=recording.config,
         evaluation=[(record["episode"], _evaluation(record)) for record in evaluations],
         training=sorted(training, key=lambda entry: entry[0]),
+    )
+
+
+def loop_series(recording: Recording) -> RunSeries:
+    """Return returns and lengths of the episodes of somebody's own loop, and what it logged, over episodes.
+
+    Of many training episodes it is the means of at most 200 stretches, of 1, 2, 5, 10, ... episodes, so that
+    those of several runs agree; the evaluation's are by the training episodes that were done before.
+    """
+    total = recording.count(schema.TRAIN_EPISODE)
+    edges = np.arange(0, max(total, 1) + (width := _stretch(total)), width)
+    training = _binned_episodes(recording, edges)
+    for name, values in _binned_scalars(recording, edges).items():
+        for k in np.flatnonzero(~np.isnan(values)).tolist():
+            training.setdefault(int(edges[k + 1]), {})[f"{LOGGED}{name}"] = {"": float(values[k])}
+    return RunSeries(
+        run_id=recording.run["run_id"],
+        name=recording.run["name"],
+        seed=int(recording.run["seed"]),
+        finished=recording.result.get("status") == "finished",
+        config=recording.config,
+        evaluation=_loop_evaluations(recording),
+        training=sorted(training.items()),
     )
 
 
@@ -102,10 +135,17 @@ def groups_of(series: Sequence[RunSeries]) -> list[Group]:
     return [Group(label, tuple(runs)) for label, runs in zip(labels, found.values(), strict=True)]
 
 
+def is_loop(run: RunSeries) -> bool:
+    """Return whether a run is somebody's own loop, whose training is told at even numbers of episodes."""
+    return "made_by" in run.config
+
+
 def title_of(metric: str) -> tuple[str, str]:
     """Return a metric's title and its unit."""
     if metric.startswith("event."):
         return f"Event: {event_in_words(metric.removeprefix('event.'))}", "times a trial, mean"
+    if metric.startswith(LOGGED):
+        return f"Logged: {metric.removeprefix(LOGGED)}", "as logged, mean"
     return TITLES[metric]
 
 
@@ -120,7 +160,7 @@ def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[int
             every run of a configuration; all of them if the run has no evaluation.
     """
     source = run.training if metric.startswith("training.") else run.evaluation
-    at_evaluations = {episode for episode, _ in run.evaluation}
+    at_evaluations = set() if is_loop(run) else {episode for episode, _ in run.evaluation}
     missing = 0.0 if metric == SHARES else np.nan
     points = {
         episode: readings[metric].get(line, missing)
@@ -162,6 +202,84 @@ def _training(side: Mapping[str, Any]) -> Readings:
         "training.zero_cells": dict(side["zero_cells"]),
         "training.schedule": {spoken(key): side[key] for key in ("epsilon", "step_size", "discount")},
     }
+
+
+def _stretch(episodes: int) -> int:
+    """Return how many episodes are told as one."""
+    widths: Iterator[int] = (factor * int(10**power) for power in range(18) for factor in (1, 2, 5))
+    return next(width for width in widths if episodes <= width * _POINTS)
+
+
+def _binned_episodes(recording: Recording, edges: NDArray[np.int64]) -> dict[int, Readings]:
+    """Return mean length and return of the training episodes between the edges."""
+    agents, bins = agents_of(recording), len(edges) - 1
+    count, length = np.zeros(bins), np.zeros(bins)
+    returns = np.zeros((bins, len(agents)))
+    for block in recording.blocks(schema.TRAIN_EPISODE):
+        at = np.searchsorted(edges, block["episode"], side="right") - 1
+        count += np.bincount(at, minlength=bins)
+        length += np.bincount(at, block["length"], minlength=bins)
+        for i in range(len(agents)):
+            returns[:, i] += np.bincount(at, block["returns"][:, i], minlength=bins)
+    found: dict[int, Readings] = {}
+    for k in np.flatnonzero(count).tolist():
+        mean = (returns[k] / count[k]).tolist()
+        found[int(edges[k + 1])] = {
+            "training.mean_length": {"": float(length[k] / count[k])},
+            "training.mean_return": _by_agent(agents, mean),
+        }
+    return found
+
+
+def _by_agent(agents: Sequence[str], values: Sequence[float]) -> dict[str, float]:
+    return {agent if len(agents) > 1 else "": value for agent, value in zip(agents, values, strict=True)}
+
+
+def _binned_scalars(recording: Recording, edges: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+    """Return the means of what was logged under each name between the edges; NaN where there was nothing."""
+    bins = len(edges) - 1
+    sums: dict[str, NDArray[np.float64]] = {}
+    counts: dict[str, NDArray[np.float64]] = {}
+    for scalar in recording.decoded(schema.SCALAR_TOPIC):
+        name = scalar["name"] if scalar["phase"] == "train" else f"{scalar['name']} ({scalar['phase']})"
+        if name not in sums:
+            if len(sums) == _MOST_NAMES:
+                raise RecordingError(f"{recording.path}: has scalars of more than {_MOST_NAMES} names.")
+            sums[name], counts[name] = np.zeros(bins), np.zeros(bins)
+        k = min(max(int(np.searchsorted(edges, scalar["episode"], side="right")) - 1, 0), bins - 1)
+        sums[name][k] += scalar["value"]
+        counts[name][k] += 1
+    with np.errstate(invalid="ignore"):
+        return {name: sums[name] / counts[name] for name in sums}
+
+
+def _loop_evaluations(recording: Recording) -> list[tuple[int, Readings]]:
+    """Return the means of the evaluation episodes, by the training episodes that were done before."""
+    ends = np.concatenate(
+        [np.empty(0, np.uint64), *(b["log_time"] for b in recording.blocks(schema.TRAIN_EPISODE))]
+    )
+    agents, events = agents_of(recording), event_names_of(recording)
+    known = bool(recording.environment["success_events"])
+    found: dict[int, list[NDArray[np.void]]] = {}
+    for block in recording.blocks(schema.EVAL_EPISODE):
+        after = np.searchsorted(ends, block["log_time"])
+        for episodes in np.unique(after).tolist():
+            found.setdefault(episodes, []).append(block[after == episodes])
+    evaluations = []
+    for episodes, parts in found.items():
+        trials = np.concatenate(parts)
+        means = trials["returns"].mean(axis=0).tolist()
+        readings: Readings = {
+            "mean_length": {"": float(trials["length"].mean())},
+            "mean_return": _by_agent(agents, means),
+        }
+        if known:
+            readings["finish_percent"] = {"": 100 * float(trials["success"].mean())}
+        for i, name in enumerate(events):
+            agent, _, kind = name.rpartition(".")
+            readings.setdefault(f"event.{kind}", {})[agent] = float(trials["events"][:, i].mean())
+        evaluations.append((episodes, readings))
+    return sorted(evaluations, key=lambda one: one[0])
 
 
 def label_of(own: int, names: Sequence[str], flat: Sequence[Mapping[str, Any]]) -> str:

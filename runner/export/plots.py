@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.series import SHARES, TITLES, Group, points_of, title_of
+from runner.analysis.series import LOGGED, SHARES, TITLES, Group, points_of, title_of
 from runner.errors import RunnerError
 
 
@@ -120,4 +120,6 @@ def _rank(metric: str) -> tuple[int, int]:
     order = list(TITLES)
     if metric.startswith("event."):
         return 1, 0
+    if metric.startswith(LOGGED):
+        return 3, 0
     return (2 if metric.startswith("training.") else 0), order.index(metric)

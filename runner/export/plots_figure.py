@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from runner.analysis.series import SHARES, Group
+from runner.analysis.series import SHARES, Group, is_loop
 from runner.errors import MissingExtra, RunnerError
 from runner.export.plots import Curve, Panel
 
@@ -164,11 +164,12 @@ def draw_panel(axes: Axes, panel: Panel, groups: int) -> None:
 
 def footnote(groups: Sequence[Group]) -> str:
     """Return what lines and bands mean."""
+    loops = any(is_loop(run) for group in groups for run in group.runs)
+    greedy = "" if loops else " Evaluation trials follow the greedy policy: no exploring."
     if max(len(group.runs) for group in groups) == 1:
-        return "Each line is one run, as reported. Evaluation trials follow the greedy policy: no exploring."
+        return f"Each line is one run, as reported.{greedy}"
     return (
-        "Lines: median over the runs of a configuration; bands: from the lowest run to the highest. "
-        "Evaluation trials follow the greedy policy: no exploring."
+        f"Lines: median over the runs of a configuration; bands: from the lowest run to the highest.{greedy}"
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -135,6 +135,8 @@ def _facts(recording: Recording) -> dict[str, str]:
         topic: recording.count(topic) for topic in (schema.TRAIN_EPISODE, schema.TRAIN_STEP, schema.EVAL_STEP)
     }
     config = recording.config
+    if recording.kind != "job":
+        return _loop_facts(recording, counts)
     told = {
         "Environment": config["env"]["id"],
         "Algorithm": spoken(config["algorithm"]),
@@ -149,9 +151,24 @@ def _facts(recording: Recording) -> dict[str, str]:
     return {key: str(value) for key, value in told.items()}
 
 
+def _loop_facts(recording: Recording, counts: Mapping[schema.Topic, int]) -> dict[str, str]:
+    """Return what identifies somebody's own loop and how much of it there is."""
+    spaces = {name: str(space["type"]) for name, space in recording.spaces.items()}
+    environments = f", {recording.environments} at once" if recording.environments > 1 else ""
+    return {
+        "Environment": f"{recording.config['env']['id']}{environments}",
+        "Recorded": f"from a loop, by {recording.config['made_by']}",
+        "Spaces": f"observation {spaces['observation']}, action {spaces['action']}",
+        "Training": f"{counts[schema.TRAIN_EPISODE]:,} episodes, {counts[schema.TRAIN_STEP]:,} steps",
+        "Evaluation": f"{counts[schema.EVAL_STEP]:,} steps",
+        "Begun": recording.run["created"],
+        "Content digest": recording.result.get("content_digest") or "none: it was interrupted",
+    }
+
+
 def _episodes(recording: Recording, chosen: Sequence[Choice]) -> list[Episode]:
     """Return the episodes that are shown: of the last evaluation, and the first and last of training."""
-    if not has_steps(recording):
+    if not has_steps(recording) or recording.kind != "job":
         return []
     found: dict[str, Episode] = {}
 
@@ -179,6 +196,8 @@ def _episodes(recording: Recording, chosen: Sequence[Choice]) -> list[Episode]:
 
 def _maps(recording: Recording, episodes: Sequence[Episode]) -> list[MapRow]:
     """Return the maps, for the situation in which the first episode shown begins."""
+    if recording.kind != "job":
+        return []
     mdp = recording.mdp
     start = int(episodes[0].states[0]) if episodes else int(mdp.start.argmax())
     try:

@@ -76,6 +76,14 @@ def shortcomings(recording: Recording) -> list[str]:
     """Return what a reader should know that is missing from a recording, a sentence each."""
     said = []
     run = recording.run["run_id"]
+    if recording.kind != "job":
+        if state_of(recording) != "finished":
+            said.append(f"Run {run} is {state_of(recording)}: shown is what its loop had done.")
+        said.append(
+            f"Run {run} was recorded from a loop: what it learned is not known, so no episode is shown with "
+            "it; `dualtaxi view` shows what was recorded."
+        )
+        return said
     if state_of(recording) != "finished":
         done, planned = recording.count(schema.TRAIN_EPISODE), recording.config["episodes"]
         said.append(

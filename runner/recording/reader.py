@@ -270,6 +270,7 @@ class Recording:
 
         For a topic of variable size it reads them.
         """
+        topic = self._own(topic)
         if topic in self.dtypes:
             ends = self._numbers(topic)[1]
             return int(ends[-1]) if len(ends) else 0
@@ -281,6 +282,11 @@ class Recording:
         Each block is a read-only structured array with the fields of the message, and those of the MCAP
         record (`log_time` in nanoseconds, ...).
         """
+        topic = self._own(topic)
+        if topic not in self.dtypes:
+            raise RecordingError(
+                f"{self.path}: the messages of {topic.name} vary in size; read them one by one."
+            )
         firsts, ends = self._numbers(topic)
         stop = int(ends[-1]) if stop is None and len(ends) else (stop or 0)
         chunks = range(
@@ -495,6 +501,10 @@ class Recording:
     def _entry(self, topic: Topic, k: int) -> ChunkEntry:
         """Return the entry of a topic's chunk number k."""
         return self._index.chunks[int(self._chunks_of[topic.channel][k])]
+
+    def _own(self, topic: Topic) -> Topic:
+        """Return this recording's topic of that name, if it has one: `/train/step` differs by its kind."""
+        return next((own for own in self.topics if own.name == topic.name), topic)
 
     def _numbers(self, topic: Topic) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return, for each chunk of a fixed-width topic, the number of its first message and behind its last.

@@ -25,7 +25,7 @@ from runner.recording.contents import (
 from runner.recording.digest import ContentHash, combine
 from runner.recording.integrity import check_integrity, places
 from runner.recording.reader import open_recording
-from runner.recording.schema import STEP, TOPICS
+from runner.recording.schema import ALL_TOPICS, KINDS, STEP, TOPICS
 from runner.recording.writer import RecordingFile
 
 Times = NDArray[np.uint64]
@@ -34,7 +34,7 @@ Change = Callable[[str, dict[str, str]], dict[str, str]]
 
 _HEAD: Final = struct.Struct("<BQ")
 _CHUNK_TIMES: Final = struct.Struct("<QQ")
-_TOPIC_OF: Final = {topic.channel: topic for topic in TOPICS}
+_TOPIC_OF: Final = {topic.channel: topic for topic in ALL_TOPICS}
 
 
 def rewrite(path: Path, fresh: Path, change: Change) -> None:
@@ -48,7 +48,9 @@ def rewrite(path: Path, fresh: Path, change: Change) -> None:
         OSError: the new file exists or cannot be written.
     """
     indexed, result = True, None
-    with RecordingFile(fresh) as file:
+    with open_recording(path) as recording:
+        topics = KINDS[recording.kind]
+    with RecordingFile(fresh, topics) as file:
         for opcode, offset, body in _whole_records(path):
             if opcode == Opcode.METADATA:
                 name, entries = metadata_of(body)

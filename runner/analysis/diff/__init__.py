@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from runner.analysis.diff.causes import Cause, Row, Update, cause_of
+from runner.analysis.diff.loops import comparable, loop_environment_diff, loop_means, loop_parting
 from runner.analysis.diff.metrics import MetricDiff, metric_diffs
 from runner.analysis.diff.settings import (
     Change,
@@ -88,6 +89,8 @@ def diff(
         targets: metric to a level, whose first crossing is to be told.
         first: only settings, and the first step of training at which they part.
     """
+    if not a.kind == b.kind == "job":
+        return _diff_of_loops(a, b)
     digests = [recording.result.get("content_digest") for recording in (a, b)]
     same = digests[0] is not None and digests[0] == digests[1]
     notes = _notes(a, b)
@@ -118,6 +121,26 @@ def diff(
     facts["tables"] = list(table_diffs(a, b, seen)) if _same_sizes(a, b) else []
     facts["metrics"] = metric_diffs(a, b, targets or {})
     return RunDiff(**facts)
+
+
+def _diff_of_loops(a: Recording, b: Recording) -> RunDiff:
+    """Return in what two runs differ of which one is somebody's own loop."""
+    digests = [recording.result.get("content_digest") for recording in (a, b)]
+    same = digests[0] is not None and digests[0] == digests[1]
+    notes = ["recorded from a loop: what it learned is not known, so no cause and no tables are told"]
+    if not comparable(a, b):
+        notes.append("the environments have other spaces: no steps are compared")
+    return RunDiff(
+        a=_who(a),
+        b=_who(b),
+        same_content=same,
+        config=changes_in(_settings(a), _settings(b)),
+        provenance=changes_in(a.provenance, b.provenance),
+        environment=loop_environment_diff(a, b),
+        parting=loop_parting(a, b) if comparable(a, b) and not same else None,
+        costs=changes_in(_costs(a) | loop_means(a), _costs(b) | loop_means(b)),
+        notes=notes,
+    )
 
 
 def _same_sizes(a: Recording, b: Recording) -> bool:

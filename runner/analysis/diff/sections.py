@@ -109,6 +109,11 @@ def _trajectory(difference: RunDiff) -> Section:
     if parting is not None and difference.cause is not None:
         sentences += _told(parting, difference.cause)
         grids += _q_rows(difference.cause)
+    elif parting is not None:
+        sentences.append(
+            f"They part at training step {parting.step:,}, of episode {parting.episode:,} at time "
+            f"{parting.t:,}: {spoken(parting.field)} is {_text(parting.a)} in A, {_text(parting.b)} in B."
+        )
     elif overlap is not None:
         sentences.append("Training is the same, step by step.")
     if overlap is not None and parting is not None:

@@ -1,0 +1,145 @@
+"""Where two recordings part of which one is of somebody's own loop: by their bytes, field by field."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.analysis.diff.settings import EnvironmentDiff, changes_in
+from runner.analysis.diff.trajectory import Parting
+from runner.recording import schema
+from runner.recording.messages import decode
+from runner.recording.reader import Recording
+
+_HEADER = {name for name, _ in schema.HEADER}
+
+
+def loop_environment_diff(a: Recording, b: Recording) -> EnvironmentDiff:
+    """Return how what is said of two environments and their spaces differs."""
+    left, right = ({"spaces": _spaces(recording), **recording.environment} for recording in (a, b))
+    return EnvironmentDiff(changes_in(left, right))
+
+
+def _spaces(recording: Recording) -> dict[str, Any]:
+    return {} if recording.kind == "job" else recording.spaces
+
+
+def comparable(a: Recording, b: Recording) -> bool:
+    """Return whether the steps of both are in the same spaces."""
+    both = {a.kind, b.kind}
+    if both <= {"job", "step"}:
+        return True
+    return len(both) == 1 and a.spaces == b.spaces and a.run["agents"] == b.run["agents"]
+
+
+def loop_parting(a: Recording, b: Recording) -> Parting | None:
+    """Return the first step of training at which two loops part, and the first field of it that differs."""
+    topics = [recording.topic("/train/step") for recording in (a, b)]
+    if topics[0] not in a.dtypes:
+        return _message_parting(a, b)
+    streams = [recording.blocks(topic) for recording, topic in zip((a, b), topics, strict=True)]
+    left: NDArray[Any] = np.empty(0)
+    right: NDArray[Any] = np.empty(0)
+    position = 0
+    while True:
+        left, right = (
+            block if len(block) else next(stream, block)
+            for block, stream in zip((left, right), streams, strict=True)
+        )
+        n = min(len(left), len(right))
+        if not n:
+            return _end(left, right, position)
+        rows, name = _first_difference(left[:n], right[:n])
+        if name:
+            return _parting(left[rows], right[rows], name)
+        left, right, position = left[n:], right[n:], position + n
+
+
+def _first_difference(left: NDArray[np.void], right: NDArray[np.void]) -> tuple[int, str]:
+    """Return the first row in which two blocks differ, and the first field; no name if there is none."""
+    names = [
+        name
+        for name in left.dtype.names or ()
+        if name not in _HEADER and not name.startswith("tag_") and name in (right.dtype.names or ())
+    ]
+    differs = {name: _rows_differ(left[name], right[name]) for name in names}
+    first = {name: int(np.argmax(rows)) for name, rows in differs.items() if rows.any()}
+    if not first:
+        return 0, ""
+    row = min(first.values())
+    return row, next(name for name, at in first.items() if at == row)
+
+
+def _rows_differ(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.bool_]:
+    one, other = (
+        np.ascontiguousarray(values).reshape(len(values), -1).view(np.uint8) for values in (left, right)
+    )
+    if one.shape != other.shape:
+        return np.ones(len(left), np.bool_)
+    return np.asarray((one != other).any(axis=1))
+
+
+def _end(left: NDArray[Any], right: NDArray[Any], position: int) -> Parting | None:
+    """Return the parting where one loop ends before the other; None if both end."""
+    if not (len(left) or len(right)):
+        return None
+    step = left[0] if len(left) else right[0]
+    a, b = ("one more" if len(block) else "none" for block in (left, right))
+    return Parting(
+        "train", None, None, position, int(step["episode"]), int(step["t"]), "step", a, b, None, None
+    )
+
+
+def _parting(left: np.void, right: np.void, name: str) -> Parting:
+    return Parting(
+        phase="train",
+        evaluation=None,
+        after=None,
+        step=int(left["step"]),
+        episode=int(left["episode"]),
+        t=int(left["t"]),
+        field=name,
+        a=left[name].tolist(),
+        b=right[name].tolist(),
+        a_step=left,
+        b_step=right,
+    )
+
+
+def _message_parting(a: Recording, b: Recording) -> Parting | None:
+    """Return the parting of loops whose steps vary in size."""
+    streams: list[Iterator[tuple[int, bytes]]] = [
+        recording.messages(recording.topic("/train/step")) for recording in (a, b)
+    ]
+    position = 0
+    while True:
+        left, right = (next(stream, None) for stream in streams)
+        if left is None and right is None:
+            return None
+        if left is None or right is None or left[1] != right[1]:
+            break
+        position += 1
+    steps = [{} if one is None else decode(schema.TRANSITION, one[1]) for one in (left, right)]
+    some = steps[0] or steps[1]
+    names = [name for name in some if steps[0].get(name) != steps[1].get(name)]
+    name = names[0] if all(steps) and names else "step"
+    told_a, told_b = (str(step.get(name, "none")) for step in steps)
+    return Parting(
+        "train", None, None, position, some["episode"], some["t"], name, told_a, told_b, None, None
+    )
+
+
+def loop_means(recording: Recording) -> dict[str, Any]:
+    """Return the means over the training episodes of a recording."""
+    episodes = length = 0
+    paid = 0.0
+    for block in recording.blocks(schema.TRAIN_EPISODE):
+        episodes += len(block)
+        length += int(block["length"].sum())
+        paid += float(block["returns"].sum())
+    if not episodes:
+        return {}
+    return {"mean_length": round(length / episodes, 3), "mean_return": round(paid / episodes, 3)}

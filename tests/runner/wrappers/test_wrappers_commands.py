@@ -1,0 +1,150 @@
+"""What is recorded from a loop is listed, plotted, compared, checked and packed like every other run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+import runner
+from runner.cli import cli
+from runner.recording import schema
+from runner.recording.reader import open_recording
+from tests.runner.wrappers.loops import make, play
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """Return a recordings folder with loops of each kind, and one like another but for its seed."""
+    made = tmp_path_factory.mktemp("loops-told")
+    for name, env_id, seed in (
+        ("lake", "FrozenLake-v1", 0),
+        ("again", "FrozenLake-v1", 0),
+        ("other", "FrozenLake-v1", 1),
+        ("pole", "CartPole-v1", 0),
+        ("rooms", "RoomsText", 0),
+    ):
+        with runner.record(make(env_id), made, name=name, seed=seed, config={"lr": 0.5}) as env:
+            for k, entry in enumerate(play(env, 400, seed)):
+                if entry[0] == "step":
+                    env.log("loss", 1 / (k + 1))
+            with env.phase("eval"):
+                list(play(env, 60, seed))
+            env.log("note", "done")
+    return made
+
+
+def dualtaxi(folder: Path, *words: str) -> Any:
+    """Run a command; nothing it says is a traceback."""
+    done = CliRunner().invoke(cli, [*words, "--recordings", str(folder)])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done
+
+
+def test_ls_and_show_tell_of_loops(folder):
+    listed = json.loads(dualtaxi(folder, "ls", "--json").stdout)
+    assert {run["name"] for run in listed} == {"lake", "again", "other", "pole", "rooms"}
+    told = json.loads(dualtaxi(folder, "show", "pole", "--json").stdout)
+    assert (told["train_steps"], told["eval_steps"]) == (400, 60)
+    assert told["config"]["made_by"] == "runner.record"
+    assert dualtaxi(folder, "show", "rooms").exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_plot_and_report_draw_loops(folder, name, tmp_path):
+    plotted = dualtaxi(folder, "plot", name, "-o", str(tmp_path / "plot.svg"))
+    assert plotted.exit_code == 0
+    drawn = (tmp_path / "plot.svg").read_text()
+    assert "Logged: loss" in drawn
+    assert "Return of training episodes" in drawn
+    assert "Return of evaluation trials" in drawn
+    assert dualtaxi(folder, "report", name, "-o", str(tmp_path / "report.html")).exit_code == 0
+    assert "from a loop" in (tmp_path / "report.html").read_text()
+
+
+def test_diff_says_where_loops_part(folder):
+    same = dualtaxi(folder, "diff", "lake", "again")
+    assert same.exit_code == 0
+    assert "the same, to the last byte" in same.stdout
+    differing = json.loads(dualtaxi(folder, "diff", "lake", "other", "--json").stdout)
+    parting = differing["parting"]
+    with (
+        open_recording(runner.find_run("lake", folder).recording) as a,
+        open_recording(runner.find_run("other", folder).recording) as b,
+    ):
+        left, right = (next(recording.blocks(schema.TRAIN_STEP)) for recording in (a, b))
+    names = [name for name in left.dtype.names if not name.startswith("tag_")]
+    first = next(k for k in range(len(left)) if left[k][names].tolist() != right[k][names].tolist())
+    assert parting["step"] == first
+    assert parting["field"] in ("state", "action", "next_state")
+    foreign = dualtaxi(folder, "diff", "pole", "rooms")
+    assert foreign.exit_code == 1
+    assert "other spaces" in foreign.stdout
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_verify_checks_what_can_be_checked(folder, name):
+    told = dualtaxi(folder, "verify", name)
+    assert told.exit_code == 0
+    assert "which alone can do it again" in told.output
+
+
+def test_verify_finds_a_digest_that_is_not_its_messages(folder, tmp_path):
+    from runner.recording.rewriting import rewrite
+    from runner.verify import verify
+
+    def other(name: str, entries: dict[str, str]) -> dict[str, str]:
+        if name != "result":
+            return entries
+        result = json.loads(entries["json"])
+        return {"json": json.dumps(result | {"content_digest": "0" * 64}, sort_keys=True)}
+
+    altered = tmp_path / "recording.mcap"
+    rewrite(runner.find_run("pole", folder).recording, altered, other)
+    assert "content_digest: found 000" in verify(altered).finding
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("evaluate", "pole"),
+        ("qtable", "lake"),
+        ("play", "pole"),
+        ("export", "gif", "pole", "-o", "x.gif"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_a_loop_has_not_is_refused_in_a_sentence(folder, words):
+    done = dualtaxi(folder, *words)
+    assert done.exit_code == 2
+    assert "loop" in done.output
+
+
+def test_the_grid_of_a_loop_is_played(folder):
+    done = dualtaxi(folder, "play", "lake", "--episode", "2")
+    assert done.exit_code == 0
+    assert "player" in done.stdout
+
+
+def test_a_loop_is_packed_and_unpacked_to_the_same_bytes(folder, tmp_path):
+    assert dualtaxi(folder, "pack", "rooms", "-o", str(tmp_path / "rooms.pack")).exit_code == 0
+    done = CliRunner().invoke(
+        cli, ["unpack", str(tmp_path / "rooms.pack"), "--recordings", str(tmp_path / "there")]
+    )
+    assert done.exit_code == 0, done.output
+    there = runner.find_run("rooms", tmp_path / "there")
+    assert there.summary["content_digest"] == runner.find_run("rooms", folder).summary["content_digest"]
+
+
+def test_an_interrupted_loop_is_not_resumed(tmp_path):
+    env = runner.record(make("FrozenLake-v1"), tmp_path, name="cut")
+    list(play(env, 50))
+    env._loop.close("interrupted")
+    before = env.run.recording.read_bytes()
+    done = dualtaxi(tmp_path, "resume", "cut")
+    assert done.exit_code == 2
+    assert "which alone can do it again" in done.output
+    assert env.run.recording.read_bytes() == before
