@@ -9,7 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from runner.archive.layout import PHASES, Shape
@@ -127,10 +126,19 @@ def record_bytes(records: Records) -> memoryview:
     return records.view(np.uint8).data.cast("B")
 
 
-def of_phase(batch: pa.RecordBatch, phase: str) -> pa.RecordBatch:
-    """Return the rows of one phase."""
-    chosen = pc.equal(batch.column("phase").cast(pa.string()), phase)
-    return batch if chosen.true_count == batch.num_rows else batch.filter(chosen)
+def of_phase(batch: pa.RecordBatch, phase: str, where: str) -> pa.RecordBatch:
+    """Return the rows of one phase.
+
+    Raises:
+        RecordingError: there are others than training's and evaluation's.
+    """
+    column = batch.column("phase")
+    words = column.dictionary.to_pylist()
+    codes = _numbers(column.indices)
+    if not {words[code] for code in np.unique(codes)} <= set(PHASES):
+        raise RecordingError(f"{where}: found phases {words}, expected {list(PHASES)}.")
+    chosen = codes == words.index(phase) if phase in words else np.zeros(len(codes), np.bool_)
+    return batch if chosen.all() else batch.filter(pa.array(chosen))
 
 
 @lru_cache(8)

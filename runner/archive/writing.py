@@ -33,6 +33,7 @@ from runner.recording.schema import STEP_NANOSECONDS, Topic
 
 ROWS_A_GROUP: Final = 1 << 18
 BYTES_A_GROUP: Final = 32 << 20
+PAGE_BYTES: Final = 1 << 18
 LEVEL: Final = 9
 """Of zstd: beyond it a step takes a tenth of a byte less, and packing three times as long."""
 _ROWS_AT_ONCE: Final = 1024
@@ -98,6 +99,7 @@ class TableWriter:
             columns,
             compression="zstd",
             compression_level=level,
+            data_page_size=PAGE_BYTES,
             use_dictionary=[name for name in columns.names if name not in encodings] if flat else True,
             column_encoding=encodings if flat else None,
         )

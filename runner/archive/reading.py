@@ -1,0 +1,200 @@
+"""An archive in a local folder, opened: nothing in it is believed before it was compared with the manifest.
+
+Whoever wrote the archive wrote the manifest too, so what a table declares (columns, rows, sizes) is held
+to what archives of ours have, before any of it is unpacked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from runner.archive import layout
+from runner.archive.columns import shape_of
+from runner.archive.layout import Shape
+from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
+from runner.archive.pages import largest_page
+from runner.errors import RecordingError
+from runner.mdp import Mdp
+from runner.recording.facts import check_run, environment_of, json_object
+from runner.recording.index import UNPACKED_A_BYTE
+from runner.recording.schema import Topic
+
+MAX_DESCRIPTION_BYTES: Final = 64 << 20
+MAX_ROWS_A_GROUP: Final = 1 << 21
+MAX_PAGE_BYTES: Final = 160 << 20
+"""A page holds 1 MiB, or one value: a Q-table as large as an environment's arrays may be."""
+_MAX_FOOTER_BYTES: Final = 32 << 20
+_UNPACKED_ANYWAY: Final = 1 << 30
+_ROW_BYTES: Final = 88
+"""Of a step in a recording."""
+
+
+class Archive:
+    """An archive in a folder.
+
+    Args:
+        folder: with a manifest.
+
+    Raises:
+        RecordingError: it is no archive of ours.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        path = folder / layout.MANIFEST
+        try:
+            with path.open("rb") as stream:
+                data = stream.read(MAX_MANIFEST_BYTES + 1)
+        except OSError as error:
+            raise RecordingError(
+                f"{folder}: is no archive: {layout.MANIFEST} cannot be read ({error.strerror})."
+            ) from error
+        self.manifest: Manifest = read_manifest(data, str(path))
+
+    def check_files(self) -> None:
+        """Compare size and hash of every file with what the manifest says.
+
+        Raises:
+            RecordingError: one is missing or changed; it is named.
+        """
+        for name, expected in self.manifest.files.items():
+            path = self.folder / name
+            try:
+                found = entry_of(path) if path.stat().st_size == expected.size else None
+                size = path.stat().st_size
+            except OSError as error:
+                raise RecordingError(
+                    f"{path}: cannot be read ({error.strerror}); the archive is damaged."
+                ) from error
+            if found != expected:
+                told = f"{size:,} bytes" if found is None else f"BLAKE3 {found.blake3[:16]}…"
+                wanted = f"{expected.size:,}" if found is None else f"{expected.blake3[:16]}…"
+                raise RecordingError(
+                    f"{path}: found {told}, expected {wanted}: the archive is damaged there."
+                )
+
+    @cached_property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """The recording's metadata records, in order."""
+        try:
+            said = {str(name): dict(entries) for name, entries in self._said["metadata"]}
+            texts = [text for entries in said.values() for pair in entries.items() for text in pair]
+            if not all(isinstance(text, str) for text in texts):
+                raise TypeError("a value is no text")
+            check_run(said["run"], str(self.folder))
+        except (KeyError, TypeError, ValueError) as error:
+            raise self._senseless(error) from error
+        return said
+
+    @cached_property
+    def attachments(self) -> list[tuple[str, str]]:
+        """Name and media type of the recording's attachments, in order."""
+        try:
+            named = [(str(name), str(media_type)) for name, media_type in self._said["attachments"]]
+        except (KeyError, TypeError, ValueError) as error:
+            raise self._senseless(error) from error
+        if strange := [name for name, _ in named if not is_inside(name) or name not in self.manifest.files]:
+            raise RecordingError(f"{self.folder}: has no attachment {strange[0]!r}.")
+        return named
+
+    @cached_property
+    def _said(self) -> dict[str, Any]:
+        return json_object(self._bytes(layout.METADATA), str(self.folder / layout.METADATA))
+
+    def _senseless(self, error: Exception) -> RecordingError:
+        return RecordingError(f"{self.folder / layout.METADATA}: makes no sense ({error!r}).")
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The run's configuration."""
+        return json_object(
+            self.metadata.get("config", {}).get("json"), f"{self.folder}: the metadata 'config'"
+        )
+
+    @cached_property
+    def mdp(self) -> Mdp:
+        """The run's environment."""
+        where = str(self.folder)
+        description = json_object(self.attachment(layout.ENVIRONMENT), f"{where}: {layout.ENVIRONMENT}")
+        return environment_of(description, self.attachment, where)
+
+    @cached_property
+    def shape(self) -> Shape:
+        """What fixes the columns of steps and episodes."""
+        return shape_of(self.metadata["run"], self.mdp, str(self.folder))
+
+    def attachment(self, name: str) -> bytes:
+        """Return an attachment's data.
+
+        Raises:
+            RecordingError: there is none of that name.
+        """
+        if name not in dict(self.attachments):
+            raise RecordingError(f"{self.folder}: has no attachment {name!r}.")
+        return self._bytes(name)
+
+    def _bytes(self, name: str) -> bytes:
+        path = self.folder / name
+        try:
+            if path.stat().st_size > MAX_DESCRIPTION_BYTES:
+                raise RecordingError(f"{path}: is larger than {MAX_DESCRIPTION_BYTES:,} bytes.")
+            return path.read_bytes()
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+
+    def count(self, *topics: Topic) -> int:
+        """Return how many messages of these topics there are."""
+        return sum(self.manifest.topics.get(topic.name, Entry(0, "")).size for topic in topics)
+
+    def batches(self, name: str, columns: pa.Schema, rows: int, n: int) -> Iterator[pa.RecordBatch]:
+        """Yield the rows of a table, n at a time.
+
+        Args:
+            name: of the table's file.
+            columns: what it must have.
+            rows: how many there must be.
+            n: the most rows of a batch.
+
+        Raises:
+            RecordingError: it is no such table.
+        """
+        path = self.folder / name
+        try:
+            with pq.ParquetFile(path, buffer_size=1 << 16, page_checksum_verification=False) as file:
+                self._check(file, path, columns, rows)
+                for batch in file.iter_batches(n):
+                    _refuse_nulls(batch, path)
+                    yield batch
+        except (pa.ArrowException, OSError, OverflowError, MemoryError) as error:
+            raise RecordingError(f"{path}: cannot be read as a table ({error}).") from error
+
+    def _check(self, file: pq.ParquetFile, path: Path, columns: pa.Schema, rows: int) -> None:
+        """Refuse a table whose footer says what no footer of ours does."""
+        about, size = file.metadata, path.stat().st_size
+        if not file.schema_arrow.remove_metadata().equals(columns):
+            raise RecordingError(
+                f"{path}: found columns\n{file.schema_arrow.remove_metadata()}\nexpected\n{columns}"
+            )
+        if about.num_rows != rows:
+            raise RecordingError(f"{path}: found {about.num_rows:,} rows, expected {rows:,}.")
+        groups = [about.row_group(k) for k in range(about.num_row_groups)]
+        if any(group.num_rows > MAX_ROWS_A_GROUP for group in groups):
+            raise RecordingError(f"{path}: has a group of more than {MAX_ROWS_A_GROUP:,} rows.")
+        if rows * _ROW_BYTES > size * UNPACKED_A_BYTE + _UNPACKED_ANYWAY:
+            raise RecordingError(f"{path}: {size:,} bytes declare {rows:,} rows; made to exhaust the disk.")
+        if (found := largest_page(path, about)) > MAX_PAGE_BYTES:
+            raise RecordingError(
+                f"{path}: declares a page of {found:,} bytes, expected {MAX_PAGE_BYTES:,} at most."
+            )
+
+
+def _refuse_nulls(batch: pa.RecordBatch, path: Path) -> None:
+    for name, column in zip(batch.schema.names, batch.columns, strict=True):
+        if column.null_count and name != "data":
+            raise RecordingError(f"{path}: found {column.null_count} rows without {name}, expected none.")
