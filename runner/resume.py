@@ -13,13 +13,10 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import struct
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO, Final
-
-from mcap.opcode import Opcode
+from typing import Any, Final
 
 from runner import runs
 from runner.config import from_mapping
@@ -41,9 +38,8 @@ from runner.origin import configured_tables, settle
 from runner.owner import owner
 from runner.provenance import provenance
 from runner.recording import schema
-from runner.recording.chunks import MAX_CHUNK_BYTES
-from runner.recording.contents import Contents, read_chunk
-from runner.recording.integrity import checked_survey
+from runner.recording.contents import Contents
+from runner.recording.integrity import checked_survey, may_be_cut
 from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import storage_error
@@ -58,7 +54,6 @@ DECISIVE: Final = (
 """Provenance that a continued run must share with its beginning, unless told otherwise."""
 _NEEDED: Final = {"run", "config", "provenance"}
 _ANEW: Final = ".anew"
-_HEAD: Final = struct.Struct("<BQ")
 
 Changes = dict[str, tuple[str, str]]
 
@@ -156,61 +151,10 @@ def _place(run: Run, described: bool) -> tuple[Path, Contents]:
     if not run.recording.is_file():
         return run.recording, Contents()
     contents = checked_survey(run.recording)
-    if _may_be_cut(run.recording, contents) and (described or not contents.chunks):
+    if may_be_cut(run.recording, contents) and (described or not contents.chunks):
         return run.recording, contents
     contents = checked_survey(anew) if anew.is_file() else Contents()
-    return anew, contents if _may_be_cut(anew, contents) else Contents()
-
-
-def _may_be_cut(path: Path, contents: Contents) -> bool:
-    """Return whether nothing is missing in what is good, and nothing good stands behind it."""
-    if any(entry.name == "repair" for entry in contents.metadata):
-        return False
-    if not contents.reason:
-        return True
-    try:
-        with path.open("rb") as stream:
-            return _ends_torn(stream, contents)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
-
-
-def _ends_torn(stream: BinaryIO, contents: Contents) -> bool:
-    """Return whether a file ends with a record that was not written to its end, or with nothing but zeros.
-
-    Before it may stand a good chunk without its index, which comes again.
-    """
-    offset = contents.end
-    if offset == 0:
-        return contents.size == 0 or _only_zeros(stream, 0)
-    for _ in range(2):
-        stream.seek(offset)
-        head = stream.read(_HEAD.size)
-        if len(head) < _HEAD.size:
-            return True
-        opcode, length = _HEAD.unpack(head)
-        if offset + 9 + length > contents.size and 0 < opcode <= Opcode.DATA_END:
-            return bool(length <= MAX_CHUNK_BYTES)
-        if opcode != Opcode.CHUNK or not _is_good_chunk(stream.read(length), offset):
-            return _only_zeros(stream, offset)
-        offset += 9 + length
-    return False
-
-
-def _is_good_chunk(body: bytes, offset: int) -> bool:
-    try:
-        read_chunk(body, offset)
-    except (RecordingError, struct.error, ValueError):
-        return False
-    return True
-
-
-def _only_zeros(stream: BinaryIO, offset: int) -> bool:
-    stream.seek(offset)
-    while piece := stream.read(1 << 20):
-        if any(piece):
-            return False
-    return True
+    return anew, contents if may_be_cut(anew, contents) else Contents()
 
 
 def _job(run: Run) -> tuple[Job, bool]:

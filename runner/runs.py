@@ -51,6 +51,8 @@ class Run:
     folder: Path
     facts: dict[str, Any]
     """The contents of `run.json`."""
+    restored: Path | None = None
+    """Where its recording was restored to, if it is in an archive alone."""
 
     @property
     def run_id(self) -> str:
@@ -86,7 +88,7 @@ class Run:
     @property
     def recording(self) -> Path:
         """The MCAP file."""
-        return self.folder / Path(str(self.facts.get("recording", RECORDING_FILE))).name
+        return self.restored or self.folder / Path(str(self.facts.get("recording", RECORDING_FILE))).name
 
     @property
     def created(self) -> datetime:
@@ -107,7 +109,7 @@ class Run:
         said = str(self.facts["status"])
         if said == "running" and not lives(self.facts.get("owner", {}), self.folder / RUN_FILE):
             return "interrupted"
-        return "archived" if self.archive and not self.recording.exists() else said
+        return "archived" if self.archive and (self.restored or not self.recording.exists()) else said
 
     @property
     def archive(self) -> dict[str, Any]:
@@ -244,11 +246,15 @@ def run_entries(recordings: Path) -> list[str]:
 
 
 @contextlib.contextmanager
-def owned(run: Run) -> Iterator[Run]:
+def owned(run: Run, archived: bool = False) -> Iterator[Run]:
     """Give a run as it is now, its folder kept from every other process that would write to it.
 
+    Args:
+        run: whose folder.
+        archived: whether it may be one whose recording is in an archive alone.
+
     Raises:
-        RunnerError: it is running, or another process has it in this way.
+        RunnerError: it is running or archived, or another process has it in this way.
         StorageError: the folder cannot be written.
     """
     from filelock import FileLock, Timeout
@@ -267,6 +273,10 @@ def owned(run: Run) -> Iterator[Run]:
             owner = run.facts.get("owner", {})
             raise RunnerError(
                 f"run {run.run_id} is running (process {owner.get('pid')} on {owner.get('host')}); let it."
+            )
+        if run.status == "archived" and not archived:
+            raise RunnerError(
+                f"run {run.run_id} is archived; `dualtaxi restore {run.run_id}` brings it back."
             )
         yield run
     finally:

@@ -56,6 +56,10 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "verify": ("runner.cli.commands.verify", "Check every step of a run by doing it again."),
         "repair": ("runner.cli.commands.repair", "Make a damaged recording whole; tell what was lost."),
     },
+    "Keep": {
+        "archive": ("runner.cli.commands.archive", "Put runs into an archive of Parquet files, losslessly."),
+        "restore": ("runner.cli.commands.restore", "Bring the recording of an archived run back."),
+    },
     "Hand on": {
         "pack": ("runner.cli.commands.pack", "Put a run into one file, to hand to a colleague."),
         "unpack": ("runner.cli.commands.unpack", "Take a run out of the file that `pack` wrote."),

@@ -49,6 +49,28 @@ def progress_line(label: str, episodes: int) -> Iterator[Callable[[Progress], No
         yield report
 
 
+@contextlib.contextmanager
+def steps_line(label: str) -> Iterator[Callable[[int], None]]:
+    """Give what is told the steps done so far: it keeps a line of them, where there is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    columns = [
+        rich_progress.SpinnerColumn(),
+        rich_progress.TextColumn(label, markup=False),
+        rich_progress.TextColumn("{task.completed:,} steps"),
+    ]
+    drawn = Console(stderr=True, highlight=False)
+    with rich_progress.Progress(
+        *columns, console=drawn, transient=True, refresh_per_second=REDRAWS_A_SECOND
+    ) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda steps: bar.update(task, completed=steps)
+
+
 class _Speed:
     """Steps a second since the first report: what came before was not learning."""
 

@@ -64,16 +64,24 @@ def refuse_running(run: Run | None) -> None:
 
 
 @contextlib.contextmanager
+def announcing() -> Iterator[None]:
+    """Say so when a kernel must be compiled, as it must once after an installation."""
+    from runner.learning.compilation import announced
+
+    with announced(lambda: say("Compiling the learning kernel, this once: a few seconds.")):
+        yield
+
+
+@contextlib.contextmanager
 def at_work(label: str, episodes: int) -> Iterator[tuple[Report, Interrupt]]:
     """Give what a job reports to, and what says whether to stop; as `dualtaxi run` has them."""
     from runner.api import interruptible
     from runner.cli.progress import progress_line
-    from runner.learning.compilation import announced
 
     with (
         interruptible(second=signal.SIG_DFL) as interrupt,
         progress_line(label, episodes) as report,
-        announced(lambda: say("Compiling the learning kernel, this once: a few seconds.")),
+        announcing(),
     ):
         yield report, interrupt
 
@@ -98,7 +106,13 @@ def run_in_words(run: Run) -> dict[str, str]:
     took = "" if summary.get("seconds") is None else f", in {duration(summary['seconds'])}"
     return {
         "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
-        "steps": f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation{took}",
+        "steps": _steps_in_words(summary) + took,
         "digest": summary.get("content_digest") or UNKNOWN,
         "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
     }
+
+
+def _steps_in_words(summary: dict[str, Any]) -> str:
+    if "train_steps" not in summary:
+        return UNKNOWN
+    return f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation"

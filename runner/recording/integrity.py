@@ -10,7 +10,7 @@ import struct
 import zlib
 from functools import cache
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.chunks import chunk_head, message_index
-from runner.recording.contents import Contents, survey
+from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head, message_index
+from runner.recording.contents import Contents, read_chunk, survey
 from runner.recording.writer import RecordingFile, schema_and_channel_bytes
 
+_HEAD: Final = struct.Struct("<BQ")
 Times = NDArray[np.uint64]
 _BLOCK_CHANNELS = {topic.channel for topic in schema.ALL_BLOCK_TOPICS}
 
@@ -70,6 +71,65 @@ def checked_survey(path: Path) -> Contents:
     except RecordingError as error:
         return Contents(size=path.stat().st_size, reason=str(error))
     return survey(path, check=_IndexCheck(path).take)
+
+
+def may_be_cut(path: Path, contents: Contents) -> bool:
+    """Return whether nothing is missing in what is good, and nothing good stands behind it.
+
+    Args:
+        path: a recording.
+        contents: what of it is good, as `checked_survey` found.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    if any(entry.name == "repair" for entry in contents.metadata):
+        return False
+    if not contents.reason:
+        return True
+    try:
+        with path.open("rb") as stream:
+            return _ends_torn(stream, contents)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+
+
+def _ends_torn(stream: BinaryIO, contents: Contents) -> bool:
+    """Return whether a file ends with a record that was not written to its end, or with nothing but zeros.
+
+    Before it may stand a good chunk without its index, which comes again.
+    """
+    offset = contents.end
+    if offset == 0:
+        return contents.size == 0 or _only_zeros(stream, 0)
+    for _ in range(2):
+        stream.seek(offset)
+        head = stream.read(_HEAD.size)
+        if len(head) < _HEAD.size:
+            return True
+        opcode, length = _HEAD.unpack(head)
+        if offset + 9 + length > contents.size and 0 < opcode <= Opcode.DATA_END:
+            return bool(length <= MAX_CHUNK_BYTES)
+        if opcode != Opcode.CHUNK or not _is_good_chunk(stream.read(length), offset):
+            return _only_zeros(stream, offset)
+        offset += 9 + length
+    return False
+
+
+def _is_good_chunk(body: bytes, offset: int) -> bool:
+    try:
+        read_chunk(body, offset)
+    except (RecordingError, struct.error, ValueError):
+        return False
+    return True
+
+
+def _only_zeros(stream: BinaryIO, offset: int) -> bool:
+    stream.seek(offset)
+    while piece := stream.read(1 << 20):
+        if any(piece):
+            return False
+    return True
 
 
 def _check_beginning(stream: BinaryIO, path: Path) -> None:

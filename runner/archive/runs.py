@@ -1,0 +1,291 @@
+"""A run of the recordings folder in an archive: put there, brought back, or read where it is.
+
+What stays of an archived run is its folder with `run.json`, whose `archive` says where the recording is,
+and what people say of it. To be looked at, its recording is restored into the user's cache.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from filelock import FileLock, Timeout
+
+from runner.archive.manifest import Manifest
+from runner.archive.restoring import check, restore
+from runner.archive.targets import Target, no_archive, split_place, target_of
+from runner.archive.writing import write_archive
+from runner.cache import CACHE_VARIABLE, cache_folder
+from runner.errors import RecordingError, RunnerError, StorageError
+from runner.recording.integrity import checked_survey, may_be_cut
+from runner.recording.reader import Recording, open_recording
+from runner.runs import RECORDING_FILE, RUN_FILE, Run, owned, run_at_once
+
+ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
+KEPT: Final = 8
+"""Restored recordings in the cache; the ones that were not looked at for longest are removed."""
+LOCK_SECONDS: Final = 600.0
+
+Report = Callable[[int], None]
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Archived:
+    """What came of archiving a run."""
+
+    run: Run
+    place: str
+    """Path or URL of the archive."""
+    manifest: Manifest
+    new: bool
+    """Whether it was made now; it may have been there."""
+    removed: bool
+    """Whether the recording was removed from the run's folder."""
+    recording_bytes: int
+    """Of the recording, when it was archived."""
+
+
+def default_target(recordings: Path) -> str:
+    """Return where archives are kept unless said: the variable says it, or `archive` beside the recordings."""
+    return os.environ.get(ARCHIVE_VARIABLE) or str(recordings.absolute().parent / "archive")
+
+
+def archive_run(
+    run: Run, to: str, remove: bool = False, report: Report = lambda _: None, dry_run: bool = False
+) -> Archived:
+    """Put a run into an archive; return what came of it.
+
+    Args:
+        run: one of a recordings folder, not running.
+        to: a folder, or `s3://bucket/prefix`.
+        remove: remove the recording when what the archive gives back was compared with it.
+        report: called with the steps done so far.
+        dry_run: pack, but neither keep nor change anything.
+
+    Raises:
+        RunnerError: the run stands alone, or is running; the target has another archive of its id.
+        RecordingError: the recording is damaged.
+        StorageError: the target cannot be written; then there is no archive.
+    """
+    if not (run.folder / RUN_FILE).is_file() or run.facts.get("recording", RECORDING_FILE) != RECORDING_FILE:
+        raise RunnerError(
+            f"{run.recording}: found a recording that stands alone, expected a run in a folder."
+        )
+    target = target_of(to)
+    with owned(run, archived=True) as current:
+        if current.status == "archived":
+            raise RunnerError(f"run {run.run_id} is archived already, in {current.archive.get('place')}.")
+        return _Archiving(current, target, report).do(remove, dry_run)
+
+
+class _Archiving:
+    """One run on its way into an archive."""
+
+    def __init__(self, run: Run, target: Target, report: Report) -> None:
+        self._run = run
+        self._target = target
+        self._report = report
+
+    def do(self, remove: bool, dry_run: bool) -> Archived:
+        """Write the archive, unless it is there; note it in the run; perhaps remove the recording."""
+        run, target = self._run, self._target
+        existing = target.manifest(run.run_id)
+        with _sound(run) as recording:
+            size = recording.size
+            if dry_run or existing is None:
+                manifest = self._write(recording, dry_run)
+            elif existing.run.get("content_digest") == recording.result.get("content_digest") is not None:
+                manifest = existing
+            else:
+                raise RunnerError(
+                    f"{target.place(run.run_id)}: found an archive of another content ({existing.digest[:16]}…): "
+                    "of this run at another time. Remove it, or choose another --to."
+                )
+        if dry_run:
+            return Archived(run, target.place(run.run_id), manifest, existing is None, False, size)
+        if remove or existing is not None:
+            with target.reading(run.run_id) as folder:
+                check(folder, self._report)
+        run = run.update(archive=_stub(target.place(run.run_id), manifest, size))
+        if remove:
+            run.recording.unlink()
+        return Archived(run, target.place(run.run_id), manifest, existing is None, remove, size)
+
+    def _write(self, recording: Recording, dry_run: bool) -> Manifest:
+        with self._target.writing(self._run.run_id) as folder:
+            manifest = write_archive(recording, folder, self._report)
+            if not dry_run:
+                self._target.commit(self._run.run_id, folder)
+            return manifest
+
+
+def _stub(place: str, manifest: Manifest, recording_bytes: int) -> dict[str, Any]:
+    """Return what a run's file says of its archive."""
+    return {
+        "place": place,
+        "digest": manifest.digest,
+        "bytes": manifest.size,
+        "recording_bytes": recording_bytes,
+        "version": manifest.version,
+    }
+
+
+@contextlib.contextmanager
+def _sound(run: Run) -> Iterator[Recording]:
+    """Give the recording of a run; damage found in it is told with what mends it."""
+    mend = f"`dualtaxi repair {run.run_id}` makes the recording whole."
+    try:
+        with open_recording(run.recording) as recording:
+            if not recording.finished:
+                contents = checked_survey(run.recording)
+                if not may_be_cut(run.recording, contents):
+                    raise RecordingError(f"{run.recording}: {contents.reason}: it is damaged.")
+            yield recording
+    except RecordingError as error:
+        if not run.recording.exists():
+            raise
+        raise RecordingError(f"{error} {mend}") from error
+
+
+def restore_run(run: Run, report: Report = lambda _: None) -> Run:
+    """Bring the recording of an archived run back into its folder; return the run. The archive stays.
+
+    Raises:
+        RunnerError: it is not archived.
+        RecordingError: the archive is damaged, missing, or another's; nothing changes.
+        StorageError: the recording cannot be written.
+    """
+    with owned(run, archived=True) as current:
+        if current.status != "archived":
+            raise RunnerError(f"run {run.run_id} is not archived: its recording is {current.recording}.")
+        fresh = current.recording.with_suffix(".restoring")
+        with _archive_of(current) as folder:
+            _restore(folder, fresh, current.archive.get("digest"), report)
+        fresh.replace(current.recording)
+        facts = {key: value for key, value in current.facts.items() if key != "archive"}
+        return Run(current.folder, facts).update()
+
+
+def restore_place(place: str, recordings: Path, report: Report = lambda _: None) -> Run:
+    """Bring a run back from an archive alone, as a run of the same id in a recordings folder.
+
+    Args:
+        place: path or URL of the archive.
+        recordings: the folder of runs.
+        report: called with the steps done so far.
+
+    Raises:
+        RunnerError: there is a run of that id.
+        RecordingError: there is no archive, or it is damaged.
+        StorageError: the run cannot be written.
+    """
+    to, run_id = split_place(place)
+    target = target_of(to)
+    manifest = target.manifest(run_id)
+    if manifest is None:
+        raise no_archive(place)
+    if manifest.run_id != run_id:
+        raise RecordingError(f"{place}: found an archive of run {manifest.run_id}, expected {run_id}.")
+    known = run_at_once(run_id, recordings)
+    if known is not None and known.status == "archived":
+        return restore_run(known, report)
+    folder = recordings / run_id
+    try:
+        recordings.mkdir(parents=True, exist_ok=True)
+        folder.mkdir()
+    except FileExistsError as error:
+        raise RunnerError(f"{folder}: found a run of that id, expected none; it is left as it is.") from error
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
+    try:
+        with target.reading(run_id) as archive:
+            _restore(archive, folder / RECORDING_FILE, manifest.digest, report)
+        with open_recording(folder / RECORDING_FILE) as recording:
+            facts = recording.run_facts()
+            facts["summary"] |= {"bytes": recording.size}
+        return Run(folder, facts).update()
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def at_hand(run: Run, tell: Tell = lambda _: None, report: Report = lambda _: None) -> Run:
+    """Return the run with its recording to be read: if it is archived, restored into the user's cache.
+
+    Args:
+        run: any run.
+        tell: called with a line when it must be restored, which takes seconds.
+        report: called with the steps restored so far.
+
+    Raises:
+        RecordingError: the archive is damaged, missing, or another's.
+        StorageError: the cache cannot be written, or another process has been restoring it for too long.
+    """
+    if run.status != "archived" or run.restored:
+        return run
+    digest = str(run.archive.get("digest", ""))
+    if len(digest) != 64 or not digest.isalnum():
+        raise RecordingError(f"{run.folder / RUN_FILE}: found archive digest {digest!r}, expected a BLAKE3.")
+    kept = cache_folder() / "restored" / f"{run.run_id}-{digest[:16]}.mcap"
+    try:
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(kept.with_suffix(".lock"), timeout=LOCK_SECONDS):
+            if not kept.is_file():
+                tell(f"Run {run.run_id} is archived; restoring it from {run.archive.get('place')}.")
+                _restore_kept(run, kept, digest, report)
+            kept.touch()
+    except Timeout as error:
+        raise StorageError(
+            f"{kept}: another process has been restoring it for {LOCK_SECONDS:.0f} s."
+        ) from error
+    except OSError as error:
+        raise StorageError(
+            f"{kept}: cannot be written ({error.strerror}); set {CACHE_VARIABLE} to another folder."
+        ) from error
+    return replace(run, restored=kept)
+
+
+def _restore_kept(run: Run, kept: Path, digest: str, report: Report) -> None:
+    """Restore a run into the cache, and make room there."""
+    others = sorted(kept.parent.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
+    for old in others[KEPT - 1 :]:
+        old.unlink(missing_ok=True)
+    fresh = kept.with_suffix(".restoring")
+    with _archive_of(run) as folder:
+        _restore(folder, fresh, digest, report)
+    fresh.replace(kept)
+
+
+def _restore(folder: Path, path: Path, digest: Any, report: Report) -> None:
+    """Restore an archive that must have a digest."""
+    path.unlink(missing_ok=True)
+    manifest = restore(folder, path, report)
+    if manifest.digest != digest:
+        path.unlink(missing_ok=True)
+        raise RecordingError(f"{folder}: found an archive of digest {manifest.digest}, expected {digest}.")
+
+
+@contextlib.contextmanager
+def _archive_of(run: Run) -> Iterator[Path]:
+    """Give the archive of a run: where it was put, or beside the recordings if they moved together."""
+    said = str(run.archive.get("place", ""))
+    beside = f"{default_target(run.folder.absolute().parent)}/{run.run_id}"
+    for place in dict.fromkeys((said, beside)):
+        to, run_id = split_place(place)
+        if run_id != run.run_id:
+            continue
+        target = target_of(to)
+        if target.manifest(run_id) is not None:
+            with target.reading(run_id) as folder:
+                yield folder
+            return
+    raise RecordingError(
+        f"run {run.run_id}: found no archive at {said} or {beside}; its recording was put into it. Mount or "
+        f"copy it there, or set {ARCHIVE_VARIABLE} to the folder that has it."
+    )

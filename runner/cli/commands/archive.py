@@ -1,0 +1,96 @@
+"""`dualtaxi archive`: runs as Parquet in a folder or in object storage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli.options import RunName, find, json_option, recordings_option
+from runner.cli.output import draw, facts, print_json, say, size
+
+if TYPE_CHECKING:
+    from runner.archive.runs import Archived
+
+
+@click.command("archive")
+@click.argument("run_names", metavar="RUN...", nargs=-1, required=True, type=RunName())
+@click.option(
+    "--to",
+    metavar="DIR|URL",
+    help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` beside the recordings]",
+)
+@click.option(
+    "--remove", is_flag=True, help="Remove the recordings, each when its archive gave the same back."
+)
+@click.option("--dry-run", is_flag=True, help="Pack and tell the sizes, but keep and change nothing.")
+@recordings_option
+@json_option
+def command(
+    run_names: tuple[str, ...],
+    to: str | None,
+    remove: bool,
+    dry_run: bool,
+    recordings: Path | None,
+    as_json: bool,
+) -> None:
+    """Put runs into an archive, losslessly: Parquet, which DuckDB, pandas and Polars read (docs/archive.md).
+
+    A run takes a tenth of the room there. Where its recording is removed, it is still listed, and every
+    command that looks at it restores it when it needs it; `dualtaxi restore` brings the recording back.
+
+    \b
+    Examples:
+      dualtaxi archive @latest
+      dualtaxi archive k3v9m2xq p7 --to /mnt/archive --remove
+      dualtaxi archive tutorial_cooperative --to s3://lab/runs --remove
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.archive.runs import archive_run, default_target
+    from runner.cli.progress import steps_line
+    from runner.cli.working import announcing
+    from runner.runs import recordings_folder
+
+    target = to or default_target(recordings_folder(recordings))
+    for run in [find(name, recordings) for name in dict.fromkeys(run_names)]:
+        with announcing(), steps_line(f"archiving {run.run_id}") as report:
+            done = archive_run(run, target, remove, report, dry_run)
+        if as_json:
+            print_json(_as_json(done, dry_run), indent=None)
+        else:
+            draw(facts(_in_words(done)))
+            if dry_run:
+                say("Nothing was kept: a dry run.")
+
+
+def _as_json(done: Archived, dry_run: bool) -> dict[str, Any]:
+    return {
+        "run_id": done.run.run_id,
+        "name": done.run.name,
+        "place": done.place,
+        "content_digest": done.manifest.digest,
+        "steps": _steps(done),
+        "bytes": done.manifest.size,
+        "recording_bytes": done.recording_bytes,
+        "new": done.new,
+        "removed": done.removed,
+        "dry_run": dry_run,
+    }
+
+
+def _in_words(done: Archived) -> dict[str, str]:
+    steps = _steps(done)
+    each = f", {done.manifest.size / steps:.2f} bytes a step" if steps else ""
+    kept = "removed" if done.removed else "kept"
+    state = "" if done.new else "  (it was there already, and is whole)"
+    return {
+        "run": f"{done.run.run_id}  {done.run.name}, seed {done.run.seed}",
+        "archive": done.place + state,
+        "size": f"{size(done.manifest.size)}{each}; the recording: {size(done.recording_bytes)}, {kept}",
+        "digest": done.manifest.digest,
+    }
+
+
+def _steps(done: Archived) -> int:
+    topics = done.manifest.topics
+    return sum(topics[name].size for name in ("/train/step", "/eval/step") if name in topics)
