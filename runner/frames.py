@@ -250,8 +250,17 @@ def _opened(run: Source) -> Iterator[Recording]:
     if isinstance(run, Recording):
         yield run
         return
-    with open_recording(run.recording if isinstance(run, Run) else Path(run)) as recording:
+    with open_recording(_at_hand(run).recording if isinstance(run, Run) else Path(run)) as recording:
         yield recording
+
+
+def _at_hand(run: Run) -> Run:
+    """Return a run whose recording can be read, also if it is in an archive alone."""
+    if run.status != "archived":
+        return run
+    from runner.archive.places import at_hand
+
+    return at_hand(run)
 
 
 def _frame(data: Any) -> pd.DataFrame:

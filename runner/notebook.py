@@ -53,9 +53,10 @@ def report(*runs: Run, height: int = HEIGHT) -> Shown:
         MissingExtra: Jinja2 or Matplotlib is not installed.
         RecordingError: a recording cannot be read.
     """
+    from runner.archive.places import at_hand
     from runner.export.report import render_report
 
-    page, _ = render_report([run.recording for run in runs])
+    page, _ = render_report([at_hand(run).recording for run in runs])
     title = ", ".join(f"{run.name}, run {run.run_id}" for run in runs)
     return Shown(
         f'<iframe title="{escape(title)}" srcdoc="{escape(page)}" width="100%" height="{height}" '
@@ -71,13 +72,14 @@ def plot(*runs: Run) -> Shown:
         RecordingError: a recording cannot be read.
     """
     from runner.analysis.series import groups_of, read_series
+    from runner.archive.places import at_hand
     from runner.export.plots import panels_of
     from runner.export.plots_figure import draw_figure
     from runner.recording.reader import open_recording
 
     series = []
     for run in runs:
-        with open_recording(run.recording) as recording:
+        with open_recording(at_hand(run).recording) as recording:
             series.append(read_series(recording))
     groups = groups_of(series)
     buffer = io.StringIO()

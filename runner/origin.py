@@ -11,6 +11,7 @@ from typing import Any
 
 from runner import runs
 from runner.analysis.tables import tables_at
+from runner.archive.places import at_hand
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.model import RunTable
 from runner.errors import RunnerError
@@ -49,7 +50,7 @@ def settled(config: ExperimentConfig, recordings: Path, but: str = "") -> Experi
         return config
     source, step = runs.find_run(start.run, recordings, but), start.step
     if step is None:
-        with open_recording(source.recording) as recording:
+        with open_recording(at_hand(source).recording) as recording:
             step = _last_step(recording)
     return from_mapping(
         config.to_mapping() | {"initial_q": {"run": address(source, recordings), "step": step}}
@@ -60,7 +61,7 @@ def address(run: Run, recordings: Path) -> str:
     """Return what a run is found by, from a recordings folder: its id, or its path if it is elsewhere."""
     inside = run.folder.parent.resolve() == recordings.resolve()
     return (
-        run.run_id if inside and run.recording.name == runs.RECORDING_FILE else str(run.recording.resolve())
+        run.run_id if inside and not run.stands_alone else str(run.recording.resolve())
     )
 
 
@@ -74,7 +75,7 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
     if not isinstance(start, RunTable):
         return None
     source = runs.find_run(start.run, run.folder.parent, but=run.run_id)
-    with open_recording(source.recording) as recording:
+    with open_recording(at_hand(source).recording) as recording:
         tables = tables_at(recording, _last_step(recording) if start.step is None else start.step)
     joint = job.config.tables == "joint"
     shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]

@@ -77,8 +77,7 @@ class Run:
     @cached_property
     def labels(self) -> Labels:
         """What people say of it, read when first asked."""
-        stands_alone = self.recording.name != RECORDING_FILE
-        return Labels() if stands_alone else read_labels(self.folder)
+        return Labels() if self.stands_alone else read_labels(self.folder)
 
     @property
     def seed(self) -> int:
@@ -89,6 +88,11 @@ class Run:
     def recording(self) -> Path:
         """The MCAP file."""
         return self.restored or self.folder / Path(str(self.facts.get("recording", RECORDING_FILE))).name
+
+    @property
+    def stands_alone(self) -> bool:
+        """Whether it is a recording by itself, not one in a folder of its own."""
+        return str(self.facts.get("recording", RECORDING_FILE)) != RECORDING_FILE
 
     @property
     def created(self) -> datetime:
@@ -104,12 +108,12 @@ class Run:
     def status(self) -> str:
         """`running`, `finished`, `interrupted` or `failed`; a dead owner's run is interrupted.
 
-        `archived` if its recording is in an archive alone.
+        `archived` if its recording is in an archive alone, and not at hand.
         """
         said = str(self.facts["status"])
         if said == "running" and not lives(self.facts.get("owner", {}), self.folder / RUN_FILE):
             return "interrupted"
-        return "archived" if self.archive and (self.restored or not self.recording.exists()) else said
+        return "archived" if self.archive and not self.recording.exists() else said
 
     @property
     def archive(self) -> dict[str, Any]:
@@ -297,6 +301,11 @@ class Named(Protocol):
     @property
     def seed(self) -> int:
         """Its job's seed."""
+
+    @property
+    def stands_alone(self) -> bool:
+        """Whether it is a recording by itself, not one in a folder of its own."""
+        return str(self.facts.get("recording", RECORDING_FILE)) != RECORDING_FILE
 
     @property
     def created(self) -> datetime:

@@ -21,7 +21,8 @@ ORDER = """
     catalogue
     frames packing
     analysis
-    archive origin
+    archive
+    origin
     execution export
     verify
     resume
@@ -30,8 +31,8 @@ ORDER = """
     wrappers
     cli
 """
-SHOWN_BY = {("runs", "notebook")}
-"""A run shows itself in a notebook by a part that comes after it, imported when asked."""
+SHOWN_BY = {("runs", "notebook"), ("frames", "archive")}
+"""A run shows itself in a notebook, and its frames come out of an archive, by parts imported when asked."""
 RANK = {part: rank for rank, line in enumerate(ORDER.split("\n")) for part in line.split()}
 FILES = {
     "runner": sorted((ROOT / "runner").rglob("*.py")),

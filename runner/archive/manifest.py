@@ -58,8 +58,13 @@ class Manifest:
         return sum(entry.size for entry in self.files.values())
 
     def to_json(self) -> bytes:
-        """Return the manifest as it is written."""
-        return json.dumps(asdict(self), indent=1, sort_keys=True).encode() + b"\n"
+        """Return the manifest as it is written: with a seal, the BLAKE3 of the rest."""
+        said = asdict(self)
+        return _json(said | {"seal": blake3(_json(said)).hexdigest()})
+
+
+def _json(said: Mapping[str, Any]) -> bytes:
+    return json.dumps(said, indent=1, sort_keys=True).encode() + b"\n"
 
 
 def content_digest(topics: Mapping[str, str]) -> str:
@@ -88,6 +93,8 @@ def read_manifest(data: bytes, where: str) -> Manifest:
         _check(manifest)
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise RecordingError(f"{where}: is no manifest of an archive ({error}).") from error
+    if manifest.to_json() != data:
+        raise RecordingError(f"{where}: does not match its seal: it was changed, and the archive is damaged.")
     return manifest
 
 

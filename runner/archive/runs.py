@@ -1,38 +1,29 @@
-"""A run of the recordings folder in an archive: put there, brought back, or read where it is.
+"""A run of the recordings folder in an archive: put there, and brought back.
 
 What stays of an archived run is its folder with `run.json`, whose `archive` says where the recording is,
-and what people say of it. To be looked at, its recording is restored into the user's cache.
+and what people say of it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
-
-from filelock import FileLock, Timeout
+from typing import Any
 
 from runner.archive.manifest import Manifest
-from runner.archive.restoring import check, restore
-from runner.archive.targets import Target, no_archive, split_place, target_of
+from runner.archive.places import archive_of, restore_to
+from runner.archive.restoring import check
+from runner.archive.targets import Target, no_archive, split_place, target_of, temporary_folder
 from runner.archive.writing import write_archive
-from runner.cache import CACHE_VARIABLE, cache_folder
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.integrity import checked_survey, may_be_cut
 from runner.recording.reader import Recording, open_recording
 from runner.runs import RECORDING_FILE, RUN_FILE, Run, owned, run_at_once
 
-ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
-KEPT: Final = 8
-"""Restored recordings in the cache; the ones that were not looked at for longest are removed."""
-LOCK_SECONDS: Final = 600.0
-
 Report = Callable[[int], None]
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -49,11 +40,6 @@ class Archived:
     """Whether the recording was removed from the run's folder."""
     recording_bytes: int
     """Of the recording, when it was archived."""
-
-
-def default_target(recordings: Path) -> str:
-    """Return where archives are kept unless said: the variable says it, or `archive` beside the recordings."""
-    return os.environ.get(ARCHIVE_VARIABLE) or str(recordings.absolute().parent / "archive")
 
 
 def archive_run(
@@ -73,7 +59,7 @@ def archive_run(
         RecordingError: the recording is damaged.
         StorageError: the target cannot be written; then there is no archive.
     """
-    if not (run.folder / RUN_FILE).is_file() or run.facts.get("recording", RECORDING_FILE) != RECORDING_FILE:
+    if not (run.folder / RUN_FILE).is_file() or run.stands_alone:
         raise RunnerError(
             f"{run.recording}: found a recording that stands alone, expected a run in a folder."
         )
@@ -104,8 +90,8 @@ class _Archiving:
                 manifest = existing
             else:
                 raise RunnerError(
-                    f"{target.place(run.run_id)}: found an archive of another content ({existing.digest[:16]}…): "
-                    "of this run at another time. Remove it, or choose another --to."
+                    f"{target.place(run.run_id)}: found an archive of another content, made of this run at "
+                    f"another time ({existing.digest[:16]}…); remove it, or choose another --to."
                 )
         if dry_run:
             return Archived(run, target.place(run.run_id), manifest, existing is None, False, size)
@@ -118,17 +104,19 @@ class _Archiving:
         return Archived(run, target.place(run.run_id), manifest, existing is None, remove, size)
 
     def _write(self, recording: Recording, dry_run: bool) -> Manifest:
+        if dry_run:
+            with temporary_folder() as folder:
+                return write_archive(recording, folder, self._report)
         with self._target.writing(self._run.run_id) as folder:
             manifest = write_archive(recording, folder, self._report)
-            if not dry_run:
-                self._target.commit(self._run.run_id, folder)
-            return manifest
+            self._target.commit(self._run.run_id, folder)
+        return manifest
 
 
 def _stub(place: str, manifest: Manifest, recording_bytes: int) -> dict[str, Any]:
     """Return what a run's file says of its archive."""
     return {
-        "place": place,
+        "target": place,
         "digest": manifest.digest,
         "bytes": manifest.size,
         "recording_bytes": recording_bytes,
@@ -165,8 +153,8 @@ def restore_run(run: Run, report: Report = lambda _: None) -> Run:
         if current.status != "archived":
             raise RunnerError(f"run {run.run_id} is not archived: its recording is {current.recording}.")
         fresh = current.recording.with_suffix(".restoring")
-        with _archive_of(current) as folder:
-            _restore(folder, fresh, current.archive.get("digest"), report)
+        with archive_of(current) as folder:
+            restore_to(folder, fresh, current.archive.get("digest"), report)
         fresh.replace(current.recording)
         facts = {key: value for key, value in current.facts.items() if key != "archive"}
         return Run(current.folder, facts).update()
@@ -205,7 +193,7 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
         raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
     try:
         with target.reading(run_id) as archive:
-            _restore(archive, folder / RECORDING_FILE, manifest.digest, report)
+            restore_to(archive, folder / RECORDING_FILE, manifest.digest, report)
         with open_recording(folder / RECORDING_FILE) as recording:
             facts = recording.run_facts()
             facts["summary"] |= {"bytes": recording.size}
@@ -213,79 +201,3 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
-
-
-def at_hand(run: Run, tell: Tell = lambda _: None, report: Report = lambda _: None) -> Run:
-    """Return the run with its recording to be read: if it is archived, restored into the user's cache.
-
-    Args:
-        run: any run.
-        tell: called with a line when it must be restored, which takes seconds.
-        report: called with the steps restored so far.
-
-    Raises:
-        RecordingError: the archive is damaged, missing, or another's.
-        StorageError: the cache cannot be written, or another process has been restoring it for too long.
-    """
-    if run.status != "archived" or run.restored:
-        return run
-    digest = str(run.archive.get("digest", ""))
-    if len(digest) != 64 or not digest.isalnum():
-        raise RecordingError(f"{run.folder / RUN_FILE}: found archive digest {digest!r}, expected a BLAKE3.")
-    kept = cache_folder() / "restored" / f"{run.run_id}-{digest[:16]}.mcap"
-    try:
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(kept.with_suffix(".lock"), timeout=LOCK_SECONDS):
-            if not kept.is_file():
-                tell(f"Run {run.run_id} is archived; restoring it from {run.archive.get('place')}.")
-                _restore_kept(run, kept, digest, report)
-            kept.touch()
-    except Timeout as error:
-        raise StorageError(
-            f"{kept}: another process has been restoring it for {LOCK_SECONDS:.0f} s."
-        ) from error
-    except OSError as error:
-        raise StorageError(
-            f"{kept}: cannot be written ({error.strerror}); set {CACHE_VARIABLE} to another folder."
-        ) from error
-    return replace(run, restored=kept)
-
-
-def _restore_kept(run: Run, kept: Path, digest: str, report: Report) -> None:
-    """Restore a run into the cache, and make room there."""
-    others = sorted(kept.parent.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
-    for old in others[KEPT - 1 :]:
-        old.unlink(missing_ok=True)
-    fresh = kept.with_suffix(".restoring")
-    with _archive_of(run) as folder:
-        _restore(folder, fresh, digest, report)
-    fresh.replace(kept)
-
-
-def _restore(folder: Path, path: Path, digest: Any, report: Report) -> None:
-    """Restore an archive that must have a digest."""
-    path.unlink(missing_ok=True)
-    manifest = restore(folder, path, report)
-    if manifest.digest != digest:
-        path.unlink(missing_ok=True)
-        raise RecordingError(f"{folder}: found an archive of digest {manifest.digest}, expected {digest}.")
-
-
-@contextlib.contextmanager
-def _archive_of(run: Run) -> Iterator[Path]:
-    """Give the archive of a run: where it was put, or beside the recordings if they moved together."""
-    said = str(run.archive.get("place", ""))
-    beside = f"{default_target(run.folder.absolute().parent)}/{run.run_id}"
-    for place in dict.fromkeys((said, beside)):
-        to, run_id = split_place(place)
-        if run_id != run.run_id:
-            continue
-        target = target_of(to)
-        if target.manifest(run_id) is not None:
-            with target.reading(run_id) as folder:
-                yield folder
-            return
-    raise RecordingError(
-        f"run {run.run_id}: found no archive at {said} or {beside}; its recording was put into it. Mount or "
-        f"copy it there, or set {ARCHIVE_VARIABLE} to the folder that has it."
-    )

@@ -139,8 +139,8 @@ class FolderTarget:
             yield
         except OSError as error:
             raise StorageError(
-                f"{self._root}: cannot be written ({error.strerror or error}); no archive was made. Free some "
-                "disk, or choose another folder by --to."
+                f"{self._root}: cannot be written ({error.strerror or error}); no archive was made. "
+                "Free some disk, or choose another folder by --to."
             ) from error
 
 

@@ -93,3 +93,20 @@ def find(name: str, recordings: Path | None) -> Any:
     from runner.runs import recordings_folder
 
     return find_run(name, recordings_folder(recordings), say)
+
+
+def find_recorded(name: str, recordings: Path | None) -> Any:
+    """Return the run of a name with its recording at hand: restored into the cache if it is archived."""
+    return recorded(find(name, recordings))
+
+
+def recorded(run: Any) -> Any:
+    """Return a run with its recording at hand: restored into the cache if it is archived, and said so."""
+    if run.status != "archived":
+        return run
+    from runner.archive.places import at_hand
+    from runner.cli.output import say
+    from runner.cli.progress import steps_line
+
+    with steps_line(f"restoring {run.run_id}") as report:
+        return at_hand(run, say, report)

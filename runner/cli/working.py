@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runner.cli.options import find
+from runner.cli.options import find_recorded
 from runner.cli.output import UNKNOWN, duration, say, size
 from runner.errors import RecordingError, RunnerError, RunNotFound
 from runner.runs import RECORDING_FILE, RUN_FILE, recordings_folder
@@ -27,7 +27,7 @@ def recording_of(name: str, recordings: Path | None) -> tuple[Path, Run | None]:
         RunnerError: there is neither.
     """
     try:
-        run = find(name, recordings)
+        run = find_recorded(name, recordings)
         in_folder = run.recording.name == RECORDING_FILE and (run.folder / RUN_FILE).is_file()
         return run.recording, run if in_folder else None
     except (RunNotFound, RecordingError):

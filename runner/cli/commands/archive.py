@@ -46,7 +46,8 @@ def command(
       dualtaxi archive k3v9m2xq p7 --to /mnt/archive --remove
       dualtaxi archive tutorial_cooperative --to s3://lab/runs --remove
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.archive.runs import archive_run, default_target
+    from runner.archive.places import default_target
+    from runner.archive.runs import archive_run
     from runner.cli.progress import steps_line
     from runner.cli.working import announcing
     from runner.runs import recordings_folder

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.options import RunName, json_option, recordings_option
+from runner.cli.options import RunName, json_option, recorded, recordings_option
 from runner.cli.output import print_json, say
 from runner.cli.sections import print_sections, require_page
 from runner.errors import RunnerError
@@ -125,7 +125,7 @@ def _read(names: tuple[str, ...], recordings: Path | None) -> list[RunSeries]:
     from runner.runs import recordings_folder
 
     found = []
-    for run in find_runs(names, recordings_folder(recordings)):
+    for run in map(recorded, find_runs(names, recordings_folder(recordings))):
         with open_recording(run.recording) as recording:
             found.append(read_series(recording))
     return found

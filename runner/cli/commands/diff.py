@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli.options import RunName, find, json_option, recordings_option
+from runner.cli.options import RunName, find_recorded, json_option, recordings_option
 from runner.cli.output import print_json, size
 from runner.cli.sections import print_sections, require_page
 from runner.errors import RunnerError
@@ -68,7 +68,7 @@ def command(
     levels = dict(_level(target) for target in targets)
     if html is not None:
         require_page(html, force)
-    left, right = find(a, recordings), find(b, recordings)
+    left, right = find_recorded(a, recordings), find_recorded(b, recordings)
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
         difference = _without(diff(recording_a, recording_b, levels, first), ignore)
         if html is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import INTERRUPTED
-from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, print_json, say
 from runner.cli.working import at_work, run_as_json, run_in_words
 
@@ -73,7 +73,7 @@ def command(
     from runner.again import evaluate
     from runner.runs import recordings_folder
 
-    source, folder = find(run_name, recordings), recordings_folder(recordings)
+    source, folder = find_recorded(run_name, recordings), recordings_folder(recordings)
     count = None if every_start else trials or TRIALS
     with at_work("", 0) as (report, interrupt):
         run = evaluate(

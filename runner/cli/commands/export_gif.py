@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.options import find_recorded, recordings_option, run_argument
 from runner.cli.output import say, size
 
 
@@ -92,7 +92,7 @@ def command(
 
     require_packages()
     said: list[int] = []
-    with open_recording(find(run_name, recordings).recording) as recording:
+    with open_recording(find_recorded(run_name, recordings).recording) as recording:
         if episode is None and chosen is None and last_whole_evaluation(recording) is None:
             episode = last_episode(recording)
             say(f"There is no whole evaluation: this is the last training episode, {episode:,}.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.options import find_recorded, recordings_option, run_argument
 from runner.cli.output import duration, say, size
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def command(
     from runner.export.rerun.writing import Source, export
 
     started = time.monotonic()
-    run = find(run_name, recordings)
+    run = find_recorded(run_name, recordings)
     path = output or Path(f"{run.name}-{run.run_id}.rrd")
     if path.exists() and not force:
         raise StorageError(f"{path}: exists already; choose another file by -o, or replace it by --force.")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, say, size
 
 
@@ -40,7 +40,7 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     from runner.packing.packing import pack
 
-    packed = pack(find(run_name, recordings), output, anonymous, force)
+    packed = pack(find_recorded(run_name, recordings), output, anonymous, force)
     manifest, path = packed.manifest, packed.path
     for note in packed.notes:
         say(note)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
 from runner.cli.output import print_json
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def command(
     from runner.cli.episode import Episode
     from runner.recording.reader import open_recording
 
-    run = find(run_name, recordings)
+    run = find_recorded(run_name, recordings)
     with open_recording(run.recording) as recording:
         _require_steps(recording)
         phase, number, title = _chosen(recording, episode, trial)

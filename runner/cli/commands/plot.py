@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import RunName, recordings_option
+from runner.cli.options import RunName, recorded, recordings_option
 from runner.cli.output import say
 
 
@@ -44,7 +44,7 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     check_suffix(output)
     matplotlib_of("a plot")
     series = []
-    for run in find_runs(run_names, recordings_folder(recordings)):
+    for run in map(recorded, find_runs(run_names, recordings_folder(recordings))):
         with open_recording(run.recording) as recording:
             series.append(read_series(recording))
             if state_of(recording) != "finished":

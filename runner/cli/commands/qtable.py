@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
 from runner.cli.output import UNKNOWN, draw, facts, number, print_json, say, table, title
 from runner.errors import RunnerError, StorageError
 
@@ -59,7 +59,7 @@ def command(
     from runner.analysis.tables import TableReplay, last_step, step_of_episode
     from runner.recording.reader import open_recording
 
-    with open_recording(find(run_name, recordings).recording) as recording:
+    with open_recording(find_recorded(run_name, recordings).recording) as recording:
         if episode is not None:
             step = step_of_episode(recording, episode)
         replay = TableReplay(recording, last_step(recording) if step is None else step)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import RunName, recordings_option
+from runner.cli.options import RunName, recorded, recordings_option
 from runner.cli.output import say, size
 
 
@@ -65,7 +65,7 @@ def command(
     require_packages()
     chosen = [("train", number, 0) for number in episodes]
     chosen += [("eval", *parse_trial(text)) for text in trials]
-    paths = [run.recording for run in find_runs(run_names, recordings_folder(recordings))]
+    paths = [run.recording for run in map(recorded, find_runs(run_names, recordings_folder(recordings)))]
     said: list[str] = []
     write_new(output, force, lambda path: said.extend(write_report(path, paths, chosen)))
     for sentence in said:

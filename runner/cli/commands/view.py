@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli.commands.export_rerun import choice_options, request_of, tell
-from runner.cli.options import RunName, find, recordings_option
+from runner.cli.options import RunName, find_recorded, recordings_option
 from runner.cli.output import say
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ def command(
     from runner.export.rerun.cache import exported
     from runner.export.rerun.spots import with_spot
 
-    runs = [find(name, recordings) for name in run_names]
+    runs = [find_recorded(name, recordings) for name in run_names]
     request = request_of(episodes, evaluations, every, everything)
     parting = None if len(runs) == 1 or spot is not None else _parting(runs)
     place = with_spot(runs[0], request, spot or parting)

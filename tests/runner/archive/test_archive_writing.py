@@ -17,19 +17,6 @@ from tests.runner.altering import altered
 from tests.runner.recording.making import TAXIS, make_run
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("recordings"), TAXIS, mode="cooperative")
-
-
-@pytest.fixture(scope="module")
-def archive(run, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("archive")
-    with open_recording(run.recording) as recording:
-        write_archive(recording, folder)
-    return folder
-
-
 def test_the_manifest_states_the_runs_digest_and_each_files_hash(run, archive):
     manifest = read_manifest((archive / layout.MANIFEST).read_bytes(), "here")
     assert manifest.digest == manifest.run["content_digest"] == run.summary["content_digest"]

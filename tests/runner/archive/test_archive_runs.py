@@ -1,0 +1,225 @@
+"""Runs put into an archive and brought back, by the commands, as a user does it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+from click.testing import CliRunner
+
+from runner.archive import layout, writing
+from runner.archive.manifest import Entry, Manifest
+from runner.cli import cli
+from runner.recording import open as open_recording
+from runner.recording import schema
+from runner.runs import create_run, find_run, list_runs
+from tests.runner.recording.making import TAXIS, experiment
+
+
+@pytest.fixture
+def recordings(run, tmp_path):
+    """Return a recordings folder of the test's own, with the run."""
+    return shutil.copytree(run.folder.parent, tmp_path / "recordings")
+
+
+@pytest.fixture
+def command(recordings):
+    def call(*words):
+        env = {"DUALTAXI_RECORDINGS": str(recordings), "DUALTAXI_ARCHIVE": "", "NO_COLOR": "1"}
+        return CliRunner().invoke(cli, [str(word) for word in words], env=env)
+
+    return call
+
+
+def done(result):
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def test_archived_and_removed_a_run_is_listed_and_restored_the_same(run, recordings, command):
+    before = run.recording.stat().st_size
+    told = json.loads(done(command("archive", run.run_id, "--remove", "--json")))
+    place = recordings.parent / "archive" / run.run_id
+    assert told["place"] == str(place)
+    assert told["content_digest"] == run.summary["content_digest"]
+    assert told["bytes"] == sum(
+        p.stat().st_size for p in place.rglob("*") if p.name != layout.MANIFEST and p.is_file()
+    )
+    assert told["bytes"] < before
+    left = find_run(run.run_id, recordings)
+    assert left.status == "archived"
+    assert not left.recording.exists()
+    assert [row["status"] for row in json.loads(done(command("ls", "--json")))] == ["archived"]
+
+    done(command("restore", run.run_id))
+    back = find_run(run.run_id, recordings)
+    assert back.status == "finished"
+    assert back.archive == {}
+    assert (place / layout.MANIFEST).exists()
+    assert command("verify", run.run_id).exit_code == 0
+    assert command("diff", run.run_id, run.recording).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("show", "RUN"),
+        ("qtable", "RUN", "--state", "3"),
+        ("verify", "RUN"),
+        ("diff", "RUN", "OTHER"),
+        ("report", "RUN", "-o", "DIR/page.html"),
+        ("plot", "RUN", "-o", "DIR/plot.svg"),
+        ("play", "RUN", "--episode", "1"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_looks_at_a_run_looks_at_an_archived_one(words, run, command, tmp_path):
+    names = {"RUN": run.run_id, "OTHER": str(run.recording), "DIR": str(tmp_path)}
+
+    def filled(word):
+        for name, value in names.items():
+            word = word.replace(name, value)
+        return word
+
+    done(command("archive", run.run_id, "--remove"))
+    first = command(*map(filled, words))
+    assert first.exit_code == 0, first.output
+    assert f"Run {run.run_id} is archived; restoring it from" in first.stderr
+    if words[0] in ("report", "plot"):
+        return
+    again = command(*map(filled, words))
+    assert again.exit_code == 0
+    assert "restoring" not in again.stderr
+    assert again.stdout == first.stdout
+
+
+def test_a_dry_run_tells_the_sizes_and_leaves_everything(run, recordings, command):
+    told = json.loads(done(command("archive", run.run_id, "--dry-run", "--remove", "--json")))
+    assert told["bytes"] > 0
+    assert not told["removed"]
+    assert not (recordings.parent / "archive").exists()
+    assert find_run(run.run_id, recordings).facts == run.facts
+
+
+def test_an_archive_that_is_there_is_looked_at_again_not_written(run, command):
+    done(command("archive", run.run_id))
+    told = json.loads(done(command("archive", run.run_id, "--remove", "--json")))
+    assert not told["new"]
+    assert told["removed"]
+
+
+def test_nothing_is_removed_for_an_archive_that_is_damaged(run, recordings, command):
+    done(command("archive", run.run_id))
+    path = recordings.parent / "archive" / run.run_id / layout.STEPS
+    data = bytearray(path.read_bytes())
+    data[1000] ^= 1
+    path.write_bytes(data)
+    result = command("archive", run.run_id, "--remove")
+    assert result.exit_code == 2
+    assert "steps.parquet" in result.output
+    assert find_run(run.run_id, recordings).recording.exists()
+
+
+def test_a_run_comes_back_from_its_archive_alone(run, recordings, command, tmp_path):
+    done(command("archive", run.run_id, "--to", tmp_path / "elsewhere"))
+    shutil.rmtree(recordings)
+    done(command("restore", tmp_path / "elsewhere" / run.run_id))
+    (back,) = list_runs(recordings)
+    assert (back.run_id, back.status) == (run.run_id, "finished")
+    assert back.summary["content_digest"] == run.summary["content_digest"]
+    again = command("restore", tmp_path / "elsewhere" / run.run_id)
+    assert again.exit_code == 2
+    assert "found a run of that id" in again.output
+
+
+def test_recordings_and_archive_may_move_together(run, recordings, command, tmp_path):
+    done(command("archive", run.run_id, "--remove"))
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    recordings.rename(moved / "recordings")
+    (tmp_path / "archive").rename(moved / "archive")
+    done(command("restore", run.run_id, "--recordings", moved / "recordings"))
+    shutil.rmtree(moved / "archive")
+    done(command("archive", run.run_id, "--remove", "--recordings", moved / "recordings"))
+    shutil.rmtree(moved / "archive")
+    lost = command("show", run.run_id, "--recordings", moved / "recordings")
+    assert lost.exit_code == 2
+    assert "found no archive at" in lost.output
+
+
+def test_a_running_run_and_an_archived_one_are_refused(run, recordings, command):
+    config = experiment(TAXIS)
+    running = create_run(recordings, config, 0)
+    result = command("archive", running.run_id)
+    assert result.exit_code == 2
+    assert "is running" in result.output
+    done(command("archive", run.run_id, "--remove"))
+    for words in (("archive", run.run_id), ("resume", run.run_id), ("rerecord", run.run_id)):
+        result = command(*words)
+        assert result.exit_code == 2
+        assert "is archived" in result.output
+    done(command("restore", run.run_id))
+    assert "is not archived" in command("restore", run.run_id).output
+
+
+def test_a_damaged_recording_is_refused_and_repair_is_named(run, recordings, command):
+    recording = recordings / run.run_id / "recording.mcap"
+    with open_recording(recording) as opened:
+        place = opened._entry(schema.TRAIN_STEP, 0).offset + 100
+    data = bytearray(recording.read_bytes())
+    data[place] ^= 255
+    recording.write_bytes(data)
+    result = command("archive", run.run_id)
+    assert result.exit_code == 2
+    assert f"`dualtaxi repair {run.run_id}`" in result.output
+    assert not (recordings.parent / "archive" / run.run_id).exists()
+
+
+def test_another_archive_of_the_same_id_is_left_alone(run, recordings, command):
+    done(command("archive", run.run_id))
+    facts = json.loads((recordings / run.run_id / "run.json").read_text())
+    place = recordings.parent / "archive" / run.run_id
+    said = json.loads((place / layout.MANIFEST).read_text())
+    other = Manifest({**said["run"], "content_digest": "0" * 64}, {"/log": Entry(1, "0" * 64)})
+    (place / layout.MANIFEST).write_bytes(other.to_json())
+    result = command("archive", run.run_id, "--remove")
+    assert result.exit_code == 2
+    assert "an archive of another content" in result.output
+    assert json.loads((recordings / run.run_id / "run.json").read_text()) == facts
+
+
+def test_a_target_that_cannot_be_written_leaves_nothing(run, recordings, command, tmp_path):
+    (tmp_path / "file").write_text("")
+    result = command("archive", run.run_id, "--to", tmp_path / "file", "--remove")
+    assert result.exit_code == 1
+    assert "cannot be written" in result.output
+    assert find_run(run.run_id, recordings).status == "finished"
+    result = command("archive", run.run_id, "--to", "ftp://host/there")
+    assert result.exit_code == 2
+    assert "expected a folder or s3://" in result.output
+
+
+def test_a_disk_that_fills_up_leaves_no_archive(run, recordings, command, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(writing.TableWriter, "close", full)
+    result = command("archive", run.run_id, "--remove")
+    assert result.exit_code == 1
+    assert "No space left on device" in result.output
+    assert list((recordings.parent / "archive").iterdir()) == []
+    assert find_run(run.run_id, recordings).status == "finished"
+
+
+def test_what_an_interrupted_archiving_left_is_no_archive_and_gives_way(run, recordings, command):
+    left = recordings.parent / "archive" / ".partial" / run.run_id
+    left.mkdir(parents=True)
+    (left / layout.STEPS).write_text("half")
+    half = recordings.parent / "archive" / run.run_id
+    half.mkdir()
+    (half / layout.STEPS).write_text("half")
+    assert command("restore", half).exit_code == 2
+    done(command("archive", run.run_id, "--remove"))
+    done(command("restore", run.run_id))
+    assert not left.exists()
