@@ -60,9 +60,7 @@ def settled(config: ExperimentConfig, recordings: Path, but: str = "") -> Experi
 def address(run: Run, recordings: Path) -> str:
     """Return what a run is found by, from a recordings folder: its id, or its path if it is elsewhere."""
     inside = run.folder.parent.resolve() == recordings.resolve()
-    return (
-        run.run_id if inside and not run.stands_alone else str(run.recording.resolve())
-    )
+    return run.run_id if inside and not run.stands_alone else str(run.recording.resolve())
 
 
 def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:

@@ -303,11 +303,6 @@ class Named(Protocol):
         """Its job's seed."""
 
     @property
-    def stands_alone(self) -> bool:
-        """Whether it is a recording by itself, not one in a folder of its own."""
-        return str(self.facts.get("recording", RECORDING_FILE)) != RECORDING_FILE
-
-    @property
     def created(self) -> datetime:
         """When it began."""
 

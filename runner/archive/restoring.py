@@ -30,6 +30,7 @@ from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 
 _ROWS_AT_ONCE: Final = 1024
+_MOST_STEPS: Final = 2**63 // STEP_NANOSECONDS
 _UNDER_WAY: Final = 8
 """Blocks on their way to the file: as many as the recorder has of a topic."""
 
@@ -162,7 +163,7 @@ class _Restoring:
 
     def _send_message(self, topic: Topic, position: int, payload: bytes) -> None:
         time = position * STEP_NANOSECONDS
-        if not 0 <= position <= schema.MAX_LOG_STEPS or len(payload) > MAX_CHUNK_BYTES - schema.HEADER_BYTES:
+        if not 0 <= position < _MOST_STEPS or len(payload) > MAX_CHUNK_BYTES - schema.HEADER_BYTES:
             raise RecordingError(
                 f"{self._where}: {topic.name}: found {len(payload):,} bytes after {position} steps."
             )
