@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.config.values import plain
 from runner.errors import EnvironmentNotUsable
 from runner.scene import is_text, is_whole, scene_mistake
 from runner.toy_text import grid_world
@@ -195,6 +194,8 @@ def mdp_of(env: Any, kwargs: Mapping[str, Any]) -> Mdp:
 
 def _read(env_id: str, kwargs: Mapping[str, Any], env: Any, rewards: str) -> Mdp:
     """Return what an environment tells of itself, not yet checked; a team shares the summed reward."""
+    from runner.config.values import plain  # reading a recording needs none of it
+
     base = env.unwrapped
     limit = env.spec.max_episode_steps if env.spec is not None else None
     transitions = _transitions(env_id, base)

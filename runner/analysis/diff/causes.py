@@ -294,6 +294,8 @@ def _reasons(a: Recording, b: Recording, records: list[np.void]) -> list[str]:
     if rewards[0] != rewards[1]:
         said.append(f"the reward was {_reward_text(rewards[0])} in A, {_reward_text(rewards[1])} in B")
     for name in ("step_size", "discount"):
+        if getattr(left, name) == getattr(right, name):
+            continue
         schedules = [compile_schedule(getattr(config, name)) for config in (left, right)]
         x, y = (float(schedule_value(schedule, episode, step)) for schedule in schedules)
         if x != y:

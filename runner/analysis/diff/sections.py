@@ -59,7 +59,7 @@ def in_short(difference: RunDiff) -> str:
     ]
     said = [f"{' and '.join(unfinished)} did not finish." if unfinished else "The content differs."]
     if settings:
-        told = "; ".join(f"{c.path} ({_text(c.a)} in A, {_text(c.b)} in B)" for c in settings[:MOST_NAMED])
+        told = "; ".join(f"{c.path} ({_set(c.a)} in A, {_set(c.b)} in B)" for c in settings[:MOST_NAMED])
         more = f"; and {len(settings) - MOST_NAMED} more" if len(settings) > MOST_NAMED else ""
         said.append(f"Of the settings, {told}{more} {'differ' if len(settings) > 1 else 'differs'}.")
     else:
@@ -146,6 +146,8 @@ def evaluation_told(difference: RunDiff, cause: Cause) -> list[str]:
     known = difference.cause
     if known is not None and known.update is not None and known.update == cause.update:
         return ["The tables came to differ by the same update as above."]
+    if cause.kind == "greedy_action" and cause.update is None and known is not None:
+        return ["Training had parted before, so the tables are not the same."]
     return updates_in_words(cause)
 
 
@@ -231,6 +233,10 @@ def _metrics(difference: RunDiff, everything: bool) -> Section:
     if crossings:
         grids.append(Grid(("first", "A", "B"), crossings))
     return Section("Metrics", grids=grids)
+
+
+def _set(value: Any) -> str:
+    return "not set" if value is None else str(value)
 
 
 def _text(value: Any) -> str:
