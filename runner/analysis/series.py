@@ -71,6 +71,10 @@ TITLES: Final = {
     "mean_length": ("Length of evaluation trials", "steps, mean"),
     "mean_penalties": ("Penalties in evaluation trials", "a trial, mean"),
     "mean_return": ("Return of evaluation trials", "summed reward, mean"),
+    "exact.finish_percent": ("Start states that succeed, exactly", "percent of start states"),
+    "exact.mean_length": ("Length of an episode, exactly", "steps, mean over start states"),
+    "exact.value": ("Value of the greedy policy", "discounted, mean"),
+    "exact.to_gain": ("To gain by a best response", "discounted, mean"),
     "training.mean_length": ("Length of training episodes", "steps, running mean"),
     "training.mean_return": ("Return of training episodes", "summed reward, mean"),
     "training.mean_reward": ("Reward in training", "a step, running mean"),
@@ -89,13 +93,18 @@ def read_series(recording: Recording) -> RunSeries:
     evaluations = evaluation_records(recording)
     training = [(record["episode"], _training(record)) for record in training_records(recording)]
     training += [(record["episode"], _training(record["training"])) for record in evaluations]
+    agents = agents_of(recording)
+    exact = {measures["evaluation"]: _exact(measures, agents) for measures in recording.optimality()}
     return RunSeries(
         run_id=recording.run["run_id"],
         name=recording.run["name"],
         seed=int(recording.run["seed"]),
         finished=recording.result.get("status") == "finished",
         config=recording.config,
-        evaluation=[(record["episode"], _evaluation(record)) for record in evaluations],
+        evaluation=[
+            (record["episode"], _evaluation(record) | exact.get(record["evaluation"], {}))
+            for record in evaluations
+        ],
         training=sorted(training, key=lambda entry: entry[0]),
     )
 
@@ -186,6 +195,20 @@ def _evaluation(record: Mapping[str, Any]) -> Readings:
         "mean_return": dict(record["mean_returns"]),
     }
     return known | means | events
+
+
+def _exact(measures: Mapping[str, Any], agents: Sequence[str]) -> Readings:
+    """Return exact measures beside the optimum's."""
+    readings = {
+        name: {"": measures[name], "optimum": measures[f"optimal_{name}"]}
+        for name in ("finish_percent", "mean_length")
+    }
+    readings["value"] = {"": sum(measures["values"]), "optimum": measures["optimal_value"]}
+    readings["to_gain"] = {
+        agent: best - own
+        for agent, own, best in zip(agents, measures["values"], measures["best_responses"], strict=True)
+    }
+    return {f"exact.{name}": lines for name, lines in readings.items()}
 
 
 def _training(side: Mapping[str, Any]) -> Readings:

@@ -16,6 +16,7 @@ from runner.export.plots import panels_of
 from runner.export.plots_figure import draw_figure, draw_panel
 from runner.frames import evaluation_records
 from runner.recording.reader import open_recording
+from tests.runner.recording.making import TAXIS, make_run
 
 
 def series(*runs):
@@ -134,3 +135,13 @@ def test_where_success_is_unknown_there_is_no_panel_of_it(pictured):
     metrics = {panel.metric for panel in panels_of(groups_of(series(pictured("stairs"))))}
     assert "finish_percent" not in metrics
     assert "mean_length" in metrics
+
+
+def test_exact_measures_are_drawn_beside_the_optimum(tmp_path):
+    run = make_run(tmp_path, TAXIS, evaluation={"every": 20, "trials": 3, "exact": True})
+    with open_recording(run.recording) as recording:
+        panels = {panel.metric: panel for panel in panels_of(groups_of([read_series(recording)]))}
+    assert panels["exact.value"].lines == ["", "optimum"]
+    policy, optimum = panels["exact.value"].curves
+    assert (policy.median <= optimum.median + 1e-9).all()
+    assert panels["exact.to_gain"].lines == ["taxi_1", "taxi_2"]
