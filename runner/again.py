@@ -17,11 +17,12 @@ from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import load_mdp
 from runner.origin import address
+from runner.owning import owned
 from runner.provenance import provenance
 from runner.recording.contents import survey
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
-from runner.runs import Run, owned, unless_empty
+from runner.runs import Run, unless_empty
 from runner.verify import initial_tables
 
 Start = int | Literal["random", "each"]

@@ -82,7 +82,9 @@ def run_job(
         file = _create(run.folder / runs.RECORDING_FILE)
     with file:
         with _failing(run):
-            describe(file, job, run, learner)
+            made_by = provenance()
+            describe(file, job, run, learner, made_by)
+            run = run.update(provenance={key: made_by[key] for key in runs.MADE_BY if key in made_by})
         recorder = recorder_for(job, learner, file, beat=run.beat)
         return execute(Session(job, learner, recorder, report, stop, observer), file, run, started)
 

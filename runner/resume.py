@@ -36,6 +36,7 @@ from runner.learning.learner import Learner
 from runner.mdp import Mdp, load_mdp
 from runner.origin import configured_tables, settle
 from runner.owner import owner
+from runner.owning import owned
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.contents import Contents
@@ -44,7 +45,7 @@ from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import storage_error
 from runner.recording.writer import RecordingFile
-from runner.runs import Run, owned
+from runner.runs import Run
 from runner.verify import differing_environment, differing_provenance, initial_tables
 
 DECISIVE: Final = (

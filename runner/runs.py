@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 from runner.documents import read_object, write_whole
-from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError, nearest
+from runner.errors import RecordingError, RunNotFound, StorageError, nearest
 from runner.labels import Labels, read_labels
 from runner.owner import lives, owner
 
@@ -31,9 +31,10 @@ if TYPE_CHECKING:  # listing runs is to be quick
     from runner.config import ExperimentConfig
 
 RUN_FILE: Final = "run.json"
-OWNER_LOCK: Final = "owner.lock"
 RECORDING_FILE: Final = "recording.mcap"
 MAX_RUN_FILE_BYTES: Final = 8 << 20
+MADE_BY: Final = ("host", "git", "dualtaxi")
+"""What `run.json` says of where and by what a run was made; its recording says it all."""
 RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"
 
 _ALPHABET: Final = "abcdefghjkmnpqrstvwxyz23456789"
@@ -249,44 +250,6 @@ def run_entries(recordings: Path) -> list[str]:
         raise StorageError(f"{recordings}: cannot be read as a folder of runs ({error.strerror}).") from error
 
 
-@contextlib.contextmanager
-def owned(run: Run, archived: bool = False) -> Iterator[Run]:
-    """Give a run as it is now, its folder kept from every other process that would write to it.
-
-    Args:
-        run: whose folder.
-        archived: whether it may be one whose recording is in an archive alone.
-
-    Raises:
-        RunnerError: it is running or archived, or another process has it in this way.
-        StorageError: the folder cannot be written.
-    """
-    from filelock import FileLock, Timeout
-
-    lock = FileLock(run.folder / OWNER_LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout as error:
-        raise RunnerError(f"run {run.run_id} is being worked on by another process; let it.") from error
-    except OSError as error:
-        raise StorageError(f"{run.folder}: cannot be written ({error.strerror}).") from error
-    try:
-        if run.facts.get("recording", RECORDING_FILE) == RECORDING_FILE:
-            run = find_run(os.fspath(run.folder.absolute()), run.folder.parent)
-        if run.status == "running":
-            owner = run.facts.get("owner", {})
-            raise RunnerError(
-                f"run {run.run_id} is running (process {owner.get('pid')} on {owner.get('host')}); let it."
-            )
-        if run.status == "archived" and not archived:
-            raise RunnerError(
-                f"run {run.run_id} is archived; `dualtaxi restore {run.run_id}` brings it back."
-            )
-        yield run
-    finally:
-        lock.release()
-
-
 class Named(Protocol):
     """What a run can be named by."""
 
@@ -421,6 +384,9 @@ def _from_recording(path: Path) -> Run:
 
     with open_recording(path) as recording:
         facts = {**recording.run_facts(), "recording": path.name}
+        with contextlib.suppress(RecordingError):
+            made_by = recording.provenance
+            facts["provenance"] = {key: made_by[key] for key in MADE_BY if key in made_by}
     if not _is_run(facts):
         raise RecordingError(f"{path}: is damaged: what it says of its run makes no sense.")
     return Run(path.parent, facts)

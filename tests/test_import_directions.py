@@ -18,6 +18,7 @@ ORDER = """
     mdp
     words learning planning recording observer
     provenance runs
+    owning
     catalogue
     frames packing
     analysis

@@ -19,9 +19,10 @@ from runner.archive.restoring import check
 from runner.archive.targets import Target, no_archive, split_place, target_of, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
+from runner.owning import owned
 from runner.recording.integrity import checked_survey, may_be_cut
 from runner.recording.reader import Recording, open_recording
-from runner.runs import RECORDING_FILE, RUN_FILE, Run, owned, run_at_once
+from runner.runs import RECORDING_FILE, RUN_FILE, Run, run_at_once
 
 Report = Callable[[int], None]
 

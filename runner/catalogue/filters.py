@@ -80,6 +80,8 @@ def parse(text: str, now: datetime | None = None) -> Filter:
         tree = parser.parse(text)
     except ParseError as error:
         raise _unparsed(text, str(error)) from None
+    except ArithmeticError:  # of a weight that is no number
+        raise RunnerError("filter: found '^' or '~' and no number; put such a text in quotes.") from None
     reading = _Reading(text, now or datetime.now(UTC))
     return Filter(reading.condition(tree), frozenset(reading.settings))
 

@@ -1,9 +1,9 @@
 """The index: one SQLite file in the user's cache, of every recordings folder that was looked at.
 
-It is brought up to date whenever it is asked: each run's files are looked at (their size and time), and
-read where they changed. It is made at one stroke and thrown away when it is damaged or of another version;
-where it cannot be used, the folders are looked at without it. It keeps a journal, not a write-ahead log:
-users' caches stand on network disks too, and a transaction here is short.
+Whenever it is asked, each run's files are looked at (size and time), and read where they changed; it
+answers in the transaction in which that is seen to. It is made at one stroke and thrown away when it is
+damaged or of another version; where it cannot be used, the folders are read without it. It keeps a journal,
+not a write-ahead log: users' caches stand on network disks too, and transactions are short.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import contextlib
 import os
 import secrets
 import time
+import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -32,24 +33,25 @@ Tell = Callable[[str], None]
 
 INDEX_FILE: Final = "catalogue.sqlite"
 _APPLICATION: Final = 0x44546178  # "DTax"
-_VERSION: Final = 1
-"""Of the columns in `rows` and what is put in them; another one is thrown away."""
+_VERSION: Final = zlib.crc32(",".join(["1", *Row._meta.sorted_field_names]).encode()) >> 1
+"""Of the columns, and of what is put in them (the number before them); another one is thrown away."""
 _BUSY_SECONDS: Final = 60
 _SETTLED_NS: Final = 2 * 10**9
 """Files that changed so recently may change again without a trace: they are read again next time."""
 _RUN_FILES: Final = (RUN_FILE, LABELS_FILE, RECORDING_FILE)
 
 
-@dataclass
-class Changes:
-    """What bringing the index up to date came upon."""
+@dataclass(frozen=True)
+class News:
+    """What is not yet in the index of a recordings folder."""
 
-    read: int = 0
-    """Folders that were read."""
-    gone: int = 0
+    root: str
+    changed: list[dict[str, Any]]
+    """The rows of the folders that are new, or not as they were."""
+    died: list[str]
+    """Runs whose process is no more, and could not say so."""
+    gone: list[str]
     """Folders that are no more."""
-    problems: list[str] = field(default_factory=list)
-    """Folders with files of a run of which nothing can be made."""
 
 
 class Index:
@@ -57,18 +59,41 @@ class Index:
 
     def __init__(self, database: SqliteDatabase, roots: Sequence[Path]) -> None:
         self._database = database
-        self.roots = [os.path.abspath(root) for root in roots]  # noqa: PTH100 - links stay what they are
-        self.changes = Changes()
+        absolute = (os.path.abspath(root) for root in roots)  # noqa: PTH100 - links stay what they are
+        self.roots = list(dict.fromkeys(absolute))
+        self.read: set[tuple[str, str]] = set()
+        """The folders that were read, as root and entry."""
+        self._found: dict[str, dict[str, Seen]] = {}
         database.register_function(matches, "matches", 2, deterministic=True)
 
-    def refresh(self) -> None:
-        """Read what changed in the folders since the index last saw them.
+    def news(self) -> list[News]:
+        """Return how the folders, as they were when first asked, differ from what is in the index now.
 
         Raises:
             StorageError: a recordings folder cannot be read.
         """
-        for root in dict.fromkeys(self.roots):
-            self._refresh(root)
+        if not self._found:
+            self._found = {root: dict(_scan(root)) for root in self.roots}
+        found = [self._news(root) for root in self._found]
+        return [news for news in found if news.changed or news.died or news.gone]
+
+    def write(self, found: Sequence[News]) -> None:
+        """Take in what was found; within a transaction."""
+        for news in found:
+            for rows in chunked(news.changed, 500):
+                Row.insert_many(rows).on_conflict_replace().execute(self._database)
+            here = Row.root == news.root
+            for entries in chunked(news.died, 500):
+                died = Row.update(status="interrupted").where(here & Row.entry.in_(entries))
+                died.execute(self._database)
+            for entries in chunked(news.gone, 500):
+                Row.delete().where(here & Row.entry.in_(entries)).execute(self._database)
+            self.read |= {(news.root, row["entry"]) for row in news.changed}
+
+    def problems(self) -> list[str]:
+        """Return what is wrong with the folders that have files of a run of which nothing can be made."""
+        wrong = Row.select(Row.problem).where(Row.root.in_(self.roots) & Row.problem.is_null(False))
+        return [problem for (problem,) in self._tuples(wrong.order_by(Row.root, Row.entry))]
 
     def forget(self) -> None:
         """Forget all about these folders, and about those that are no more."""
@@ -138,47 +163,28 @@ class Index:
         newest = self._of(Filter(None), Row.settings).order_by(Row.created.desc()).limit(200)
         return {path for (settings,) in self._tuples(newest) for path in json.loads(settings)}
 
-    def _refresh(self, root: str) -> None:
-        known = self._known(root)
-        found = dict(_scan(root))
+    def _news(self, root: str) -> News:
+        found, known = self._found[root], self._known(root)
         now = time.time_ns()
         changed = [
-            _read(root, entry, seen, now)
-            for entry, seen in found.items()
-            if known.get(entry, ("",))[0] != seen.fingerprint
+            entry for entry, seen in found.items() if self._changed(root, entry, seen, known.get(entry))
         ]
-        self.changes.read += len(changed)
-        died = [
-            entry
-            for entry, (mark, status) in known.items()
-            if status == "running" and self._died(root, entry, mark, found)
-        ]
-        gone = [entry for entry in known if entry not in found]
-        self.changes.gone += len(gone)
-        if changed or died or gone:
-            self._write(root, changed, died, gone)
-        problems = Row.select(Row.entry, Row.problem).where((Row.root == root) & Row.problem.is_null(False))
-        self.changes.problems += [problem for _, problem in self._tuples(problems.order_by(Row.entry))]
+        running = [entry for entry, (*_, status) in known.items() if status == "running" and entry in found]
+        return News(
+            root,
+            changed=[_read(root, entry, found[entry], now) for entry in changed],
+            died=[entry for entry in set(running) - set(changed) if not _runs(root, entry)],
+            gone=[entry for entry in known if entry not in found and _seen(root, entry) is None],
+        )
 
-    def _known(self, root: str) -> dict[str, tuple[str, str | None]]:
-        rows = Row.select(Row.entry, Row.fingerprint, Row.status).where(Row.root == root)
-        return {entry: (fingerprint, status) for entry, fingerprint, status in self._tuples(rows)}
+    def _changed(self, root: str, entry: str, seen: Seen, known: tuple[str, int, str | None] | None) -> bool:
+        if known is None or known[0] != seen.fingerprint:
+            return True
+        return not known[1] and (root, entry) not in self.read
 
-    def _died(self, root: str, entry: str, fingerprint: str, found: dict[str, Seen]) -> bool:
-        """Return whether a run that ran when last seen, and said nothing since, runs no more."""
-        if entry not in found or found[entry].fingerprint != fingerprint:
-            return False
-        return all(run.status != "running" for run in runs_in(Path(root, entry)))
-
-    def _write(self, root: str, changed: list[dict[str, Any]], died: list[str], gone: list[str]) -> None:
-        with self._database.atomic():
-            for rows in chunked(changed, 500):
-                Row.insert_many(rows).on_conflict_replace().execute(self._database)
-            for entries in chunked(died, 500):
-                ended = Row.update(status="interrupted").where((Row.root == root) & Row.entry.in_(entries))
-                ended.execute(self._database)
-            for entries in chunked(gone, 500):
-                Row.delete().where((Row.root == root) & Row.entry.in_(entries)).execute(self._database)
+    def _known(self, root: str) -> dict[str, tuple[str, int, str | None]]:
+        rows = Row.select(Row.entry, Row.fingerprint, Row.settled, Row.status).where(Row.root == root)
+        return {entry: (mark, settled, status) for entry, mark, settled, status in self._tuples(rows)}
 
     def _delete(self, condition: Any) -> None:
         Row.delete().where(condition).execute(self._database)
@@ -251,42 +257,57 @@ def index_path() -> Path:
 def _look(
     database: SqliteDatabase, roots: Sequence[Path], work: Callable[[Index], Found], anew: bool
 ) -> Found:
+    """Return what the work finds in the transaction in which the index was seen to agree with the folders."""
     index = Index(database, roots)
     if anew:
         index.forget()
-    index.refresh()
-    return work(index)
+    news = index.news()
+    if not news:
+        with database.atomic("DEFERRED"):
+            if not index.news():
+                return work(index)
+    with database.atomic("IMMEDIATE"):
+        index.write(news)
+        index.write(index.news())  # mostly nothing: what other processes did meanwhile
+        return work(index)
 
 
 def _scan(root: str) -> Iterator[tuple[str, Seen]]:
     """Yield the folders that have a run's files, by name."""
     for entry in run_entries(Path(root)):
-        marks, changed, size = [], 0, None
-        for name in _RUN_FILES:
-            try:
-                facts = os.stat(f"{root}{os.sep}{entry}{os.sep}{name}")  # noqa: PTH116 - Path takes thrice as long
-            except OSError:
-                marks.append("")
-                continue
-            marks.append(f"{facts.st_mtime_ns}.{facts.st_size}.{facts.st_ino}")
-            changed = max(changed, facts.st_mtime_ns)
-            size = facts.st_size if name == RECORDING_FILE else None
-        if (marks[0] or marks[2]) and entry.isprintable():
-            yield entry, Seen(" ".join(marks), changed, size)
+        seen = _seen(root, entry)
+        if seen is not None and entry.isprintable():
+            yield entry, seen
+
+
+def _seen(root: str, entry: str) -> Seen | None:
+    """Return how a folder looks from outside; None if it has no run's files."""
+    marks, changed, size = [], 0, None
+    for name in _RUN_FILES:
+        try:
+            facts = os.stat(f"{root}{os.sep}{entry}{os.sep}{name}")  # noqa: PTH116 - Path takes thrice as long
+        except OSError:
+            marks.append("")
+            continue
+        marks.append(f"{facts.st_mtime_ns}.{facts.st_size}.{facts.st_ino}")
+        changed = max(changed, facts.st_mtime_ns)
+        size = facts.st_size if name == RECORDING_FILE else None
+    return Seen(" ".join(marks), changed, size) if marks[0] or marks[2] else None
+
+
+def _runs(root: str, entry: str) -> bool:
+    return any(run.status == "running" for run in runs_in(Path(root, entry)))
 
 
 def _read(root: str, entry: str, seen: Seen, now: int) -> dict[str, Any]:
     """Return the row of a folder, read now."""
     folder = Path(root, entry)
     settled = seen.changed + _SETTLED_NS < now
-    place = {"root": root, "entry": entry, "fingerprint": seen.fingerprint if settled else ""}
+    place = {"root": root, "entry": entry, "fingerprint": seen.fingerprint, "settled": settled}
     for run in runs_in(folder):
         return _EMPTY | place | row_of(run, seen.size)
-    return (
-        _EMPTY
-        | place
-        | {"problem": f"{folder}: neither {RUN_FILE} nor {RECORDING_FILE} can be read as a run's."}
-    )
+    problem = f"{folder}: neither {RUN_FILE} nor {RECORDING_FILE} can be read as a run's."
+    return _EMPTY | place | {"problem": problem}
 
 
 _EMPTY: Final[dict[str, Any]] = dict.fromkeys(Row._meta.sorted_field_names)

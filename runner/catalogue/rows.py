@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-from peewee import BigIntegerField, CompositeKey, Field, FloatField, Model, TextField
+from peewee import BigIntegerField, BooleanField, CompositeKey, Field, FloatField, Model, TextField
 
 from runner.runs import Run
 
@@ -42,6 +42,8 @@ class Row(Model):
     """The run's folder in it."""
     fingerprint = TextField()
     """What tells whether its files changed."""
+    settled = BooleanField()
+    """Whether they had not changed just before; if they had, they may do so again without a trace."""
     problem = TextField(null=True)
 
     id = TextField(null=True)
@@ -81,7 +83,7 @@ class Row(Model):
         table_name = "runs"
         primary_key = CompositeKey("root", "entry")
         without_rowid = True
-        indexes = ((("root", "entry", "fingerprint", "status"), False), (("digest",), False))
+        indexes = ((("root", "entry", "fingerprint", "settled", "status"), False), (("digest",), False))
 
 
 def row_of(run: Run, size: int | None) -> dict[str, Any]:

@@ -13,7 +13,8 @@ from typing import Any, Final
 
 from runner.cache import EXPORTS, RESTORED, cache_folder
 from runner.labels import LABELS_FILE, LOCK_FILE
-from runner.runs import OWNER_LOCK, RECORDING_FILE, RUN_FILE
+from runner.owning import OWNER_LOCK
+from runner.runs import RECORDING_FILE, RUN_FILE
 
 REMOVED: Final = ".removed-"
 """What the folder of a run is called from the moment it is removed until its files are."""

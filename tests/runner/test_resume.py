@@ -20,12 +20,13 @@ from runner.config import from_mapping
 from runner.errors import Diverged, RunnerError, StorageError
 from runner.execution import run_job
 from runner.job import Job
+from runner.owning import owned
 from runner.recording import open as open_recording
 from runner.recording.contents import survey
 from runner.recording.repair import repair
 from runner.recording.schema import BLOCK_TOPICS, EVAL_STEP, TRAIN_STEP
 from runner.recording.writer import RecordingFile
-from runner.resume import owned, resume
+from runner.resume import resume
 from runner.runs import Run, create_run, find_run, list_runs
 from tests.runner.recording.making import SMALL_MAP, TAXIS, make_run
 

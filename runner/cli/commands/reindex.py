@@ -62,7 +62,7 @@ def _found(index: Index) -> _Found:
         runs=len(rows),
         copies=sum(row["same_as"] is not None for row in rows),
         statuses={status: statuses.count(status) for status in sorted(set(statuses))},
-        problems=index.changes.problems,
+        problems=index.problems(),
     )
 
 

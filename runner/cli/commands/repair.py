@@ -67,7 +67,7 @@ def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json:
 
 def _kept(run: Run | None) -> contextlib.AbstractContextManager[Any]:
     """Return a context in which no other process writes to the run."""
-    from runner.runs import owned
+    from runner.owning import owned
 
     return contextlib.nullcontext() if run is None else owned(run)
 
