@@ -21,7 +21,7 @@ REMOVED: Final = ".removed-"
 
 _OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, OWNER_LOCK))
 _LEFT_OVER: Final = re.compile(
-    r"recording\.(anew|repairing|rerecording)|recording\.damaged-\d+\.mcap|(run|labels)\.[0-9a-f]{8}\.tmp"
+    r"recording\.(anew|repairing|rerecording|restoring)|recording\.damaged-\d+\.mcap|(run|labels)\.[0-9a-f]{8}\.tmp"
 )
 _ID: Final = re.compile(r"\w+")
 
