@@ -276,8 +276,10 @@ class Session:
         return episode in (0, self._config.episodes) or bool(every and episode % every == 0)
 
     def _snapshot(self) -> None:
-        for i, agent in enumerate(self._learner.agents):
-            table = QTable(self._learner.step, self._learner.episode, agent, i, self._learner.table(i))
+        learner = self._learner
+        for number, values in enumerate(learner.snapshot()):
+            agent = learner.agents[number % len(learner.agents)]
+            table = QTable(learner.step, learner.episode, agent, number, values)
             self.recorder.message(schema.Q_TABLE_TOPIC, encode_q_table(table))
 
     def _log(self, text: str, level: str = "INFO") -> None:

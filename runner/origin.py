@@ -7,15 +7,15 @@ when the job is created: from then on the configuration says which run it is, an
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from runner import runs
-from runner.analysis.tables import tables_at
+from runner.analysis.tables import held_at
 from runner.archive.places import at_hand
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.model import RunTable
 from runner.errors import RunnerError
 from runner.job import Job
+from runner.learning.learner import Held
 from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
@@ -63,8 +63,8 @@ def address(run: Run, recordings: Path) -> str:
     return run.run_id if inside and not run.stands_alone else str(run.recording.resolve())
 
 
-def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
-    """Return the tables of the run that a settled job's `initial_q` names; None if it names none.
+def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
+    """Return what the learners of the run held that a settled job's `initial_q` names; None if it names none.
 
     Raises:
         RunnerError: there is no such run or step, or its tables have another shape.
@@ -74,13 +74,13 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
         return None
     source = runs.find_run(start.run, run.folder.parent, but=run.run_id)
     with open_recording(at_hand(source).recording) as recording:
-        tables = tables_at(recording, _last_step(recording) if start.step is None else start.step)
+        held = held_at(recording, _last_step(recording) if start.step is None else start.step)
     joint = job.config.tables == "joint"
     shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
-    if [table.shape for table in tables] != shapes:
-        found = [table.shape for table in tables]
+    found = [one["q"].shape for one in held]
+    if found != shapes:
         raise RunnerError(f"initial_q: run {source.run_id} has tables of shape {found}, expected {shapes}.")
-    return tables
+    return held
 
 
 def _last_step(recording: Recording) -> int:

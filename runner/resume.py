@@ -32,7 +32,7 @@ from runner.execution import (
     recorder_for,
 )
 from runner.job import Job
-from runner.learning.learner import Learner
+from runner.learning.learner import Held, Learner
 from runner.mdp import Mdp, load_mdp
 from runner.origin import configured_tables, settle
 from runner.owner import owner
@@ -184,7 +184,7 @@ def _proof(run: Run) -> str | None:
     return str(proof) if proof else None
 
 
-def _first_tables(job: Job, run: Run, mdp: Mdp) -> list[Any] | None:
+def _first_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
     """Return the tables that the run began with if it took them over from another; None if it did not."""
     if not isinstance(job.config.initial_q, RunTable):
         return None

@@ -19,12 +19,13 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
+from runner.analysis.tables import initially_held
 from runner.config import from_mapping
 from runner.config.model import RunTable
 from runner.errors import ConfigError, Diverged, RecordingError
 from runner.execution import Report, Session, recorder_for
 from runner.job import Job
-from runner.learning.learner import Learner
+from runner.learning.learner import Held, Learner
 from runner.mdp import Mdp, load_mdp
 from runner.provenance import provenance
 from runner.recording import schema
@@ -270,19 +271,14 @@ def _catching_up(recording: Recording, past: Past, counts: dict[str, int]) -> Ca
     return lambda: past.exhausted and all(counts[name] >= count for name, count in recorded.items())
 
 
-def initial_tables(recording: Recording) -> list[NDArray[np.float64]] | None:
-    """Return the tables that a run took over from another one, from its own first snapshots.
+def initial_tables(recording: Recording) -> list[Held] | None:
+    """Return what a run took over from another one, from its own first snapshots.
 
-    None if it took over none, or was cut off before them: its configuration says what it begins with.
+    None if it took over nothing, or was cut off before them: its configuration says what it begins with.
     """
     if not isinstance(from_mapping(recording.config).initial_q, RunTable):
         return None
-    tables: list[NDArray[np.float64]] = []
-    for snapshot in recording.snapshots():
-        if snapshot.step or snapshot.table != len(tables):
-            break
-        tables.append(snapshot.values)
-    return tables if len(tables) == int(recording.run["learners"]) else None
+    return initially_held(recording)
 
 
 def differing_provenance(recording: Recording) -> dict[str, tuple[str, str]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from runner.config import from_mapping
 from runner.errors import RecordingError
 from runner.learning import kernel
-from runner.learning.learner import Learner
+from runner.learning.learner import Held, Learner, held_of, kinds_of
 from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.messages import QTable
@@ -40,12 +40,13 @@ class TableReplay:
     def __init__(self, recording: Recording, step: int = 0) -> None:
         self._recording = recording
         self._recorded = recording.count(schema.TRAIN_STEP)
-        config = from_mapping(recording.config)
-        nearest = _snapshot_before(recording, step)
-        self._learner = Learner(config, recording.mdp, 0)
-        _check_shapes(recording, nearest, self.tables)
-        self._learner.set_tables([table.values for table in nearest])
-        self.step = nearest[0].step
+        self._learner = Learner(from_mapping(recording.config), recording.mdp, int(recording.run["seed"]))
+        nearest = _snapshot_before(recording, step, self._learner.kinds)
+        if nearest is None:
+            raise RecordingError(f"{recording.path}: has no Q-table at or before step {step}.")
+        self.step, held = nearest
+        _check_shapes(recording, held, self.held)
+        self._learner.set_held(held)
         """Training steps taken."""
         self.advance(step)
 
@@ -58,6 +59,11 @@ class TableReplay:
     def tables(self) -> list[NDArray[np.float64]]:
         """The tables as they are now, [states, actions] each: views that `advance` changes."""
         return [self._learner.table(i) for i in range(len(self.agents))]
+
+    @property
+    def held(self) -> list[Held]:
+        """All that the learners hold now, by name: views that `advance` changes; `q` is in `tables`."""
+        return [self._learner.held(i) for i in range(len(self.agents))]
 
     @property
     def own_actions(self) -> NDArray[np.int32]:
@@ -78,9 +84,9 @@ class TableReplay:
         for block in self._blocks(step):
             kernel.replay(*self._state, block.view(np.recarray), _NO_ROWS)
 
-    def rewind(self, step: int, tables: list[NDArray[np.float64]]) -> None:
-        """Go back to a step at which the tables were these."""
-        self._learner.set_tables(tables)
+    def rewind(self, step: int, held: list[Held]) -> None:
+        """Go back to a step at which the learners held this."""
+        self._learner.set_held(held)
         self.step = step
 
     def rows(self, stop: int) -> NDArray[np.float64]:
@@ -99,7 +105,7 @@ class TableReplay:
 
     @property
     def _state(self) -> tuple[Any, ...]:
-        return self._learner.model, self._learner.tables, self._learner.rules
+        return self._learner.seed, self._learner.model, self._learner.tables, self._learner.rules
 
     def _blocks(self, stop: int) -> Iterator[NDArray[np.void]]:
         """Yield the recorded steps from here up to `stop`, all of them; each block moves `step` on."""
@@ -148,6 +154,15 @@ def tables_at(recording: Recording, step: int) -> list[NDArray[np.float64]]:
         RecordingError: there is no such step, or the steps from the nearest snapshot are not recorded.
     """
     return TableReplay(recording, step).tables
+
+
+def held_at(recording: Recording, step: int) -> list[Held]:
+    """Return all that the learners held after `step` training steps, by name; `q` are the tables.
+
+    Raises:
+        RecordingError: as of `tables_at`.
+    """
+    return TableReplay(recording, step).held
 
 
 def step_of_episode(recording: Recording, episode: int) -> int:
@@ -242,23 +257,31 @@ def _note_changes(
     return steps[-1:], rows[-1:]
 
 
-def _check_shapes(recording: Recording, found: list[QTable], expected: list[NDArray[np.float64]]) -> None:
-    shapes = [table.values.shape for table in found], [table.shape for table in expected]
+def initially_held(recording: Recording) -> list[Held] | None:
+    """Return what the learners held before training, by the first snapshot; None if that is missing."""
+    nearest = _snapshot_before(recording, 0, kinds_of(from_mapping(recording.config)))
+    return nearest and nearest[1]
+
+
+def _check_shapes(recording: Recording, found: list[Held], expected: list[Held]) -> None:
+    shapes = [[table.shape for one in held for table in one.values()] for held in (found, expected)]
     if shapes[0] != shapes[1]:
         raise RecordingError(f"{recording.path}: found Q-tables of shape {shapes[0]}, expected {shapes[1]}.")
 
 
-def _snapshot_before(recording: Recording, step: int) -> list[QTable]:
-    """Return the tables of the last complete snapshot at or before a step."""
+def _snapshot_before(
+    recording: Recording, step: int, kinds: tuple[str, ...]
+) -> tuple[int, list[Held]] | None:
+    """Return the last complete snapshot at or before a step, and its step; None if there is none."""
     learners = int(recording.run["learners"])
     nearest: list[QTable] = []
     group: list[QTable] = []
-    for snapshot in recording.snapshots(step):
+    for snapshot in recording.snapshots(step, learners * len(kinds)):
         if snapshot.step > step:
             break
         group = [*group, snapshot] if group and group[0].step == snapshot.step else [snapshot]
-        if len(group) == learners:
+        if len(group) == learners * len(kinds):
             nearest = group
     if not nearest:
-        raise RecordingError(f"{recording.path}: has no Q-table at or before step {step}.")
-    return nearest
+        return None
+    return nearest[0].step, held_of([table.values for table in nearest], kinds)

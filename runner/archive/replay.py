@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from runner.analysis.tables import check_steps
 from runner.config import from_mapping
 from runner.learning import kernel
-from runner.learning.learner import Learner
+from runner.learning.learner import Learner, held_of
 from runner.mdp import Mdp
 
 _NO_ROWS = np.empty((0, 0, 0))
@@ -49,18 +49,20 @@ class Tables:
         if self._follow:
             check_steps(steps, self._mdp, self._where)
             learner = self._learner
-            kernel.replay(learner.model, learner.tables, learner.rules, steps.view(np.recarray), _NO_ROWS)
+            rows = steps.view(np.recarray)
+            kernel.replay(learner.seed, learner.model, learner.tables, learner.rules, rows, _NO_ROWS)
         self.step = int(steps["step"][-1]) + 1
         self._given.clear()
 
     def at(self, step: int, table: int) -> NDArray[np.float64] | None:
         """Return a table after so many training steps if the steps taken tell it: a view."""
-        known = self._follow and step == self.step and 0 <= table < len(self._learner.agents)
-        return self._learner.table(table) if known else None
+        tables = self._learner.snapshot()
+        known = self._follow and step == self.step and 0 <= table < len(tables)
+        return tables[table] if known else None
 
     def give(self, step: int, table: int, values: NDArray[np.float64]) -> None:
         """Say what a table is; once all are said after as many steps, they are followed from there."""
-        tables = [self._learner.table(i) for i in range(len(self._learner.agents))]
+        tables = self._learner.snapshot()
         if not 0 <= table < len(tables) or tables[table].shape != values.shape:
             return  # kept, but not to be followed from
         if step != self.step:
@@ -68,7 +70,8 @@ class Tables:
             self._given.clear()
         self._given.add(table)
         self._follow |= len(self._given) == len(tables)
-        self._learner.set_tables([*tables[:table], values, *tables[table + 1 :]])
+        tables[table] = values
+        self._learner.set_held(held_of(tables, self._learner.kinds))
 
 
 class Snapshot(Protocol):

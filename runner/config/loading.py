@@ -18,6 +18,7 @@ from runner.config.model import (
     LEARNERS,
     NAME_EXPECTED,
     NAME_PATTERN,
+    OWN_SECTIONS,
     ExperimentConfig,
     ExperimentFile,
     Rewards,
@@ -150,6 +151,9 @@ def _resolved(file: ExperimentFile, name: str) -> dict[str, Any]:
     values = {key: getattr(file, key) for key in ExperimentConfig.model_fields}
     values["name"] = file.name or name
     values["tables"], values["rewards"] = _learners(file)
+    for key, (algorithm, usual) in OWN_SECTIONS.items():
+        if file.algorithm == algorithm and values[key] is None:
+            values[key] = usual
     if isinstance(file.seeds, SeedRange):
         values["seeds"] = tuple(range(file.seeds.first, file.seeds.first + file.seeds.count))
     elif file.seeds is None:

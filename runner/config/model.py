@@ -25,6 +25,15 @@ from runner.config.schedules import Probability, StepSize
 from runner.config.values import Count, FrozenMapping, Section, frozen, plain, refusal
 
 Mode = Literal["cooperative", "competitive"]
+Algorithm = Literal[
+    "q_learning",
+    "sarsa",
+    "expected_sarsa",
+    "double_q_learning",
+    "hysteretic_q_learning",
+    "wolf_phc",
+    "random",
+]
 Tables = Literal["joint", "per_agent"]
 Rewards = Literal["team", "individual"]
 
@@ -242,12 +251,45 @@ class Quirks(Section):
     )
 
 
+class Hysteretic(Section):
+    """Hysteretic Q-learning's second step size; the first is `step_size`."""
+
+    decrease: Probability = Field(
+        default=0.01,
+        description="The step size of updates that lower a value, from 0 to 1; those that raise it take "
+        "`step_size`, which is to be the greater.",
+    )
+
+
+class WolfPhc(Section):
+    """How fast WoLF-PHC moves its policy towards the greedy action: it wins or learns fast."""
+
+    win: StepSize = Field(
+        default=0.05,
+        description="How much probability an update moves while the policy wins; at most `lose`.",
+    )
+    lose: StepSize = Field(default=0.2, description="How much it moves while the policy loses.")
+
+    @model_validator(mode="after")
+    def _wins_slowly(self) -> Self:
+        if isinstance(self.win, float) and isinstance(self.lose, float) and self.win > self.lose:
+            raise refusal(("win",), f"found {self.win:g}, expected at most lose, {self.lose:g}")
+        return self
+
+
+OWN_SECTIONS: dict[str, tuple[Algorithm, Section]] = {
+    "hysteretic": ("hysteretic_q_learning", Hysteretic()),
+    "wolf_phc": ("wolf_phc", WolfPhc()),
+}
+"""Sections that only one algorithm has: by key, which one, and what it is unless given."""
+
+
 class _Settings(Section):
     """What a file and the resolved experiment say in the same words."""
 
     env: Environment = Field(default=Environment(), description="The environment and its arguments.")
-    algorithm: Literal["q_learning", "random"] = Field(
-        default="q_learning", description="What learns: Q-learning, or random actions that learn nothing."
+    algorithm: Algorithm = Field(
+        default="q_learning", description="What learns (docs/algorithms.md), or random: nothing learns."
     )
     episodes: Annotated[int, Field(ge=0, le=10**12)] = Field(
         description="How many episodes to train for; 0 only evaluates the initial tables."
@@ -294,6 +336,10 @@ class ExperimentConfig(_Settings):
     tables: Tables
     rewards: Rewards
     seeds: Seeds
+    hysteretic: Hysteretic | None = None
+    """Present if, and only if, the algorithm is Hysteretic Q-learning."""
+    wolf_phc: WolfPhc | None = None
+    """Present if, and only if, the algorithm is WoLF-PHC."""
 
     @property
     def mode(self) -> Mode | None:
@@ -310,17 +356,39 @@ class ExperimentConfig(_Settings):
         if (self.tables, self.rewards) == ("joint", "individual"):
             message = "found 'individual', expected 'team': one joint table cannot learn from two rewards"
             raise refusal(("rewards",), message)
-        if self.algorithm == "random" and self.evaluation is not None and self.evaluation.exact:
-            message = "found true, but the algorithm is random: only a greedy policy is measured exactly"
+        draws = self.algorithm in ("random", "wolf_phc")
+        if draws and self.evaluation is not None and self.evaluation.exact:
+            message = (
+                f"found true, but the algorithm is {self.algorithm}, which draws: only a greedy policy is "
+            )
+            message += "measured exactly"
             raise refusal(("evaluation", "exact"), message)
         if self.quirks.second_table_uses_first_action and self.tables == "joint":
             message = "needs tables: per_agent (or mode: competitive), found tables: joint"
             raise refusal(("quirks", "second_table_uses_first_action"), message)
+        if self.quirks.second_table_uses_first_action and self.algorithm not in ("q_learning", "random"):
+            message = f"needs algorithm: q_learning, found algorithm: {self.algorithm}"
+            raise refusal(("quirks", "second_table_uses_first_action"), message)
+        if self.algorithm == "hysteretic_q_learning" and self.tables == "joint":
+            message = (
+                "found 'hysteretic_q_learning', which is for learners that do not see each other's actions, "
+                "but there is one joint table: set tables: per_agent (and rewards: team) or mode: competitive"
+            )
+            raise refusal(("algorithm",), message)
+        for key, (algorithm, _) in OWN_SECTIONS.items():
+            if getattr(self, key) is not None and self.algorithm != algorithm:
+                message = f"goes with algorithm: {algorithm}, found algorithm: {self.algorithm}. Remove it"
+                raise refusal((key,), message)
         return self
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return plain values, fit for JSON, which `from_mapping` takes back to an equal object."""
-        values = self.model_dump(mode="json")
+        """Return plain values, fit for JSON, which `from_mapping` takes back to an equal object.
+
+        Sections of other algorithms are left out.
+        """
+        values = self.model_dump(
+            mode="json", exclude={key for key in OWN_SECTIONS if getattr(self, key) is None}
+        )
         return {key: values[key] for key in KEYS if key in values}
 
     def to_yaml(self) -> str:
@@ -384,6 +452,12 @@ class ExperimentFile(_Settings):
         default=None,
         description="The team's summed reward for all, or each agent's own. Follows `tables`.",
     )
+    hysteretic: Annotated[Hysteretic | None, _given(Hysteretic)] = Field(
+        default=None, description="Only with algorithm: hysteretic_q_learning."
+    )
+    wolf_phc: Annotated[WolfPhc | None, _given(WolfPhc)] = Field(
+        default=None, description="Only with algorithm: wolf_phc."
+    )
     seed: Annotated[Seed | None, _given(Seed)] = Field(
         default=None, description="What every random draw follows from; 0 unless given. One run."
     )
@@ -394,7 +468,7 @@ class ExperimentFile(_Settings):
 
 KEYS = (
     *("name", "env", "mode", "tables", "rewards", "algorithm", "episodes", "seed", "seeds"),
-    *("step_size", "discount", "epsilon", "exploration", "initial_q"),
+    *("step_size", "discount", "epsilon", "exploration", "initial_q", "hysteretic", "wolf_phc"),
     *("evaluation", "log", "snapshots", "recording", "quirks"),
 )
 """The keys of a file in the order in which people read them."""

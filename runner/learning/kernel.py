@@ -1,12 +1,7 @@
 """The compiled learning and evaluation loops; they fill blocks of step records and know nothing else.
 
-`train` is epsilon-greedy tabular Q-learning as in Sutton and Barto, "Reinforcement Learning" (2nd
-edition, section 6.5), for one table over the joint action or one table a learner:
-
-    Q(S, A) <- Q(S, A) + step_size * (R + discount * max_a Q(S', a) - Q(S, A))
-
-The greedy action and the value of each state are kept beside the tables and mended at each update, so a
-step does not scan a row unless the row's best value fell. Ties go to the lowest action.
+What is special to an algorithm, acting and learning, is in `algorithms`; both loops that learn, `train` and
+`replay`, learn by the same function.
 """
 
 from __future__ import annotations
@@ -18,37 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.learning import draws
+from runner.learning.algorithms import (
+    EXPECTED_SARSA,
+    SARSA,
+    Index,
+    Moment,
+    Rules,
+    Tables,
+    choose,
+    drawn,
+    exploring,
+    learn,
+)
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
-
-
-class Tables(NamedTuple):
-    """The learners' Q-tables, one after the other in one array, and what is kept beside them."""
-
-    q: NDArray[np.float64]
-    """[sum of S * width]: table i starts at offset[i], row-major."""
-    offset: tuple[int, ...]
-    """[L]; a tuple, as `Model.width`: their length is known when the kernel is compiled."""
-    greedy: NDArray[np.int32]
-    """[L, S]: the lowest action of the highest value."""
-    value: NDArray[np.float64]
-    """[L, S]: the highest value."""
-
-
-class Rules(NamedTuple):
-    """How to learn: three schedules (see `schedules`) and the switches of the configuration."""
-
-    step_size: NDArray[np.float64]
-    discount: NDArray[np.float64]
-    epsilon: NDArray[np.float64]
-    by_step: bool
-    """Whether any schedule counts steps, not episodes."""
-    learns: bool
-    independent: bool
-    """Whether each learner explores by a draw of its own."""
-    epsilon_exploits: bool
-    first_action_for_all: bool
-    bootstrap_after_termination: bool
 
 
 class Tally(NamedTuple):
@@ -64,13 +42,20 @@ class Tally(NamedTuple):
     """Ring over the last episodes: length of episode k at k modulo its length."""
 
 
-Index = np.uint64
-"""What the hot loops index with: numba leaves out the arithmetic for negative indices."""
+_loop = numba.njit(cache=True, nogil=True, _nrt=False)
+"""Compiles a loop. It allocates nothing, so it need not count references to its arrays (`_nrt`): what is
+inlined into a loop would count them at every step, atomically, and take four times as long."""
 
 START_RANDOM, START_EACH = -1, -2
 
-CURSOR = np.dtype([("step", "<i8"), ("episode", "<i8"), ("t", "<i8"), ("state", "<i8")])
-"""Where a phase stands: steps taken, current episode, steps in it, current state (if t > 0)."""
+DRAWN = -2
+"""In a policy to evaluate: each learner draws its action from the policy it has learned."""
+
+CURSOR = np.dtype(
+    [(name, "<i8") for name in ("step", "episode", "t", "state", "next_action", "next_explored")]
+)
+"""Where a phase stands: steps taken, current episode, steps in it; if t > 0 the current state, and of SARSA
+the joint action that is to be taken there, and who explores by it."""
 
 
 @numba.njit(inline="always")
@@ -92,40 +77,6 @@ def _outcome(model: Model, pair: int, key: np.uint64, t: int) -> int:
     while u >= model.cumulative[pair, k]:
         k += Index(1)
     return pair * Index(outcomes) + k
-
-
-@numba.njit(inline="always")
-def _update(
-    tables: Tables, i: int, state: int, action: int, width: int, target: float, step_size: float
-) -> None:
-    """Move Q_i(state, action) towards the target; keep the state's greedy action and value true."""
-    row = Index(tables.offset[i]) + state * Index(width)
-    old = tables.q[row + action]
-    new = old + step_size * (target - old)
-    tables.q[row + action] = new
-    if action == Index(tables.greedy[i, state]):
-        if new >= old:
-            tables.value[i, state] = new
-        else:
-            _rescan(tables, i, state, row, width)
-    elif new > tables.value[i, state] or (
-        new == tables.value[i, state] and action < Index(tables.greedy[i, state])
-    ):
-        tables.greedy[i, state] = action
-        tables.value[i, state] = new
-
-
-@numba.njit(inline="always")
-def _rescan(tables: Tables, i: int, state: int, row: int, width: int) -> None:
-    """Find the state's greedy action and value anew."""
-    best = Index(0)
-    highest = tables.q[row]
-    for action in range(Index(1), Index(width)):
-        if tables.q[row + action] > highest:
-            highest = tables.q[row + action]
-            best = action
-    tables.greedy[i, state] = best
-    tables.value[i, state] = highest
 
 
 @numba.njit(inline="always")
@@ -155,7 +106,7 @@ def _end_episode(model: Model, tally: Tally, record: np.record, last: np.record)
             record.penalties += count
 
 
-@numba.njit(cache=True, nogil=True)
+@_loop
 def train(
     cursor: NDArray[np.void],
     seed: np.uint64,
@@ -175,17 +126,16 @@ def train(
     """
     at = cursor[0]
     step, episode, t, state = at.step, at.episode, at.t, Index(at.state)
+    next_action, next_explored = at.next_action, at.next_explored
+    algorithm = len(rules.algorithm)
     learners = len(model.width)
     joint_actions = len(model.own_action)
-    every_learner = (1 << learners) - 1
     window, lengths = len(tally.recent_outcomes), len(tally.recent_lengths)
     exploration = draws.key(seed, draws.EXPLORATION, episode)
     chance = draws.key(seed, draws.OUTCOME, episode)
     step_size = schedule_value(rules.step_size, episode, step)
     discount = schedule_value(rules.discount, episode, step)
-    epsilon = schedule_value(rules.epsilon, episode, step)
-    if rules.epsilon_exploits:
-        epsilon = 1.0 - epsilon
+    epsilon = exploring(rules, episode, step)
     place = step % window
     filled = ended = 0
     while filled < len(steps) and ended < len(episodes) and episode < until_episode and step < until_step:
@@ -196,29 +146,13 @@ def train(
         if t == 0 or rules.by_step:
             step_size = schedule_value(rules.step_size, episode, step)
             discount = schedule_value(rules.discount, episode, step)
-            epsilon = schedule_value(rules.epsilon, episode, step)
-            if rules.epsilon_exploits:
-                epsilon = 1.0 - epsilon
+            epsilon = exploring(rules, episode, step)
 
-        # Choose the joint action.
-        action = 0
-        explored = 0
-        if rules.independent:
-            for i in range(learners):
-                bits = draws.draw(exploration, t * learners + i)
-                if draws.coin(bits) < epsilon:
-                    action += draws.below(bits, model.width[i]) * model.stride[i]
-                    explored |= 1 << i
-                else:
-                    action += tables.greedy[i, state] * model.stride[i]
+        # Choose the joint action; SARSA has done so before its last update.
+        if algorithm == SARSA and t > 0:
+            action, explored = next_action, next_explored
         else:
-            bits = draws.draw(exploration, t)
-            if draws.coin(bits) < epsilon:
-                action = draws.below(bits, joint_actions)
-                explored = every_learner
-            else:
-                for i in range(learners):
-                    action += tables.greedy[i, state] * model.stride[i]
+            action, explored = choose(seed, model, tables, rules, epsilon, exploration, episode, t, state)
 
         # Take it, and observe.
         outcome = _outcome(model, state * Index(joint_actions) + Index(action), chance, t)
@@ -228,13 +162,23 @@ def train(
         truncated = t + 1 == model.step_limit
 
         # Learn from it.
+        next_epsilon = epsilon
+        if algorithm in (SARSA, EXPECTED_SARSA) and rules.by_step:
+            next_epsilon = exploring(rules, episode, step + 1)
+        if algorithm == SARSA:
+            next_action, next_explored = choose(
+                seed, model, tables, rules, next_epsilon, exploration, episode, t + 1, next_state
+            )
         if rules.learns:
+            now = Moment(episode, step, t, step_size, discount, next_epsilon)
+            bootstraps = not terminated or rules.bootstrap_after_termination
             for i in range(learners):
-                target = model.rewards[kind, i]
-                if not terminated or rules.bootstrap_after_termination:
-                    target += discount * tables.value[i, next_state]
                 own = Index(model.own_action[action, 0 if rules.first_action_for_all else i])
-                _update(tables, i, state, own, model.width[i], target, step_size)
+                next_own = Index(model.own_action[next_action, i])
+                reward = model.rewards[kind, i]
+                learn(
+                    seed, model, tables, rules, now, i, state, own, reward, next_state, next_own, bootstraps
+                )
 
         # Record it.
         record = steps[Index(filled)]
@@ -266,14 +210,16 @@ def train(
             episode += 1
             t = 0
     at.step, at.episode, at.t, at.state = step, episode, t, state
+    at.next_action, at.next_explored = next_action, next_explored
     return filled, ended
 
 
-@numba.njit(cache=True, nogil=True)
+@_loop
 def evaluate(
     cursor: NDArray[np.void],
     seed: np.uint64,
     model: Model,
+    tables: Tables,
     policy: NDArray[np.int32],
     tally: Tally,
     steps: NDArray[np.void],
@@ -281,7 +227,7 @@ def evaluate(
     until_episode: int,
     start: int,
 ) -> tuple[int, int]:
-    """Play `policy` (the joint action of each state; -1 for a random one) as `train` trains.
+    """Play `policy` (the joint action of each state; -1 for a random one, `DRAWN`) as `train` trains.
 
     `start` is the state that trials start in, or `START_RANDOM`, or `START_EACH` for all in turn.
     """
@@ -303,7 +249,13 @@ def evaluate(
             chance = draws.key(seed, draws.EVALUATION_OUTCOME, episode)
         action = np.int64(policy[state])
         explored = 0
-        if action < 0:
+        if action == DRAWN:
+            key = draws.key(seed, draws.EVALUATION_ACTION, episode)
+            action = 0
+            for i in range(learners):
+                u = draws.uniform(draws.draw(key, t * learners + i))
+                action += drawn(model, tables, i, state, u) * model.stride[i]
+        elif action < 0:
             bits = draws.draw(draws.key(seed, draws.EVALUATION_ACTION, episode), t)
             action = draws.below(bits, joint_actions)
             explored = every_learner
@@ -341,16 +293,22 @@ def evaluate(
     return filled, ended
 
 
-@numba.njit(cache=True, nogil=True)
+@_loop
 def replay(
-    model: Model, tables: Tables, rules: Rules, steps: NDArray[np.void], rows: NDArray[np.float64]
+    seed: np.uint64,
+    model: Model,
+    tables: Tables,
+    rules: Rules,
+    steps: NDArray[np.void],
+    rows: NDArray[np.float64],
 ) -> None:
     """Apply the updates of recorded training steps, in order, to the tables.
 
-    A recorded step holds all that its update took in, so the replayed update is `train`'s own, to the last
-    bit. Where `rows` ([steps, L, widest], or empty) has room, row k gets each learner's values of the state
-    before step k's update: what it saw when it chose.
+    A recorded step and the run's draws hold all that its update took in, so the replayed update is
+    `train`'s own, to the last bit. Where `rows` ([steps, L, widest], or empty) has room, row k gets each
+    learner's values of the state before step k's update: what it saw when it chose.
     """
+    algorithm = len(rules.algorithm)
     learners = len(model.width)
     for k in range(len(steps)):
         record = steps[k]
@@ -361,14 +319,26 @@ def replay(
                     rows[k, i, action] = tables.q[row + action]
         if not rules.learns:
             continue
-        step_size = schedule_value(rules.step_size, record.episode, record.step)
-        discount = schedule_value(rules.discount, record.episode, record.step)
+        episode, step, t = record.episode, record.step, np.int64(record.t)
+        state, next_state = Index(record.state), Index(record.next_state)
+        step_size = schedule_value(rules.step_size, episode, step)
+        discount = schedule_value(rules.discount, episode, step)
+        next_epsilon = 0.0
+        if algorithm in (SARSA, EXPECTED_SARSA):
+            next_epsilon = exploring(rules, episode, step + 1)
+        next_action = 0
+        if algorithm == SARSA:
+            exploration = draws.key(seed, draws.EXPLORATION, episode)
+            next_action, _ = choose(
+                seed, model, tables, rules, next_epsilon, exploration, episode, t + 1, next_state
+            )
+        now = Moment(episode, step, t, step_size, discount, next_epsilon)
+        bootstraps = not record.terminated or rules.bootstrap_after_termination
         for i in range(learners):
-            target = record.rewards[i]
-            if not record.terminated or rules.bootstrap_after_termination:
-                target += discount * tables.value[i, record.next_state]
             own = Index(model.own_action[record.action, 0 if rules.first_action_for_all else i])
-            _update(tables, i, Index(record.state), own, model.width[i], target, step_size)
+            next_own = Index(model.own_action[next_action, i])
+            reward = record.rewards[i]
+            learn(seed, model, tables, rules, now, i, state, own, reward, next_state, next_own, bootstraps)
 
 
 @numba.njit(cache=True)

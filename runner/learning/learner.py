@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,15 @@ from numpy.typing import NDArray
 from runner.config import ExperimentConfig
 from runner.config.model import RandomTable
 from runner.errors import ConfigError, EnvironmentNotUsable
-from runner.learning import kernel
-from runner.learning.kernel import Rules, Tables, Tally
+from runner.learning import algorithms, kernel
+from runner.learning.algorithms import Rules, Tables
+from runner.learning.kernel import Tally
 from runner.learning.model import Model, build_model
 from runner.learning.schedules import compile_schedule, schedule_value
 from runner.mdp import Mdp
+
+Held = Mapping[str, NDArray[np.float64]]
+"""What one learner holds: its Q-table as `q` and, by name, whatever else its algorithm keeps (`KEPT`)."""
 
 
 class Learner:
@@ -24,11 +29,11 @@ class Learner:
         config: the experiment.
         mdp: its environment.
         seed: fixes every draw.
-        initial: tables to start from instead of `config.initial_q`, a float64 [S, width] a learner.
+        initial: what to start from instead of `config.initial_q`, as `held` returns it, for each learner.
     """
 
     def __init__(
-        self, config: ExperimentConfig, mdp: Mdp, seed: int, initial: list[NDArray[np.float64]] | None = None
+        self, config: ExperimentConfig, mdp: Mdp, seed: int, initial: Sequence[Held] | None = None
     ) -> None:
         self.config = config
         self.mdp = mdp
@@ -37,8 +42,9 @@ class Learner:
         self.agents = ("agency",) if config.tables == "joint" and len(mdp.agents) > 1 else mdp.agents
         self.rules = rules_of(config)
         _check_fit(config, mdp, self.model)
-        self.tables = _tables(self.model, mdp.states)
-        self.set_tables(initial)
+        self.kinds = kinds_of(config)
+        self.tables = _tables(self.model, mdp.states, self.kinds)
+        self.set_held(initial)
         log = config.log
         self._tally = _tally(self.model, log.window if log else 1, log.episodes if log else 50)
         self._eval_tally = _tally(self.model, 1, 1)
@@ -59,9 +65,28 @@ class Learner:
         return int(self._cursor.episode[0])
 
     def table(self, i: int) -> NDArray[np.float64]:
-        """Return learner i's Q-table as it is now, [S, width]: a view."""
+        """Return learner i's Q-table as it is now, [S, width]: a view.
+
+        These are the values that greedy actions follow; of Double Q-learning the mean of both tables.
+        """
+        return self._of(i, self.tables.q)
+
+    def held(self, i: int) -> Held:
+        """Return all that learner i holds now, [S, width] each and visits [S, 1]: views."""
+        kept: dict[str, NDArray[np.float64]] = {"q": self.table(i)}
+        for name, array in zip(self.kinds[1:], self.tables.kept, strict=False):
+            kept[name] = self._of(i, array)
+        if "visits" in self.kinds:
+            kept["visits"] = self.tables.visits[i][:, np.newaxis]
+        return kept
+
+    def snapshot(self) -> list[NDArray[np.float64]]:
+        """Return all tables as a snapshot numbers them, those of one kind together: views."""
+        return [self.held(i)[name] for name in self.kinds for i in range(len(self.agents))]
+
+    def _of(self, i: int, array: NDArray[np.float64]) -> NDArray[np.float64]:
         start, width = int(self.tables.offset[i]), int(self.model.width[i])
-        return self.tables.q[start : start + self.mdp.states * width].reshape(-1, width)
+        return array[start : start + self.mdp.states * width].reshape(-1, width)
 
     def train(
         self, steps: NDArray[np.void], episodes: NDArray[np.void], until_episode: int, until_step: int
@@ -83,9 +108,9 @@ class Learner:
         return filled, ended
 
     def begin_evaluation(self) -> None:
-        """Fix the policy to be evaluated: greedy in the tables as they are, or random."""
-        if not self.rules.learns:
-            self._policy.fill(-1)
+        """Fix the policy to be evaluated: greedy in the tables as they are, or as learned, or random."""
+        if not self.rules.learns or len(self.rules.algorithm) == algorithms.WOLF_PHC:
+            self._policy.fill(kernel.DRAWN if self.rules.learns else -1)
             return
         self._policy[:] = (self.tables.greedy.T * np.array(self.model.stride)).sum(axis=1)
 
@@ -102,6 +127,7 @@ class Learner:
             self._eval_cursor,
             self.seed,
             self.model,
+            self.tables,
             self._policy,
             self._eval_tally,
             steps,
@@ -154,18 +180,39 @@ class Learner:
         if self._success.any():
             episodes["success"] = episodes["events"][:, self._success].any(axis=1)
 
-    def set_tables(self, initial: list[NDArray[np.float64]] | None) -> None:
-        """Set the tables, one [S, width] a learner; None for those that the configuration begins with."""
-        start = self.config.initial_q
-        if initial is not None:
-            self.tables.q[:] = np.concatenate([table.reshape(-1) for table in initial])
-        elif isinstance(start, RandomTable):
-            kernel.fill_random(self.tables.q, self.seed, start.random.low, start.random.high)
-        elif isinstance(start, int | float):
-            self.tables.q[:] = start
+    def set_held(self, initial: Sequence[Held] | None) -> None:
+        """Set what each learner holds; None for what the configuration begins with.
+
+        What `initial` leaves out follows from its `q`: both tables of Double Q-learning are that one, and a
+        policy of WoLF-PHC is uniform.
+        """
+        double = len(self.rules.algorithm) == algorithms.DOUBLE_Q_LEARNING
+        if initial is None:
+            self._fill(self.tables.kept.reshape(-1) if double else self.tables.q)
+        for i in range(len(self.agents)):
+            given = {} if initial is None else initial[i]
+            for name, array in self.held(i).items():
+                if name in given:
+                    array[:] = given[name]
+                elif name == "visits":
+                    array[:] = 0.0
+                elif name in ("policy", "average_policy"):
+                    array[:] = 1.0 / array.shape[1]
+                elif "q" in given:
+                    array[:] = given["q"]
+        if double:
+            self.tables.q[:] = 0.5 * (self.tables.kept[0] + self.tables.kept[1])
         for i in range(len(self.model.width)):
             self.tables.greedy[i] = self.table(i).argmax(axis=1)
             self.tables.value[i] = self.table(i).max(axis=1)
+
+    def _fill(self, cells: NDArray[np.float64]) -> None:
+        """Fill cells as the configuration says; 0 where it names another run's tables."""
+        start = self.config.initial_q
+        if isinstance(start, RandomTable):
+            kernel.fill_random(cells, self.seed, start.random.low, start.random.high)
+        else:
+            cells[:] = start if isinstance(start, int | float) else 0.0
 
 
 def _trial_start(config: ExperimentConfig, mdp: Mdp) -> int:
@@ -183,7 +230,12 @@ def rules_of(config: ExperimentConfig) -> Rules:
     learns = config.algorithm != "random"
     step_size, discount = compile_schedule(config.step_size), compile_schedule(config.discount)
     epsilon = compile_schedule(config.epsilon if learns else 1.0)
+    hysteretic, wolf = config.hysteretic, config.wolf_phc
     return Rules(
+        algorithm=(0,) * algorithms.NUMBERS[config.algorithm],
+        decrease=compile_schedule(hysteretic.decrease if hysteretic else 0.0),
+        win=compile_schedule(wolf.win if wolf else 0.0),
+        lose=compile_schedule(wolf.lose if wolf else 0.0),
         step_size=step_size,
         discount=discount,
         epsilon=epsilon,
@@ -194,6 +246,17 @@ def rules_of(config: ExperimentConfig) -> Rules:
         first_action_for_all=config.quirks.second_table_uses_first_action,
         bootstrap_after_termination=config.quirks.bootstrap_after_termination,
     )
+
+
+def kinds_of(config: ExperimentConfig) -> tuple[str, ...]:
+    """Return the names of what each learner of an experiment holds, in the order of a snapshot."""
+    return ("q", *algorithms.KEPT.get(config.algorithm, ()))
+
+
+def held_of(tables: Sequence[NDArray[np.float64]], kinds: tuple[str, ...]) -> list[Held]:
+    """Return the tables of a whole snapshot by learner and name."""
+    learners = len(tables) // len(kinds)
+    return [{name: tables[k * learners + i] for k, name in enumerate(kinds)} for i in range(learners)]
 
 
 def _check_fit(config: ExperimentConfig, mdp: Mdp, model: Model) -> None:
@@ -211,7 +274,7 @@ def _check_fit(config: ExperimentConfig, mdp: Mdp, model: Model) -> None:
         )
 
 
-def _tables(model: Model, states: int) -> Tables:
+def _tables(model: Model, states: int, kinds: tuple[str, ...]) -> Tables:
     sizes = [width * states for width in model.width]
     learners = len(sizes)
     return Tables(
@@ -219,6 +282,8 @@ def _tables(model: Model, states: int) -> Tables:
         offset=tuple(sum(sizes[:i]) for i in range(learners)),
         greedy=np.zeros((learners, states), np.int32),
         value=np.zeros((learners, states)),
+        kept=np.zeros((2 if len(kinds) > 1 else 0, sum(sizes))),
+        visits=np.zeros((learners if "visits" in kinds else 0, states)),
     )
 
 

@@ -464,15 +464,26 @@ class Recording:
             except RecordingError as error:
                 raise RecordingError(f"{where}: {error}") from error
 
-    def snapshots(self, step: int = 0) -> Iterator[QTable]:
-        """Yield the Q-table snapshots in order; those are left out that are older than needed for `step`.
+    def snapshots(self, step: int = 0, tables: int = 0) -> Iterator[QTable]:
+        """Yield the snapshots in order; those are left out that are older than needed for `step`.
 
         Of the last moment at or before `step` all are given, and of the moment before it.
+
+        Args:
+            step: a training step.
+            tables: how many tables there are of a moment; by default the learners' Q-tables are given, and
+                what else their algorithm keeps is left out.
         """
+        learners = int(self.run["learners"])
+        for snapshot in self._since(step, tables or learners):
+            if tables or snapshot.table < learners:
+                yield snapshot
+
+    def _since(self, step: int, tables: int) -> Iterator[QTable]:
         topic = schema.Q_TABLE_TOPIC
         chunks = range(len(self._chunks_of[topic.channel]))
         behind = bisect_right(chunks, step, key=lambda k: next(self._snapshots(k)).step) if step else 0
-        yield from self._snapshots(max(0, behind - 2 * int(self.run["learners"])))
+        yield from self._snapshots(max(0, behind - 2 * tables))
 
     def _snapshots(self, first_chunk: int) -> Iterator[QTable]:
         for time, payload in self.messages(schema.Q_TABLE_TOPIC, first_chunk):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from runner.analysis.diff.tables import own_actions_in_words
 from runner.analysis.diff.trajectory import Parting
 from runner.errors import RecordingError
+from runner.learning.learner import Held
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.words import actions_in_words, states_in_words
@@ -228,23 +229,28 @@ def _first_difference(left: TableReplay, right: TableReplay, start: int, stop: i
 
     If there is one, both are left before that step.
     """
-    before = [table.copy() for table in left.tables]
+    before = [_copied(replay) for replay in (left, right)]
     left.advance(stop)
     right.advance(stop)
     if _same(left, right):
         return None
     while stop - start > 1:
         middle = (start + stop) // 2
-        for replay in (left, right):
-            replay.rewind(start, before)
+        for replay, contents in zip((left, right), before, strict=True):
+            replay.rewind(start, contents)
             replay.advance(middle)
         if _same(left, right):
-            start, before = middle, [table.copy() for table in left.tables]
+            start, before = middle, [_copied(replay) for replay in (left, right)]
         else:
             stop = middle
-    for replay in (left, right):
-        replay.rewind(start, before)
+    for replay, contents in zip((left, right), before, strict=True):
+        replay.rewind(start, contents)
     return start
+
+
+def _copied(replay: TableReplay) -> list[Held]:
+    """Return all that the learners hold now, to go back to."""
+    return [{name: array.copy() for name, array in one.items()} for one in replay.held]
 
 
 def _same(left: TableReplay, right: TableReplay) -> bool:

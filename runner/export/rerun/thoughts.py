@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.tables import tables_at
+from runner.analysis.tables import held_at
 from runner.config import from_mapping
 from runner.export.rerun.filling import best_of_joint, pictures_of
 from runner.export.rerun.scene import Placements, own_actions
@@ -57,6 +57,7 @@ class Thinker:
     def __init__(self, recording: Recording, placements: Placements | None) -> None:
         self._recording = recording
         self._config = from_mapping(recording.config)
+        self._seed = int(recording.run["seed"])
         self.mdp: Mdp = recording.mdp
         self._own_actions = own_actions(self.mdp)
         self._context = np.zeros(self.mdp.states, np.int64)
@@ -79,7 +80,7 @@ class Thinker:
         begin_anew = self._learner is None or step < self._step
         begin_anew |= any(self._step + NEAR_STEPS < snapshot <= step for snapshot in self._snapshots)
         if begin_anew:
-            self._learner = Learner(self._config, self.mdp, 0, tables_at(self._recording, step))
+            self._learner = Learner(self._config, self.mdp, self._seed, held_at(self._recording, step))
             self._step = step
         elif step > self._step:
             for block in self._recording.blocks(TRAIN_STEP, self._step, step):
@@ -89,7 +90,7 @@ class Thinker:
     def training(self, block: NDArray[np.void]) -> Thoughts:
         """Return the thoughts at the training steps of a block, which follow each other, and update."""
         self.at(int(block["step"][0]))
-        model = self._state[0]
+        model = self._state[1]
         rows = np.full((len(block), len(model.width), max(model.width)), np.nan)
         renewed = self._renewals(block)
         value, greedy = self._empty_pictures(len(renewed))
@@ -100,7 +101,7 @@ class Thinker:
 
     def evaluating(self, block: NDArray[np.void]) -> Thoughts:
         """Return the thoughts at a block of evaluation steps, all of the tables as they are."""
-        model, tables, _ = self._state
+        _, model, tables, _ = self._state
         learner = self._learner
         assert learner is not None
         state = block["state"].astype(np.int64)
@@ -117,7 +118,7 @@ class Thinker:
     @property
     def _state(self) -> tuple[Any, ...]:
         assert self._learner is not None
-        return self._learner.model, self._learner.tables, self._learner.rules
+        return self._learner.seed, self._learner.model, self._learner.tables, self._learner.rules
 
     def _renewals(self, block: NDArray[np.void]) -> NDArray[np.int64]:
         """Return the rows at which an episode begins or the context changes, looking back over blocks."""
@@ -148,6 +149,7 @@ class Thinker:
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
 def _replay(
+    seed: Any,
     model: Any,
     tables: Any,
     rules: Any,
@@ -161,7 +163,7 @@ def _replay(
     """Replay steps, and before each of those in `renewed` take down the pictures of all learners."""
     at = 0
     for k in range(len(renewed)):
-        kernel.replay(model, tables, rules, steps[at : renewed[k]], rows[at : renewed[k]])
+        kernel.replay(seed, model, tables, rules, steps[at : renewed[k]], rows[at : renewed[k]])
         at = renewed[k]
         pictures_of(tables, pictures[k], value[k], greedy[k])
-    kernel.replay(model, tables, rules, steps[at:], rows[at:])
+    kernel.replay(seed, model, tables, rules, steps[at:], rows[at:])

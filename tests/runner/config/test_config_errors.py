@@ -154,7 +154,8 @@ from runner.errors import ConfigError
         ("snapshots:", "2:1: snapshots: found null, expected a mapping with every"),
         (
             "algorithm: q_lerning",
-            "2:1: algorithm: found 'q_lerning', expected 'q_learning' or 'random'. "
+            "2:1: algorithm: found 'q_lerning', expected 'q_learning', 'sarsa', 'expected_sarsa', "
+            "'double_q_learning', 'hysteretic_q_learning', 'wolf_phc' or 'random'. "
             "Did you mean 'q_learning'?",
         ),
         ("episodes: 5", "2:1: episodes: given twice; first in line 1"),

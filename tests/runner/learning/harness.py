@@ -72,6 +72,46 @@ RULES = {
         "step_size": PIECEWISE | {"points": [[0, 0.3]]},
     },
 }
+ALGORITHMS = {
+    "sarsa": {"algorithm": "sarsa"},
+    "sarsa of two": COMPETITIVE | {"algorithm": "sarsa"},
+    "sarsa, each alone, by step": COMPETITIVE
+    | {"algorithm": "sarsa", "exploration": "independent", "epsilon": LINEAR | {"over": 900, "by": "step"}},
+    "sarsa that bootstraps at the end": {
+        "algorithm": "sarsa",
+        "initial_q": 3.0,
+        "quirks": {"bootstrap_after_termination": True},
+    },
+    "expected sarsa": {"algorithm": "expected_sarsa"},
+    "expected sarsa of two": COMPETITIVE
+    | {"algorithm": "expected_sarsa", "epsilon": EXPONENTIAL | {"factor": 0.999, "by": "step"}},
+    "expected sarsa, epsilon exploits": {
+        "algorithm": "expected_sarsa",
+        "quirks": {"epsilon_exploits": True},
+        "epsilon": 0.3,
+    },
+    "double": {"algorithm": "double_q_learning"},
+    "double of two, random": COMPETITIVE | {"algorithm": "double_q_learning", "initial_q": "random"},
+    "hysteretic": INDEPENDENT_LEARNERS | {"algorithm": "hysteretic_q_learning"},
+    "hysteretic, changing": COMPETITIVE
+    | {
+        "algorithm": "hysteretic_q_learning",
+        "exploration": "independent",
+        "hysteretic": {"decrease": LINEAR | {"over": 400, "by": "step"}},
+    },
+    "distributed": INDEPENDENT_LEARNERS
+    | {"algorithm": "hysteretic_q_learning", "hysteretic": {"decrease": 0.0}},
+    "wolf": {"algorithm": "wolf_phc"},
+    "wolf of two": COMPETITIVE | {"algorithm": "wolf_phc", "initial_q": "random"},
+    "wolf, changing": INDEPENDENT_LEARNERS
+    | {
+        "algorithm": "wolf_phc",
+        "exploration": "independent",
+        "epsilon": 0.1,
+        "wolf_phc": {"win": EXPONENTIAL | {"factor": 0.99}, "lose": 1.0},
+    },
+}
+"""Every algorithm besides Q-learning, with what is special to it."""
 
 
 class Played(NamedTuple):
@@ -138,6 +178,9 @@ def assert_same_records(records: NDArray[np.void], expected: Sequence[NamedTuple
 
 
 def assert_same_tables(learner: Learner, twin: Twin) -> None:
-    """Compare every cell of every table, bit for bit."""
-    for i, table in enumerate(twin.tables):
-        assert learner.table(i).tobytes() == np.array(table).tobytes(), f"table {i}"
+    """Compare every cell of all that each learner holds, bit for bit."""
+    for i in range(twin.learners):
+        held, expected = learner.held(i), twin.held(i)
+        assert held.keys() == expected.keys()
+        for name, table in expected.items():
+            assert held[name].tobytes() == np.array(table).tobytes(), f"{name} of learner {i}"

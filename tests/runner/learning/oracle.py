@@ -1,6 +1,6 @@
-"""Tabular Q-learning in plain Python: what the compiled kernel must equal to the last bit.
+"""The algorithms in plain Python: what the compiled kernel must equal to the last bit.
 
-Written from the specification, slow and obvious: Sutton and Barto's pseudo-code, SplitMix64 in Python
+Written from the sources, slow and obvious: Sutton and Barto's pseudo-code, SplitMix64 in Python
 integers, one step after the other through the arrays of the `Mdp`. Nothing is imported from the kernel.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 START, EXPLORATION, OUTCOME, UPDATE = range(4)
-EVALUATION_START, EVALUATION_OUTCOME, EVALUATION_ACTION, INITIAL_Q = range(4, 8)
+EVALUATION_START, EVALUATION_OUTCOME, EVALUATION_ACTION, INITIAL_Q, POLICY = range(4, 9)
 
 BITS_64 = 2**64 - 1
 
@@ -57,7 +57,7 @@ def pick(chances: list[tuple[int, float]], u: float) -> int:
         total += probability
         if u < total:
             return item
-    return chances[-1][0]
+    return [item for item, probability in chances if probability > 0][-1]
 
 
 def value_of(schedule: Any, episode: int, step: int) -> float:
@@ -141,22 +141,51 @@ class Twin:
         self.widths = [mdp.joint_actions] if joint else list(mdp.action_counts)
         self.learners = len(self.widths)
         self.learns = config.algorithm != "random"
-        self.tables = [[[0.0] * width for _ in range(mdp.states)] for width in self.widths]
+        self.tables = self._of_states(0.0)
+        self.doubles = [self._of_states(0.0), self._of_states(0.0)]
+        self.policies = [[[1.0 / width] * width for _ in range(mdp.states)] for width in self.widths]
+        self.averages = [[[1.0 / width] * width for _ in range(mdp.states)] for width in self.widths]
+        self.visits = [[0] * mdp.states for _ in self.widths]
+        self.chosen: tuple[int, int] | None = None  # by SARSA, for the step to come
         self._fill_tables()
         self.starts = [(s, p) for s, p in enumerate(mdp.start.tolist()) if p > 0]
         self.training, self.evaluation = Phase(), Phase()
 
+    def _of_states(self, value: float) -> list[list[list[float]]]:
+        """Return a table a learner, filled with a value."""
+        return [[[value] * width for _ in range(self.mdp.states)] for width in self.widths]
+
     def _fill_tables(self) -> None:
+        double = self.config.algorithm == "double_q_learning"
         start, stream, index = self.config.initial_q, key(self.seed, INITIAL_Q, 0), 0
-        for table in self.tables:
-            for row in table:
-                for action in range(len(row)):
-                    if isinstance(start, int | float):
-                        row[action] = start
-                    else:
-                        low, high = start.random.low, start.random.high
-                        row[action] = low + (high - low) * uniform(splitmix64(stream, index))
-                    index += 1
+        for tables in self.doubles if double else [self.tables]:
+            for table in tables:
+                for row in table:
+                    for action in range(len(row)):
+                        if isinstance(start, int | float):
+                            row[action] = start
+                        else:
+                            low, high = start.random.low, start.random.high
+                            row[action] = low + (high - low) * uniform(splitmix64(stream, index))
+                        index += 1
+        if double:
+            for i, table in enumerate(self.tables):
+                for state, row in enumerate(table):
+                    for action in range(len(row)):
+                        row[action] = self._mean(i, state, action)
+
+    def _mean(self, i: int, state: int, action: int) -> float:
+        return (self.doubles[0][i][state][action] + self.doubles[1][i][state][action]) / 2
+
+    def held(self, i: int) -> dict[str, list[list[float]]]:
+        """Return all that learner i holds, by name."""
+        held = {"q": self.tables[i]}
+        if self.config.algorithm == "double_q_learning":
+            held |= {"q_1": self.doubles[0][i], "q_2": self.doubles[1][i]}
+        if self.config.algorithm == "wolf_phc":
+            visits = [[float(count)] for count in self.visits[i]]
+            held |= {"policy": self.policies[i], "average_policy": self.averages[i], "visits": visits}
+        return held
 
     def epsilon(self, episode: int, step: int) -> float:
         """Return the probability of exploring."""
@@ -166,12 +195,15 @@ class Twin:
         return 1.0 - epsilon if self.config.quirks.epsilon_exploits else epsilon
 
     def train(self, until_episode: int, until_step: int) -> None:
-        """Run episodes of Q-learning until that many episodes or steps are done."""
+        """Run training episodes until that many episodes or steps are done."""
         config, phase = self.config, self.training
         while len(phase.episodes) < until_episode and len(phase.steps) < until_step:
             episode, t = len(phase.episodes), len(phase.begun)
             state = phase.steps[-1].next_state if t else self._start(START, episode)
-            action, explored = self._epsilon_greedy(state, episode, t, len(phase.steps))
+            if self.chosen is None or t == 0:
+                action, explored = self._epsilon_greedy(state, episode, t, len(phase.steps))
+            else:
+                action, explored = self.chosen
             step, outcome = self._move(phase, OUTCOME, episode, t, state, action, explored)
             if self.learns:
                 step_size = value_of(config.step_size, episode, step.step)
@@ -186,7 +218,16 @@ class Twin:
         while len(phase.episodes) < until:
             trial, t = len(phase.episodes), len(phase.begun)
             state = phase.steps[-1].next_state if t else self._trial_start(trial)
-            if self.learns:
+            if self.config.algorithm == "wolf_phc":
+                own = [
+                    pick(
+                        list(enumerate(self.policies[i][state])),
+                        uniform(draw(self.seed, EVALUATION_ACTION, trial, t * self.learners + i)),
+                    )
+                    for i in range(self.learners)
+                ]
+                action, explored = self._joint(own), 0
+            elif self.learns:
                 action, explored = self._joint([self._greedy(i, state) for i in range(self.learners)]), 0
             else:
                 bits = draw(self.seed, EVALUATION_ACTION, trial, t)
@@ -207,6 +248,12 @@ class Twin:
         row = self.tables[i][state]
         return row.index(max(row))
 
+    def _unexploring(self, i: int, state: int, episode: int, t: int) -> int:
+        if self.config.algorithm != "wolf_phc":
+            return self._greedy(i, state)
+        u = uniform(draw(self.seed, POLICY, episode, t * self.learners + i))
+        return pick(list(enumerate(self.policies[i][state])), u)
+
     def _joint(self, actions: list[int]) -> int:
         joint = 0
         for action, width in zip(actions, self.widths, strict=True):
@@ -223,7 +270,7 @@ class Twin:
     def _epsilon_greedy(self, state: int, episode: int, t: int, step: int) -> tuple[int, int]:
         """Return the joint action, and who explored (bit i: learner i)."""
         epsilon = self.epsilon(episode, step)
-        actions = [self._greedy(i, state) for i in range(self.learners)]
+        actions = [self._unexploring(i, state, episode, t) for i in range(self.learners)]
         if self.config.exploration == "shared":
             bits = draw(self.seed, EXPLORATION, episode, t)
             if coin(bits) < epsilon:
@@ -260,14 +307,92 @@ class Twin:
         return step, k
 
     def _learn(self, step: Step, step_size: float, discount: float) -> None:
-        quirks = self.config.quirks
+        quirks, learn_value = self.config.quirks, getattr(self, f"_{self.config.algorithm}")
         own = self._own(step.action)
-        for i, table in enumerate(self.tables):
-            td_target = step.rewards[i]
-            if not step.terminated or quirks.bootstrap_after_termination:
-                td_target += discount * max(table[step.next_state])
-            row, action = table[step.state], own[0 if quirks.second_table_uses_first_action else i]
-            row[action] = row[action] + step_size * (td_target - row[action])
+        self.chosen = None
+        if self.config.algorithm == "sarsa":
+            self.chosen = self._epsilon_greedy(step.next_state, step.episode, step.t + 1, step.step + 1)
+        if step.terminated and not quirks.bootstrap_after_termination:
+            discount = None  # the next state does not count
+        for i in range(self.learners):
+            learn_value(step, i, own[0 if quirks.second_table_uses_first_action else i], step_size, discount)
+
+    def _q_learning(self, step: Step, i: int, action: int, step_size: float, discount: float | None) -> None:
+        """Sutton and Barto, section 6.5."""
+        td_target = step.rewards[i]
+        if discount is not None:
+            td_target += discount * max(self.tables[i][step.next_state])
+        self._towards(self.tables[i][step.state], action, td_target, step_size)
+
+    def _sarsa(self, step: Step, i: int, action: int, step_size: float, discount: float | None) -> None:
+        """Sutton and Barto, section 6.4; the next action is chosen by the tables before this update."""
+        td_target = step.rewards[i]
+        if discount is not None:
+            assert self.chosen is not None
+            td_target += discount * self.tables[i][step.next_state][self._own(self.chosen[0])[i]]
+        self._towards(self.tables[i][step.state], action, td_target, step_size)
+
+    def _expected_sarsa(
+        self, step: Step, i: int, action: int, step_size: float, discount: float | None
+    ) -> None:
+        """Sutton and Barto, section 6.6."""
+        td_target, row = step.rewards[i], self.tables[i][step.next_state]
+        if discount is not None:
+            epsilon = self.epsilon(step.episode, step.step + 1)
+            total = 0.0
+            for value in row:
+                total += value
+            td_target += discount * (epsilon * (total / len(row)) + (1.0 - epsilon) * max(row))
+        self._towards(self.tables[i][step.state], action, td_target, step_size)
+
+    def _double_q_learning(
+        self, step: Step, i: int, action: int, step_size: float, discount: float | None
+    ) -> None:
+        """Sutton and Barto, section 6.7; van Hasselt 2010, algorithm 1."""
+        one, other = self.doubles[0][i], self.doubles[1][i]
+        if coin(draw(self.seed, UPDATE, step.episode, step.t * self.learners + i)) >= 0.5:
+            one, other = other, one
+        td_target, following = step.rewards[i], one[step.next_state]
+        if discount is not None:
+            td_target += discount * other[step.next_state][following.index(max(following))]
+        self._towards(one[step.state], action, td_target, step_size)
+        self.tables[i][step.state][action] = self._mean(i, step.state, action)
+
+    def _hysteretic_q_learning(
+        self, step: Step, i: int, action: int, step_size: float, discount: float | None
+    ) -> None:
+        """Matignon, Laurent and Le Fort-Piat 2007, equation 6."""
+        td_target, row = step.rewards[i], self.tables[i][step.state]
+        if discount is not None:
+            td_target += discount * max(self.tables[i][step.next_state])
+        delta = td_target - row[action]
+        rises = delta >= 0
+        decrease = value_of(self.config.hysteretic.decrease, step.episode, step.step)
+        row[action] = row[action] + (step_size if rises else decrease) * delta
+
+    def _wolf_phc(self, step: Step, i: int, action: int, step_size: float, discount: float | None) -> None:
+        """Bowling and Veloso 2002, table 5: the value, the average policy, the policy."""
+        self._q_learning(step, i, action, step_size, discount)
+        s, n, wolf = step.state, self.widths[i], self.config.wolf_phc
+        q, policy, average = self.tables[i][s], self.policies[i][s], self.averages[i][s]
+        self.visits[i][s] += 1
+        for a in range(n):
+            average[a] = average[a] + (policy[a] - average[a]) / self.visits[i][s]
+        worth = usual = 0.0
+        for a in range(n):
+            worth += policy[a] * q[a]
+            usual += average[a] * q[a]
+        delta = value_of(wolf.win if worth > usual else wolf.lose, step.episode, step.step)
+        greedy, gained = self._greedy(i, s), 0.0
+        for a in range(n):
+            if a != greedy:
+                lost = min(policy[a], delta / (n - 1))
+                policy[a] = policy[a] - lost
+                gained += lost
+        policy[greedy] = policy[greedy] + gained
+
+    def _towards(self, row: list[float], action: int, td_target: float, step_size: float) -> None:
+        row[action] = row[action] + step_size * (td_target - row[action])
 
     def _record(self, phase: Phase, step: Step, outcome: int) -> None:
         phase.steps.append(step)

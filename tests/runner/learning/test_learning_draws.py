@@ -21,7 +21,7 @@ PUBLISHED = [
     16408922859458223821,
 ]
 """The first outputs of SplitMix64 seeded with 1234567, as its reference implementation prints them."""
-STREAMS = range(8)
+STREAMS = range(9)
 
 
 @numba.njit
@@ -70,7 +70,7 @@ def test_keys_and_numbers_are_the_twins(seed):
 
 def test_the_streams_have_the_specified_numbers():
     names = ("START", "EXPLORATION", "OUTCOME", "UPDATE")
-    names += ("EVALUATION_START", "EVALUATION_OUTCOME", "EVALUATION_ACTION", "INITIAL_Q")
+    names += ("EVALUATION_START", "EVALUATION_OUTCOME", "EVALUATION_ACTION", "INITIAL_Q", "POLICY")
     assert [getattr(draws, name) for name in names] == [getattr(oracle, name) for name in names]
 
 

@@ -7,24 +7,44 @@ import pytest
 
 from runner.learning import kernel
 from runner.learning.learner import Learner
-from tests.runner.learning.harness import GAMES, RULES, SMALL, Played, experiment, train
+from tests.runner.learning.harness import ALGORITHMS, GAMES, RULES, SMALL, Played, experiment, train
 
 
 def replayed(config, mdp, seed, steps, tables=None):
     """Return the tables after these steps."""
     learner = Learner(config, mdp, seed, tables)
-    kernel.replay(learner.model, learner.tables, learner.rules, steps, np.empty((0, 0, 0)))
+    kernel.replay(learner.seed, learner.model, learner.tables, learner.rules, steps, np.empty((0, 0, 0)))
     return learner.tables
 
 
-@pytest.mark.parametrize("rules", RULES)
+def same(left, right):
+    """Compare all that two learners' tables hold, bit for bit."""
+    for kept in ("q", "greedy", "value", "kept", "visits"):
+        assert getattr(left, kept).tobytes() == getattr(right, kept).tobytes(), kept
+
+
+@pytest.mark.parametrize("rules", RULES | ALGORITHMS)
 def test_all_steps_replayed_give_the_tables(rules):
-    config, mdp = experiment(SMALL, {"epsilon": 0.4, "step_size": 0.3}, RULES[rules])
+    config, mdp = experiment(SMALL, {"epsilon": 0.4, "step_size": 0.3}, (RULES | ALGORITHMS)[rules])
     learner = Learner(config, mdp, 2)
     steps = train(learner, 10**6, 3000, block=1000).steps
-    again = replayed(config, mdp, 2, steps)
-    for kept in ("q", "greedy", "value"):
-        assert getattr(again, kept).tobytes() == getattr(learner.tables, kept).tobytes()
+    same(replayed(config, mdp, 2, steps), learner.tables)
+
+
+@pytest.mark.parametrize("rules", ALGORITHMS)
+def test_steps_after_any_moment_give_the_tables_from_what_was_held_then(rules):
+    config, mdp = experiment(SMALL, {"epsilon": 0.4, "step_size": 0.3}, ALGORITHMS[rules])
+    learner = Learner(config, mdp, 2)
+    for stop in (7, 33, 34, 1777):  # also within an episode
+        train(learner, 10**6, stop, block=1000)
+        held = [
+            {name: array.copy() for name, array in learner.held(i).items()}
+            for i in range(len(learner.agents))
+        ]
+        other = Learner(config, mdp, 2)
+        train(other, 10**6, stop, block=1000)
+        steps = train(other, 10**6, stop + 500, block=77).steps
+        same(replayed(config, mdp, 2, steps, held), other.tables)
 
 
 @pytest.mark.parametrize("game", GAMES)
@@ -32,10 +52,11 @@ def test_steps_after_a_snapshot_give_the_tables_from_it(game):
     config, mdp = experiment(GAMES[game], {"epsilon": 0.6, "step_size": 0.3, "initial_q": "random"})
     learner = Learner(config, mdp, 11)
     before: Played = train(learner, 10**6, 1777, block=1000)
-    snapshot = [learner.table(i).copy() for i in range(len(learner.agents))]
+    snapshot = [{"q": learner.table(i).copy()} for i in range(len(learner.agents))]
     after = train(learner, 10**6, 4000, block=1000)
     assert (
-        replayed(config, mdp, 11, before.steps).q.tobytes() == np.concatenate(snapshot, axis=None).tobytes()
+        replayed(config, mdp, 11, before.steps).q.tobytes()
+        == np.concatenate([held["q"] for held in snapshot], axis=None).tobytes()
     )
     assert replayed(config, mdp, 11, after.steps, snapshot).q.tobytes() == learner.tables.q.tobytes()
 

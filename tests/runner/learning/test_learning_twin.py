@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from runner.config import from_mapping
+from runner.config.model import Algorithm
 from runner.errors import EnvironmentNotUsable
 from runner.learning.learner import Learner
 from runner.mdp import Mdp
 from tests.runner.learning.harness import (
+    ALGORITHMS,
     COMPETITIVE,
     GAMES,
     RULES,
@@ -60,6 +63,20 @@ def test_trajectories_and_tables_are_the_twins_by_every_rule(rules):
     twin = assert_kernel_is_twin(config, mdp, seed=2, blocks=[1, 7, 1000])
     ends = {(episode.terminated, episode.truncated) for episode in twin.training.episodes}
     assert {(True, False), (False, True)} <= ends, "the case must see episodes end both ways"
+
+
+@pytest.mark.parametrize("rules", ALGORITHMS)
+def test_trajectories_and_tables_are_the_twins_by_every_algorithm(rules):
+    config, mdp = experiment(SMALL, {"epsilon": 0.4, "step_size": 0.3}, ALGORITHMS[rules])
+    twin = assert_kernel_is_twin(config, mdp, seed=2, blocks=[1, 7, 1000])
+    assert any(episode.truncated for episode in twin.training.episodes), "the case must see episodes cut off"
+
+
+@pytest.mark.parametrize("game", ["slipping", "frozen lake", "taxi in the rain"])
+@pytest.mark.parametrize("algorithm", ["sarsa", "expected_sarsa", "double_q_learning", "wolf_phc"])
+def test_every_algorithm_plays_games_of_chance_as_its_twin(algorithm, game):
+    config, mdp = experiment(GAMES[game], {"epsilon": 0.6, "step_size": 0.3, "algorithm": algorithm})
+    assert_kernel_is_twin(config, mdp, seed=11, blocks=[1000], until=(10**6, 1500))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2**32 + 5, 2**63, 2**64 - 1])
@@ -115,7 +132,7 @@ settings_of_learners = st.fixed_dictionaries(
         "discount": fractions | schedules,
         "step_size": st.floats(0.01, 1.0),
         "exploration": st.sampled_from(["shared", "independent"]),
-        "algorithm": st.sampled_from(["q_learning", "q_learning", "random"]),
+        "algorithm": st.sampled_from(get_args(Algorithm)),
         "initial_q": st.floats(-2.0, 2.0) | st.just("random"),
         "quirks": st.fixed_dictionaries(
             {
@@ -128,9 +145,11 @@ settings_of_learners = st.fixed_dictionaries(
 )
 
 
-@settings(deadline=None, max_examples=120)
+@settings(deadline=None, max_examples=200)
 @given(random_mdps(), settings_of_learners, st.integers(0, 2**64 - 1), st.integers(1, 40))
 def test_any_game_by_any_rule_is_learned_as_the_twin_does(mdp, values, seed, block):
+    if values["algorithm"] not in ("q_learning", "random"):
+        values["quirks"]["second_table_uses_first_action"] = False
     config = from_mapping({"episodes": 100, "mode": "competitive"} | values)
     assume(len(set(mdp.action_counts)) == 1 or not config.quirks.second_table_uses_first_action)
     assert_kernel_is_twin(config, mdp, seed, [block], until=(40, 120))

@@ -1,0 +1,63 @@
+"""Which algorithm learns, and what only some of them have, is said by one key and its section."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import pytest
+
+from runner.config import from_mapping
+from runner.config.model import Algorithm
+from runner.learning.algorithms import NUMBERS
+
+TWO = {"episodes": 1, "tables": "per_agent", "rewards": "team"}
+
+
+@pytest.mark.parametrize("algorithm", get_args(Algorithm))
+def test_every_algorithm_is_known_and_survives_the_round_trip(algorithm):
+    config = from_mapping(TWO | {"algorithm": algorithm})
+    assert from_mapping(config.to_mapping()) == config
+    assert algorithm in NUMBERS
+
+
+def test_a_section_is_there_for_its_algorithm_alone():
+    assert from_mapping(TWO | {"algorithm": "hysteretic_q_learning"}).to_mapping()["hysteretic"] == {
+        "decrease": 0.01
+    }
+    wolf = from_mapping(TWO | {"algorithm": "wolf_phc", "wolf_phc": {"win": 0.1}}).to_mapping()
+    assert wolf["wolf_phc"] == {"win": 0.1, "lose": 0.2}
+    assert not {"hysteretic", "wolf_phc"} & from_mapping(TWO).to_mapping().keys()
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("algorithm: sarssa", "x.yaml:2:1: algorithm: found 'sarssa', expected"),
+        (
+            "algorithm: hysteretic_q_learning",
+            "x.yaml:2:1: algorithm: found 'hysteretic_q_learning', which is",
+        ),
+        (
+            "hysteretic: {decrease: 0.1}",
+            "x.yaml:2:1: hysteretic: goes with algorithm: hysteretic_q_learning",
+        ),
+        (
+            "algorithm: wolf_phc\nwolf_phc: {win: 0.3}",
+            "x.yaml:3:12: wolf_phc.win: found 0.3, expected at most",
+        ),
+        ("algorithm: wolf_phc\nwolf_phc: {loose: 0.3}", "x.yaml:3:12: wolf_phc.loose: unknown key"),
+        ("algorithm: wolf_phc\nwolf_phc: {lose: 0}", "x.yaml:3:12: wolf_phc.lose: found 0, expected"),
+        (
+            "algorithm: sarsa\nmode: competitive\nquirks: {second_table_uses_first_action: true}",
+            "x.yaml:4:10: quirks.second_table_uses_first_action: needs algorithm: q_learning",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_told_with_its_place(told, text, line):
+    (found,) = told("episodes: 1\n" + text)
+    assert found.startswith(line), found
+
+
+def test_the_near_name_is_told(told):
+    assert told("episodes: 1\nalgorithm: sarssa")[0].endswith("Did you mean 'sarsa'?")
+    assert told("episodes: 1\nalgorithm: wolf_phc\nwolf_phc: {loose: 0.3}")[0].endswith("'lose'?")
