@@ -102,6 +102,7 @@ def execute(session: Session, file: RecordingFile, run: Run, started: float) -> 
             write_result(file, {"status": status, "error": str(error)})
         with contextlib.suppress(StorageError):  # nor need there be room for this
             run.update(status=status, summary={"error": str(error), "bytes": file.size})
+        _tell_what_next(run, error)
         raise
     summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": file.size}
     return run.update(status=status, summary=summary)
@@ -115,7 +116,14 @@ def _failing(run: Run) -> Iterator[None]:
     except RunnerError as error:
         with contextlib.suppress(StorageError):
             run.update(status="failed", summary={"error": str(error)})
+        _tell_what_next(run, error)
         raise
+
+
+def _tell_what_next(run: Run, error: BaseException) -> None:
+    """Add to the error of a full disk how to go on with what was recorded."""
+    if isinstance(error, StorageError) and run.recording.exists():
+        error.add_note(f"`dualtaxi resume {run.run_id}` goes on when there is room.")
 
 
 def _create(path: Path) -> RecordingFile:
@@ -364,6 +372,7 @@ def describe(
     try:
         _describe(file, job, run, learner, made_by or provenance())
     except OSError as error:
+        file.cut_back()
         raise storage_error(file, error) from error
 
 

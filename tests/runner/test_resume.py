@@ -370,8 +370,10 @@ def test_after_a_full_disk(whole, tmp_path, monkeypatch, room):
 
     with monkeypatch.context() as patch:
         patch.setattr(RecordingFile, "_append", filling)
-        with pytest.raises(StorageError, match="No space left"):
+        with pytest.raises(StorageError, match="No space left") as full:
             run_job(Job(config, 0), run)
+        if run.recording.exists():
+            assert f"`dualtaxi resume {run.run_id}`" in "".join(full.value.__notes__)
         assert find_run(run.run_id, tmp_path).status == "failed"
         with pytest.raises(StorageError, match="No space left"):  # it is still full
             resume(find_run(run.run_id, tmp_path))

@@ -75,6 +75,15 @@ def test_another_writers_file(command, tmp_path, name):
 # --- resume -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("name", ["verify", "repair"])
+def test_a_run_that_was_killed_before_it_had_a_recording(command, copied, name):
+    copied.recording.unlink()
+    copied.update(status="interrupted", summary={})
+    result = command(name, copied.run_id)
+    assert result.exit_code == 2
+    assert f"`dualtaxi resume {copied.run_id}` does it from the beginning" in result.stderr
+
+
 def test_resume(command, copied, recorded_run):
     cut(copied)
     assert command.json("ls")[0]["status"] == "interrupted"
