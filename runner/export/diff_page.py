@@ -189,14 +189,14 @@ def _map(mdp: Mdp, apart: NDArray[np.float64], agent: str) -> list[dict[str, Any
     values[at] = apart[states]
     bounds = (0.0, float(np.nanmax(values)))
     title = f"Largest difference of {agent}'s Q-values in each state"
-    told = situation_in_words(mdp, state, movers)
+    fixed = situation_in_words(mdp, state, movers)
+    caption = f"{title}, in the end, where it is largest{f' ({fixed})' if fixed else ''}."
     if len(movers) == 2:
         one, other = (mdp.scene["things"][mover]["label"] for mover in movers)
-        told = f"large square: where {one} is; in it, where {other} is. {told}"
+        caption += f" Large square: where {one} is; in it, where {other} is."
         picture = svg_maps.pair_map(mdp.scene, values, bounds, title)
     else:
         picture = svg_maps.policy_map(mdp.scene, values, [None] * cells, bounds, title)
-    caption = f"{title}, in the end, in the situation where it is largest: {told}"
     return [{"svg": picture, "caption": caption, "high": bounds[1]}]
 
 
