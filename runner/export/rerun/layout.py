@@ -72,6 +72,17 @@ def blueprint(
     )
 
 
+def loop_blueprint(parts: Sequence[Any]) -> rrb.Blueprint:
+    """Return the arrangement for somebody's own loops, each arranged already."""
+    return rrb.Blueprint(
+        parts[0] if len(parts) == 1 else rrb.Vertical(*parts),
+        rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_A_SECOND, play_state="paused"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+    )
+
+
 def _single(run: Shown) -> list[Any]:
     left = rrb.Vertical(_grid(run), _events(run), row_shares=[3, 1])
     if not run.values:

@@ -100,9 +100,13 @@ def select(recording: Recording, request: Request) -> Selection:
     Raises:
         RecordingError: an episode or evaluation does not exist, or steps are asked for and not recorded.
     """
+    if recording.kind != "job":
+        from runner.export.rerun.loops import select_loop
+
+        return select_loop(recording, request)
     selection = Selection()
     if not recording.finished or recording.result.get("status", "interrupted") != "finished":
-        selection.warnings.append(_interrupted(recording))
+        selection.warnings.append(interrupted(recording))
     if recording.mdp.scene is None or recording.mdp.scene_cells is None:
         selection.warnings.append("The environment has no scene: state and action are shown as series.")
     if _has_no_steps(recording):
@@ -118,6 +122,16 @@ def select(recording: Recording, request: Request) -> Selection:
     ]
     _tell(selection, request, train, numbers, evaluations, wanted)
     return selection
+
+
+def chosen_spans(recording: Recording, request: Request) -> list[Span]:
+    """Return the training steps that a request means.
+
+    Raises:
+        RecordingError: an episode does not exist.
+    """
+    train = episodes_of(recording, "train")
+    return spans_of(train, _training_episodes(recording, request, train))
 
 
 def episodes_of(recording: Recording, phase: str) -> Episodes:
@@ -222,7 +236,8 @@ def _without_steps(recording: Recording, request: Request, selection: Selection)
     selection.warnings.append(f"The run was recorded without steps: only metrics are exported; {hint}.")
 
 
-def _interrupted(recording: Recording) -> str:
+def interrupted(recording: Recording) -> str:
+    """Return what is to be said of a run that did not finish."""
     status = recording.result.get("status", "interrupted")
     return f"The run is {status}: exported is what there is, up to its last whole chunk."
 

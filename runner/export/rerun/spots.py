@@ -52,6 +52,8 @@ def where_they_part(runs: Sequence[Run]) -> tuple[tuple[int, ...] | None, str]:
     part, or where it cannot be known.
     """
     with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
+        if not a.kind == b.kind == "job":
+            return None, "Where two loops part is told by `dualtaxi diff`."
         if not can_compare_steps(a, b):
             return (
                 None,
@@ -121,6 +123,8 @@ def _including(request: Request, more: Request) -> Request:
 def _beginning(recording: Recording, request: Request) -> int:
     """Return the first step of the last evaluation exported, or else of the last training episode."""
     selection = select(recording, request)
+    if recording.kind == "variable":
+        return 0
     topic, first = schema.EVAL_STEP, [span.start for _, span in selection.evaluations[-1:]]
     if not first:
         topic, first = schema.TRAIN_STEP, [span.start for span in selection.train[-1:]]

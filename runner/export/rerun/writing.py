@@ -12,11 +12,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from runner.errors import StorageError
+from runner.errors import RecordingError, StorageError
 from runner.export.rerun.ahead import ahead
 from runner.export.rerun.classes import Vocabulary, vocabulary_of
 from runner.export.rerun.columns import Batch, Sender, ink, instances, place, texts
-from runner.export.rerun.layout import Shown, blueprint, draw_background
+from runner.export.rerun.layout import Shown, blueprint, draw_background, loop_blueprint
 from runner.export.rerun.metrics import MetricWriter, send_metrics
 from runner.export.rerun.scene import TRAIL_STEPS, Marks, Scene, marks_of, scene_of
 from runner.export.rerun.selection import Request, Selection, select
@@ -55,6 +55,8 @@ def export(sources: Sequence[Source], request: Request, path: Path) -> list[Sele
     selections = [select(source.recording, request) for source in sources]
     fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     stream = new_stream("-".join(source.recording.run["run_id"] for source in sources))
+    if any(source.recording.kind != "job" for source in sources):
+        return _export_loops(stream, sources, selections, path, fresh)
     exporters = [
         RunExporter(stream, source, selection) for source, selection in zip(sources, selections, strict=True)
     ]
@@ -63,6 +65,49 @@ def export(sources: Sequence[Source], request: Request, path: Path) -> list[Sele
         stream.send_recording_name(" and ".join(source.title for source in sources))
         for exporter in exporters:
             exporter.export()
+        stream.flush()
+        stream.disconnect()
+        fresh.replace(path)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
+    finally:
+        fresh.unlink(missing_ok=True)
+    return selections
+
+
+def _export_loops(
+    stream: rr.RecordingStream,
+    sources: Sequence[Source],
+    selections: list[Selection],
+    path: Path,
+    fresh: Path,
+) -> list[Selection]:
+    """Write somebody's own loops to an `.rrd` file."""
+    from runner.export.rerun.loops import LoopExporter
+
+    for source in sources:
+        if source.recording.kind == "job":
+            raise RecordingError(
+                f"{source.recording.path}: was trained here, the other was recorded from a loop; "
+                "look at them one by one."
+            )
+    exporters = [
+        LoopExporter(stream, source.recording, selection, source.root)
+        for source, selection in zip(sources, selections, strict=True)
+    ]
+    try:
+        stream.save(fresh)
+        stream.send_recording_name(" and ".join(source.title for source in sources))
+        for exporter in exporters:
+            exporter.export()
+        stream.send_blueprint(
+            loop_blueprint(
+                [
+                    exporter.blueprint(source.title)
+                    for exporter, source in zip(exporters, sources, strict=True)
+                ]
+            )
+        )
         stream.flush()
         stream.disconnect()
         fresh.replace(path)

@@ -148,3 +148,17 @@ def test_an_interrupted_loop_is_not_resumed(tmp_path):
     assert done.exit_code == 2
     assert "which alone can do it again" in done.output
     assert env.run.recording.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_rerun_gets_what_a_loop_recorded(folder, name, tmp_path):
+    from rerun.chunk import RrdReader
+
+    exported = dualtaxi(folder, "export", "rerun", name, "-o", str(tmp_path / "loop.rrd"))
+    assert exported.exit_code == 0, exported.output
+    assert "400 of 400 training steps" in exported.output
+    store = RrdReader(str(tmp_path / "loop.rrd")).store()
+    paths = {str(column.entity_path) for column in store.schema().component_columns()}
+    assert {"/train/return", "/eval/return", "/train/reward", "/logged/loss", "/log"} <= paths
+    assert ("/train/grid/things" in paths) == (name == "lake")
+    assert ("/train/observation" in paths) == (name == "pole")
