@@ -2,9 +2,9 @@
 
 import json
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from jsonschema import Draft202012Validator
 
 from runner.config import from_mapping, json_schema, load
 
@@ -156,6 +156,6 @@ def test_yaml_is_taken_back_to_an_equal_config(tmp_path_factory, values):
 
 @given(EXPERIMENTS)
 def test_what_is_accepted_is_what_the_schema_allows(values):
-    validator = pytest.importorskip("jsonschema").Draft202012Validator(json_schema())
+    validator = Draft202012Validator(json_schema())
     validator.validate(values)
     validator.validate(from_mapping(values).to_mapping())

@@ -6,6 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
+from rerun.chunk import RrdReader
 
 from runner.analysis.tables import TableReplay, tables_at
 from runner.export.rerun.scene import events_of_steps, marks_of, own_actions, scene_of
@@ -15,8 +16,6 @@ from runner.export.rerun.writing import Source, export
 from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import open_recording
-
-reading = pytest.importorskip("rerun.chunk")
 
 TOPICS = {"train": schema.TRAIN_STEP, "eval": schema.EVAL_STEP}
 
@@ -28,7 +27,7 @@ class Exported:
         self.recording = recording
         self.path = path
         (self.selection,) = export([Source(recording, "a run")], Request(everything=True), path)
-        self.store = reading.RrdReader(str(path)).store()
+        self.store = RrdReader(str(path)).store()
 
     def table(self, entity, component=None):
         """Return the columns of an entity's rows that have times and the component, in order of the step."""

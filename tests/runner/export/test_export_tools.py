@@ -124,7 +124,8 @@ def test_tables_of_chosen_episodes(export, taxis):
 
 @pytest.mark.parametrize("phase", ["train", "eval"])
 def test_minari_reads_the_episodes(export, taxis, phase, monkeypatch):
-    minari = pytest.importorskip("minari")
+    import minari
+
     monkeypatch.setattr("runner.export.minari._AT_ONCE", 7)
     told = export("minari", taxis.recording, "--phase", phase)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("minari").absolute()))
@@ -149,7 +150,8 @@ def test_minari_reads_the_episodes(export, taxis, phase, monkeypatch):
 
 
 def test_minari_of_chosen_and_of_cut_off_episodes(export, taxis, killed, monkeypatch):
-    minari = pytest.importorskip("minari")
+    import minari
+
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("minari").absolute()))
     export("minari", taxis.recording, "--episodes", "7")
     assert minari.load_dataset(f"taxis-{taxis.run_id}-v0").total_steps == len(
@@ -163,10 +165,9 @@ def test_minari_of_chosen_and_of_cut_off_episodes(export, taxis, killed, monkeyp
 
 
 def test_tensorboard_reads_the_measures(export, taxis):
-    pytest.importorskip("tensorboardX")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+        from tensorboard.backend.event_processing import event_accumulator as accumulator
     export("tensorboard", taxis.recording, "-o", "a/logs")
     export("tensorboard", taxis.recording, "-o", "b/logs")
     (first,), (second,) = (list(Path(place, "logs").iterdir()) for place in "ab")
@@ -222,7 +223,6 @@ def read_run(client, run):
 
 
 def test_mlflow_reads_the_run_once(export, taxis):
-    pytest.importorskip("mlflow")
     export("mlflow", taxis.recording, "--with-recording")
     (found,) = read_mlflow()
     assert "already" in export("mlflow", taxis.recording).stderr
@@ -252,7 +252,6 @@ def test_mlflow_reads_the_run_once(export, taxis):
 
 
 def test_a_store_that_cannot_be_used_is_told(export, taxis):
-    pytest.importorskip("mlflow")
     assert "cannot" in export("mlflow", taxis.recording, "--tracking-uri", "nonsense://x", code=2).stderr
 
 
