@@ -6,9 +6,12 @@ import csv
 import io
 import json
 import os
+import re
+import shlex
 import shutil
 import time
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 
 import pytest
 
@@ -358,3 +361,20 @@ def test_several_folders_are_one_list(command, make, recorded, recorded_run):
     assert {each["run_id"] for each in command.json("ls", *both)} == {run.run_id, recorded_run.run_id}
     assert str(recorded.recordings) in command("ls", *both).stdout
     assert command.json("reindex", *both)["runs"] == 2
+
+
+def documented():
+    """Return the commands in the shell examples of the page on the catalogue, as words."""
+    page = (Path(__file__).parents[3] / "docs" / "catalogue.md").read_text()
+    blocks = re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    return [shlex.split(line)[1:] for block in blocks for line in block.splitlines()]
+
+
+def test_the_documented_examples_run(command, make, monkeypatch, tmp_path):
+    make(40, "interrupted")
+    monkeypatch.chdir(tmp_path)
+    assert len(documented()) > 10
+    for words in documented():
+        result = command(*words)
+        assert result.exit_code == 0, (words, result.stderr)
+    assert command.json("ls")[0]["note"] == "the step size of the paper"

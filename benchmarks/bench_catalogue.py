@@ -1,0 +1,95 @@
+"""How long the catalogue takes: `ls` over ten thousand runs, and reading a thousand recordings anew."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from benchmarks.bench_cold_start import command
+from benchmarks.figures import Figure, figure
+from benchmarks.processes import run, run_command
+from runner.cache import CACHE_VARIABLE
+from runner.runs import RUN_FILE, list_runs
+
+LISTED, RECORDED = 10_000, 1_000
+SMALL = ("episodes=30", "env.kwargs={max_episode_steps: 40}", "evaluation.every=10", "evaluation.trials=5")
+FILTER = "status:finished config.discount:>0.5 NOT tag:keep"
+OLD = 1_700_000_000
+"""When the files were last changed, as far as can be seen: an index need not read them twice."""
+
+
+def measure(quick: bool) -> list[Figure]:
+    """Return seconds of whole commands; clock and processor time, since others' work disturbs the clock."""
+    repetitions = 3 if quick else 10
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {CACHE_VARIABLE: f"{folder}/cache", "COLUMNS": "120"}
+        small = one_run(Path(folder, "one"))
+        described = many(small, Path(folder, "described"), LISTED, recordings=False)
+        recorded = many(small, Path(folder, "recorded"), RECORDED, recordings=True)
+        for place in recorded.iterdir():
+            if int(place.name[1:]) % 2:
+                (place / RUN_FILE).unlink()
+
+        def timed(*words: str, place: Path, times: int = repetitions) -> list[float]:
+            line = [*command(*words), "--recordings", str(place)]
+            return [run(line, environment).cpu_seconds for _ in range(times)]
+
+        first = timed("ls", "--limit", "50", place=described, times=1)
+        lists = timed("ls", "--limit", "50", place=described)
+        filtered = timed("ls", "--limit", "50", "--sort", "-finish_percent", FILTER, place=described)
+        shown = timed("show", "r00042", place=described)
+        reindexed = timed("reindex", place=recorded)
+    note = f"{LISTED:,} runs, each in its folder; processor time of the whole command"
+    return [
+        figure("ls", lists, "s", (0.8, 0.4), higher_is_better=False, detail=note),
+        figure("ls with a filter, sorted", filtered, "s", (0.8, 0.4), higher_is_better=False, detail=FILTER),
+        figure("ls that makes the index first", first, "s", higher_is_better=False),
+        figure("show of a run by the beginning of its id", shown, "s", higher_is_better=False),
+        figure(
+            f"reindex of {RECORDED:,} recordings",
+            reindexed,
+            "s",
+            (20, 5),
+            higher_is_better=False,
+            detail="small ones, copied; half of them without run.json, so that they are opened",
+        ),
+    ]
+
+
+def one_run(folder: Path) -> Path:
+    """Return the folder of a small run."""
+    run(run_command("cooperative", str(folder), *SMALL))
+    (small,) = list_runs(folder)
+    return small.folder
+
+
+def many(small: Path, folder: Path, count: int, recordings: bool) -> Path:
+    """Return a folder with runs like one, but with ids, seeds, settings and results of their own."""
+    facts = json.loads((small / RUN_FILE).read_text())
+    rng = random.Random(0)
+    for number in range(count):
+        place = folder / f"r{number:05}"
+        if recordings:
+            shutil.copytree(small, place)
+        else:
+            place.mkdir(parents=True)
+            (place / "recording.mcap").write_bytes(b"")
+        facts |= {"run_id": place.name, "seed": number % 10, "name": f"experiment{number % 37}"}
+        facts["created"] = f"2026-{1 + number % 12:02}-{1 + number % 28:02}T10:00:00.{number % 1000:03}+00:00"
+        facts["config"] |= {"discount": rng.random(), "name": facts["name"]}
+        facts["summary"]["last_evaluation"] = {"finish_percent": rng.uniform(0, 100)}
+        facts["summary"]["content_digest"] = f"{rng.getrandbits(256):064x}"
+        (place / RUN_FILE).write_text(json.dumps(facts, indent=1))
+        age(place.iterdir())
+    return folder
+
+
+def age(paths: Iterable[Path]) -> None:
+    """Make files look as if they had last changed long ago."""
+    for path in paths:
+        os.utime(path, (OLD, OLD))
