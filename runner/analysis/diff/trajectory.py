@@ -308,7 +308,7 @@ class _Steps:
         if block is None:
             return False
         states = len(self._visits)
-        if (found := int(block["state"].max())) >= states:
+        if (found := int(block["state"].max(initial=0))) >= states:
             raise RecordingError(
                 f"{self._path}: found state {found} in training step {block['step'][0]} or soon after, "
                 f"expected less than {states}; `dualtaxi verify` names the step."
