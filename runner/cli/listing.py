@@ -29,6 +29,9 @@ PROGRAMS: Final = (
 """What programs are told of a run, unless they ask for other columns."""
 _FIELD_OF: Final = {"run_id": "id", "tags": "tag", "content_digest": "digest"}
 _HEADINGS: Final = {"finish_percent": "finished %", "bytes": "size", "tag": "tags", "same_as": "same as"}
+_NARROWEST: Final = 14
+"""The width at which a shrinking column can still be read."""
+_MISSED: Final = ("config", "bytes", "episodes", "seed", "folder", "age")
 _OFTEN_EMPTY: Final = ("tag", "same_as", "note", "archive")
 _LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
 _SHRINKING: Final = ("name", "config", "tags", "note", "environment", "host", "archive", "folder", "path")
@@ -117,6 +120,21 @@ def print_table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
     for line in cells:
         drawn.add_row(*line)
     draw(drawn)
+
+
+def fitting(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> list[str]:
+    """Return the columns that fit a terminal, less those that can best be missed where it is narrow."""
+    kept, drawn = list(columns), console()
+    widths = {
+        column: max(len(_HEADINGS.get(column, column)), *(len(_cell(row, column)) for row in rows)) + 2
+        for column in columns
+    }
+    for column in _SHRINKING:
+        widths[column] = min(widths.get(column, 0), _NARROWEST)
+    for column in _MISSED:
+        if drawn.is_terminal and column in kept and sum(map(widths.__getitem__, kept)) > drawn.width:
+            kept.remove(column)
+    return kept
 
 
 def _aligned(lines: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:

@@ -58,7 +58,7 @@ def command(
 
     Shown are the training episodes done (of those to do, where some are missing), how many percent of the
     last evaluation's trials finished, the size of the recording, how long ago the run began, and which run
-    recorded the same content before.
+    recorded the same content before; some of that is left out where a terminal is narrow.
 
     \b
     Examples:
@@ -85,7 +85,8 @@ def command(
     elif as_csv:
         listing.print_csv(rows, shown or listing.PROGRAMS)
     elif rows:
-        listing.print_table(rows, shown or listing.usual_columns(rows, len(recordings)))
+        usual = listing.usual_columns(rows, len(recordings))
+        listing.print_table(rows, shown or listing.fitting(rows, usual))
     _tell_the_rest(rows, total, offset, chosen, recordings)
 
 
