@@ -1,4 +1,4 @@
-"""The archive of the cooperative tutorial: bytes a step, seconds each way, peak memory; also of a longer run."""
+"""The archive of the cooperative tutorial: bytes a step, seconds each way, peak memory; also when longer."""
 
 from __future__ import annotations
 
