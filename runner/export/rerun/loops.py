@@ -316,6 +316,10 @@ class _Grid:
         self._events = EventWriter(stream, path, phase, mdp)
         self._writer.dress()
         self._phase = phase
+        self._trained = np.concatenate(
+            [np.empty(0, np.uint64), *(b["log_time"] for b in recording.blocks(schema.TRAIN_EPISODE))]
+        )
+        """When each training episode ended."""
         self._before: NDArray[np.void] | None = None
         self._last = -1
 
@@ -326,7 +330,10 @@ class _Grid:
         if self._last >= 0 and time[0] != self._last + 1:
             gaps.insert(0, self._last + 1)
         before = steps[:0] if self._before is None else self._before
-        batch = Batch(steps, no_thoughts(), steps["episode"].astype(np.int64), before, time)
+        episode = steps["episode"].astype(np.int64)
+        if self._phase == "eval":
+            episode = np.searchsorted(self._trained, steps["log_time"])
+        batch = Batch(steps, no_thoughts(), episode, before, time)
         self._writer.write(batch, self._phase)
         self._events.write(batch)
         if gaps:
