@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import time
+from typing import get_args
+
 import gymnasium
 import numpy as np
 
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.learners import train, tutorial_learner
+from runner.config.model import Algorithm
 
+ALGORITHMS = [name for name in get_args(Algorithm) if name != "random"]
 EPSILON = 0.8
 STEP_SIZE = 0.1
 DISCOUNT = 0.7
@@ -39,6 +44,27 @@ def measure(quick: bool) -> list[Figure]:
             "M steps/s",
             detail="gymnasium.make, env.step, NumPy argmax and max; records nothing",
         ),
+        *algorithms(repetitions),
+    ]
+
+
+def algorithms(repetitions: int) -> list[Figure]:
+    """Return steps a second of processor time of each algorithm, all of them in turn in each repetition."""
+    cases = [("mode=cooperative", name) for name in ALGORITHMS if name != "hysteretic_q_learning"]
+    cases += [("mode=competitive", name) for name in ALGORITHMS]
+    speeds: dict[tuple[str, str], list[float]] = {case: [] for case in cases}
+    for mode, name in cases:
+        train(tutorial_learner(mode, f"algorithm={name}"), 100)  # compiles
+    for _ in range(repetitions):
+        for mode, name in cases:
+            learner = tutorial_learner(mode, f"algorithm={name}", "episodes=1000")
+            begun = time.process_time()
+            train(learner, learner.config.episodes)
+            speeds[mode, name].append(learner.step / (time.process_time() - begun) / 1e6)
+    tables = {"mode=cooperative": "one table of 36 actions", "mode=competitive": "two tables of 6 actions"}
+    return [
+        figure(f"  {name}, {tables[mode]}", values, "M steps/s", detail="processor time")
+        for (mode, name), values in speeds.items()
     ]
 
 

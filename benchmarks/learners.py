@@ -19,9 +19,9 @@ BLOCK_EPISODES = 2_048
 NO_LIMIT = 2**62
 
 
-def tutorial_learner() -> Learner:
+def tutorial_learner(*overrides: str) -> Learner:
     """Return an untrained learner of the cooperative tutorial: one joint table, epsilon 0.8."""
-    config = load(ROOT / "configs" / "tutorial_cooperative.yaml")
+    config = load(ROOT / "configs" / "tutorial_cooperative.yaml", overrides)
     return Learner(config, load_mdp(config.env.id, config.env.kwargs, config.rewards), seed=0)
 
 

@@ -63,7 +63,7 @@ class Cause:
     """Why two runs part at a step."""
 
     kind: str
-    """start, exploration, random_action, greedy_action, transition, or end."""
+    """start, exploration, random_action, greedy_action, policy_action, transition, or end."""
     text: str
     rows: list[Row] = field(default_factory=list)
     """The Q-values of each agent in the state in which the greedy actions differ."""
@@ -153,6 +153,8 @@ def _greedy(
     from runner.analysis.tables import TableReplay
 
     cause = Cause("greedy_action", f"other greedy action: {text}")
+    if "wolf_phc" in (a.config.get("algorithm"), b.config.get("algorithm")):
+        cause = Cause("policy_action", f"another action, drawn from a learned policy: {text}")
     steps = [_training_step(parting, recording) for recording in (a, b)]
     known = training is not None and training[0].step < min(steps)
     try:

@@ -45,8 +45,9 @@ def command(
 ) -> None:
     """Tell the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
 
-    With --state: its values, the greedy action (ties go to the first), how often each action was taken
-    there so far, and which step last changed each value. In Python: runner.analysis.tables.tables_at().
+    With --state: its values, the policy if the algorithm learns one, the greedy action (ties go to the
+    first), how often each action was taken there so far, and which step last changed each value. In Python:
+    runner.analysis.tables.tables_at().
 
     \b
     Examples:
@@ -101,7 +102,8 @@ def _state(recording: Recording, replay: Any, state: int) -> dict[str, Any]:
     history = history_of(recording, state, replay.step)
     joint, own = actions_in_words(mdp), action_names(mdp)
     values = []
-    for i, (agent, q) in enumerate(zip(replay.agents, replay.tables, strict=True)):
+    for i, (agent, held) in enumerate(zip(replay.agents, replay.held, strict=True)):
+        q = held["q"]
         names = joint if q.shape[1] == mdp.joint_actions else own[i] if own else range(q.shape[1])
         for action, name in enumerate(names):
             changed = int(history.changed_step[i, action])
@@ -111,6 +113,7 @@ def _state(recording: Recording, replay: Any, state: int) -> dict[str, Any]:
                     "action": action,
                     "action_in_words": str(name),
                     "value": float(q[state, action]),
+                    **({"policy": float(held["policy"][state, action])} if "policy" in held else {}),
                     "greedy": bool(replay.greedy[i, state] == action),
                     "visits": int(history.visits[i, action]),
                     "changed_step": None if changed < 0 else changed,
@@ -158,8 +161,9 @@ def _draw(told: dict[str, Any]) -> None:
 
 
 def _drawn(rows: list[dict[str, Any]]) -> Any:
+    policy = ("policy",) if "policy" in rows[0] else ()
     drawn = table(
-        *("action", "", "value", "greedy", "visits", "last changed by step", "in episode"),
+        *("action", "", "value", *policy, "greedy", "visits", "last changed by step", "in episode"),
         left=("", "greedy"),
     )
     for row in rows:
@@ -168,6 +172,7 @@ def _drawn(rows: list[dict[str, Any]]) -> Any:
             str(row["action"]),
             row["action_in_words"],
             number(row["value"], 4),
+            *(number(row[name], 4) for name in policy),
             "greedy" if row["greedy"] else "",
             f"{row['visits']:,}",
             f"{row['changed_step']:,}" if changed else UNKNOWN,
