@@ -35,3 +35,13 @@ def test_a_shipped_experiment_runs(path, tmp_path):
 
 def test_what_is_shipped_is_found():
     assert {"quick", "cooperative", "competitive", "tutorial_cooperative"} <= {path.stem for path in CONFIGS}
+
+
+def test_the_optimum_is_learned_to_the_last_bit_that_counts(tmp_path):
+    config = load(CONFIGS[0].with_name("optimal.yaml"), ["recording.steps=none", "evaluation.every=1000"])
+    run = run_job(next(jobs_of(config)), create_run(tmp_path, config, config.seeds[0]))
+    with open_recording(run.recording) as recording:
+        last = list(recording.optimality())[-1]
+    assert (last["starts"], last["finish_percent"]) == (2880, 100.0)
+    assert last["mean_length"] == last["optimal_mean_length"] == pytest.approx(9.172916666666667)
+    assert sum(last["values"]) == pytest.approx(last["optimal_value"], abs=1e-9)
