@@ -100,7 +100,7 @@ class Putting(Protocol):
 
     @property
     def place(self) -> tuple[int, int]:
-        """The steps of the phase so far, and the number of the episode under way, or to come."""
+        """The steps of the phase so far, and the number of the episode that began last."""
 
     def open(self) -> None:
         """Take blocks from the recorder."""

@@ -76,9 +76,14 @@ class Rows:
 
     @property
     def place(self) -> tuple[int, int]:
-        """The steps of the phase so far, and the number of the episode under way, or to come."""
-        episode = self._episode + len(self._begins) + self._fresh
-        return self._recorder.steps[self._phase] + self.filled, episode
+        """The steps of the phase so far, and the number of the episode that began last; 0 before any."""
+        began = self._episode + len(self._begins)
+        return self._recorder.steps[self._phase] + self.filled, max(began, 0)
+
+    @property
+    def _coming(self) -> int:
+        """The number of the episode that the next step belongs to."""
+        return self._episode + len(self._begins) + self._fresh
 
     # --- what a loop does -----------------------------------------------------------------------------
 
@@ -355,7 +360,7 @@ class VariableRows(Rows):
     def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
         """Put down a step."""
         row, reward = self.filled, float(reward)
-        step, episode = self.place
+        step, episode = self.place[0], self._coming
         began = row if self._fresh else self._begins[-1] if self._begins else -self._t
         payload = encode(
             schema.TRANSITION,
@@ -379,7 +384,7 @@ class VariableRows(Rows):
         self._count(reward, terminated, truncated)
 
     def _put_reset(self, observation: Any, seed: int | None) -> None:
-        step, episode = self.place
+        step, episode = self.place[0], self._coming
         payload = encode(
             schema.RESET,
             {
