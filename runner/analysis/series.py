@@ -6,6 +6,7 @@ Runs belong to one group when their configurations differ in nothing but the see
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -239,7 +240,7 @@ def _binned_episodes(recording: Recording, edges: NDArray[np.int64]) -> dict[int
     count, length = np.zeros(bins), np.zeros(bins)
     returns = np.zeros((bins, len(agents)))
     for block in recording.blocks(schema.TRAIN_EPISODE):
-        at = np.searchsorted(edges, block["episode"], side="right") - 1
+        at = (np.searchsorted(edges, block["episode"], side="right") - 1).clip(0, bins - 1)
         count += np.bincount(at, minlength=bins)
         length += np.bincount(at, block["length"], minlength=bins)
         for i in range(len(agents)):
@@ -269,6 +270,8 @@ def _binned_scalars(recording: Recording, edges: NDArray[np.int64]) -> dict[str,
             if len(sums) == _MOST_NAMES:
                 raise RecordingError(f"{recording.path}: has scalars of more than {_MOST_NAMES} names.")
             sums[name], counts[name] = np.zeros(bins), np.zeros(bins)
+        if not math.isfinite(scalar["value"]):
+            continue  # a figure has no place for it
         k = min(max(int(np.searchsorted(edges, scalar["episode"], side="right")) - 1, 0), bins - 1)
         sums[name][k] += scalar["value"]
         counts[name][k] += 1
