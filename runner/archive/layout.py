@@ -4,6 +4,7 @@
     <run id>/episodes.parquet        the ends of episodes
     <run id>/train_metrics.parquet   reports on training
     <run id>/eval_metrics.parquet    evaluations
+    <run id>/optimality.parquet      exact measures of evaluated policies
     <run id>/q_tables.parquet        snapshots; those that a replay gives are there by position and hash
     <run id>/log.parquet             lines of text
     <run id>/run.parquet             one row: what the run is, its configuration and provenance
@@ -38,6 +39,7 @@ STEPS: Final = "steps.parquet"
 EPISODES: Final = "episodes.parquet"
 TRAIN_METRICS: Final = "train_metrics.parquet"
 EVAL_METRICS: Final = "eval_metrics.parquet"
+OPTIMALITY: Final = "optimality.parquet"
 Q_TABLES: Final = "q_tables.parquet"
 LOG: Final = "log.parquet"
 RUN: Final = "run.parquet"
@@ -65,14 +67,18 @@ def _metrics(topic: Topic) -> pa.Schema:
 MESSAGES: Final = {
     schema.TRAIN_METRICS_TOPIC: TRAIN_METRICS,
     schema.EVAL_METRICS_TOPIC: EVAL_METRICS,
+    schema.OPTIMALITY_TOPIC: OPTIMALITY,
     schema.LOG_TOPIC: LOG,
     schema.Q_TABLE_TOPIC: Q_TABLES,
 }
 """The table of each topic of variable size."""
+ROW_BY_ROW: Final = tuple(topic for topic in MESSAGES if topic is not schema.Q_TABLE_TOPIC)
+"""Those whose messages are a row each, with all that is in them."""
 
 SCHEMAS: Final = {
     TRAIN_METRICS: _metrics(schema.TRAIN_METRICS_TOPIC),
     EVAL_METRICS: _metrics(schema.EVAL_METRICS_TOPIC),
+    OPTIMALITY: _metrics(schema.OPTIMALITY_TOPIC),
     LOG: pa.schema(
         [("run_id", TEXT), ("position", pa.int64()), ("level", pa.string()), ("message", pa.string())]
     ),

@@ -54,7 +54,7 @@ def at_hand(run: Run, tell: Tell = lambda _: None, report: Report = lambda _: No
         kept.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(kept.with_suffix(".lock"), timeout=LOCK_SECONDS):
             if not kept.is_file():
-                tell(f"Run {run.run_id} is archived; restoring it from {run.archive.get('place')}.")
+                tell(f"Run {run.run_id} is archived; restoring it from {run.archive.get('target')}.")
                 _restore_kept(run, kept, digest, report)
             kept.touch()
     except Timeout as error:

@@ -104,7 +104,7 @@ class _Restoring:
             self._restore_blocks(
                 layout.EPISODES, (schema.TRAIN_EPISODE, schema.EVAL_EPISODE), self._send_episodes
             )
-            for topic in (schema.TRAIN_METRICS_TOPIC, schema.EVAL_METRICS_TOPIC, schema.LOG_TOPIC):
+            for topic in layout.ROW_BY_ROW:
                 for row in self._rows(topic):
                     self._send_message(topic, row["position"], self._payload(topic, row))
         finally:

@@ -162,7 +162,7 @@ class _Writing:
         self._write_descriptions()
         self._write_steps()
         self._write_blocks(layout.EPISODES, _EPISODES, self._shape.episodes)
-        for topic in (schema.TRAIN_METRICS_TOPIC, schema.EVAL_METRICS_TOPIC, schema.LOG_TOPIC):
+        for topic in layout.ROW_BY_ROW:
             self._write_messages(topic)
         topics = {
             name: Entry(count, self._hashes[name].hexdigest())

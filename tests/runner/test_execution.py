@@ -131,7 +131,7 @@ def test_run_json_says_what_was_done(tmp_path):
     summary = said["summary"]
     with open_recording(run.recording) as recording:
         for topic in schema.TOPICS:
-            assert summary["messages"].get(topic.name, 0) == recording.count(topic)
+            assert summary["messages"][topic.name] == recording.count(topic)
         last = recording.metrics("eval")[-1]
         assert summary["train_steps"] == recording.count(schema.TRAIN_STEP) == last["step"]
         assert summary["eval_steps"] == recording.count(schema.EVAL_STEP)

@@ -28,7 +28,7 @@ from runner.recording.schema import BLOCK_TOPICS, EVAL_STEP, TRAIN_STEP
 from runner.recording.writer import RecordingFile
 from runner.resume import resume
 from runner.runs import Run, create_run, find_run, list_runs
-from tests.runner.recording.making import SMALL_MAP, TAXIS, make_run
+from tests.runner.recording.making import SAMPLED, SMALL_MAP, TAXIS, make_run
 
 REPOSITORY = Path(__file__).parents[2]
 LONG = {
@@ -177,7 +177,7 @@ def test_cut_off_anywhere(whole, tmp_path, share):
     [
         pytest.param({"recording": {"steps": "none", "chunk_steps": 256}}, id="without steps"),
         pytest.param({"recording": {"index": "chunk", "compression": "lz4"}}, id="chunk index"),
-        pytest.param({"initial_q": "random", "algorithm": "random"}, id="random"),
+        pytest.param({"initial_q": "random", "algorithm": "random", **SAMPLED}, id="random"),
         pytest.param({"evaluation": None, "log": None}, id="training only"),
         pytest.param({"mode": "cooperative", "recording": {"compression": "none"}}, id="one table"),
     ],

@@ -18,7 +18,7 @@ TAXIS: dict[str, Any] = {
     "episodes": 60,
     "epsilon": 0.4,
     "step_size": 0.3,
-    "evaluation": {"every": 20, "trials": 3},
+    "evaluation": {"every": 20, "trials": 3, "exact": True},
     "log": {"every_steps": 500, "window": 200},
     "snapshots": {"every": 30},
 }
@@ -28,11 +28,15 @@ LAKE: dict[str, Any] = {
     "env": {"id": "FrozenLake-v1", "kwargs": {"max_episode_steps": 20}},
     "episodes": 12,
     "epsilon": 1.0,
-    "evaluation": {"every": 6, "trials": 2},
+    "evaluation": {"every": 6, "trials": 2, "exact": True},
     "log": {"every_steps": 30},
     "snapshots": {"every": 6},
 }
 """One learner, no events; the smallest recording that has every topic."""
+
+
+SAMPLED: dict[str, Any] = {"evaluation": {"every": 20, "trials": 3}}
+"""No exact measures: what acts at random has no greedy policy."""
 
 
 def experiment(*parts: dict[str, Any], **values: Any) -> ExperimentConfig:

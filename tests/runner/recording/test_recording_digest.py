@@ -18,7 +18,7 @@ from runner.recording import open as open_recording
 from runner.recording import pipeline, recorder, schema
 from runner.recording.digest import combine
 from tests.runner.learning.oracle import Twin
-from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
+from tests.runner.recording.making import LAKE, SAMPLED, TAXIS, experiment, make_run
 
 PACKINGS = [
     {"compression": "lz4"},
@@ -119,7 +119,7 @@ def test_leaving_the_steps_out_leaves_only_them_out(taxis, tmp_path):
     assert topics == {topic: found for topic, found in said(taxis)[1].items() if not topic.endswith("/step")}
 
 
-@pytest.mark.parametrize("made_of", [TAXIS, LAKE, TAXIS | {"algorithm": "random"}])
+@pytest.mark.parametrize("made_of", [TAXIS, LAKE, TAXIS | SAMPLED | {"algorithm": "random"}])
 def test_recording_changes_nothing(made_of, tmp_path):
     """Recorded, computed without a file, and computed by the plain-Python twin: the same tables and steps."""
     run = make_run(tmp_path, made_of, seed=4)
