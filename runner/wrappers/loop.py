@@ -133,7 +133,8 @@ class Loop(Generic[R]):
         self._started = time.monotonic()
         self._make_rows = rows
         self._rows: dict[str, R] = {}
-        self._active: R | None = None
+        self.active: R | None = None
+        """Whose steps came last; None before any, and when the loop is closed."""
         self.described = described
         self.plan = plan
         self.lock = threading.RLock()
@@ -209,20 +210,15 @@ class Loop(Generic[R]):
                 f"run {self.run.run_id} is closed: steps can no longer be recorded in it. "
                 "Wrap the environment anew to go on."
             )
-        if self._active is not None and self._active is not rows:
-            self._active.commit()
-            self._active.open()
-        self._active = rows
-
-    @property
-    def active(self) -> R | None:
-        """Whose steps came last."""
-        return self._active
+        if self.active is not None and self.active is not rows:
+            self.active.commit()
+            self.active.open()
+        self.active = rows
 
     @property
     def position(self) -> int:
         """The number of steps executed so far."""
-        return sum(self._recorder.steps.values()) + (self._active.filled if self._active else 0)
+        return sum(self._recorder.steps.values()) + (self.active.filled if self.active else 0)
 
     def log(self, phase: str, name: str, value: Any) -> None:
         """Record a number or a text under a name, at this moment.
@@ -347,7 +343,7 @@ class Loop(Generic[R]):
                     self.run = self.run.update(status="failed", summary={"error": str(failure)})
                 raise
             finally:
-                self.closed = True
+                self.closed, self.active = True, None
                 self._file.close()
             self.run = self.run.update(status=status, summary=summary)
         return self.run

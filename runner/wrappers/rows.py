@@ -7,8 +7,6 @@ numbers, the state before each, the lengths of episodes) is computed for a whole
 from __future__ import annotations
 
 import struct
-import warnings
-from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -16,12 +14,12 @@ from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
-from runner.recording.spaces import encode_text
-from runner.wrappers.described import Described, Part, parts_of
+from runner.wrappers.described import Described, parts_of
+from runner.wrappers.judge import Judge
+from runner.wrappers.values import check_value, filler, value_bytes, whole_number
 
 _DISCRETE: Final = struct.Struct("<qqd??")
 _DISCRETE_DTYPE: Final = np.dtype(
@@ -31,7 +29,6 @@ _ENDING: Final = struct.Struct("<d??")
 _ENDING_DTYPE: Final = np.dtype([("reward", "<f8"), ("terminated", "?"), ("truncated", "?")])
 _VARIABLE_ROWS: Final = 4096
 _LARGEST: Final = 2**32 - 1
-Columns = Sequence[tuple[Part, NDArray[Any]]]
 
 
 class Rows:
@@ -264,12 +261,12 @@ class DiscreteRows(BlockRows):
         try:
             _DISCRETE.pack_into(self._bytes, at, action, observation, reward, terminated, truncated)
         except (struct.error, TypeError):
-            action, observation = _whole(action, "action"), _whole(observation, "observation")
+            action, observation = whole_number(action, "action"), whole_number(observation, "observation")
             _DISCRETE.pack_into(self._bytes, at, action, observation, reward, terminated, truncated)
         self._count(reward, terminated, truncated)
 
     def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
-        self._reset_column[len(self._reset_rows)] = _whole(observation, "observation")
+        self._reset_column[len(self._reset_rows)] = whole_number(observation, "observation")
 
     def _rewards(self, n: int) -> NDArray[np.float64]:
         return self._scratch["reward"][:n]
@@ -407,184 +404,6 @@ class VariableRows(Rows):
 
     def _finish_resets(self, before: int) -> None:
         pass
-
-
-class Judge:
-    """Counts the penalties and events of episodes, where the environment's arrays say what they are."""
-
-    def __init__(self, mdp: Mdp | None) -> None:
-        self._mdp = mdp
-        self._counts = np.zeros((1, 1), np.int64)
-        """[rows + 1, events + 1]: events and penalties before each row, counted from the first."""
-        self._carried = np.zeros(1 + (len(mdp.event_names) if mdp else 0), np.int64)
-        """Those of the episode under way, before the first row."""
-
-    def judge(
-        self,
-        rewards: NDArray[np.float64],
-        state: NDArray[Any],
-        action: NDArray[Any],
-        next_state: NDArray[Any],
-    ) -> None:
-        """Look at rows."""
-        mdp = self._mdp
-        if mdp is None:
-            return
-        bits = np.zeros((len(rewards) + 1, len(self._carried)), np.int64)
-        bits[1:, -1] = rewards < mdp.penalty_below
-        if mdp.event_names:
-            names = np.arange(len(mdp.event_names), dtype=np.uint32)
-            bits[1:, :-1] = (_events(mdp, rewards, state, action, next_state)[:, np.newaxis] >> names) & 1
-        self._counts = bits.cumsum(axis=0)
-
-    def fill(self, episodes: NDArray[np.void], first: NDArray[Any], last: NDArray[Any]) -> None:
-        """Fill in the counts of episodes from their first and last rows; those before 0 are carried."""
-        mdp = self._mdp
-        if mdp is None:
-            return
-        counts = self._counts[last + 1] - self._counts[np.maximum(first, 0)]
-        counts[first < 0] += self._carried
-        episodes["penalties"] = counts[:, -1]
-        episodes["events"] = counts[:, :-1]
-        wanted = [mdp.event_names.index(name) for name in mdp.success_events]
-        episodes["success"] = (counts[:, wanted] > 0).any(axis=1)
-
-    def carry(self, start: int) -> None:
-        """Keep what the episode that began at this row has counted, for the rows to come."""
-        if self._mdp is not None:
-            kept = self._carried if start < 0 else 0
-            self._carried = self._counts[-1] - self._counts[max(start, 0)] + kept
-
-
-def _events(
-    mdp: Mdp,
-    rewards: NDArray[np.float64],
-    state: NDArray[Any],
-    action: NDArray[Any],
-    next_state: NDArray[Any],
-) -> NDArray[np.uint32]:
-    """Return the events of steps: those of the outcome that has their next state, and their reward if any."""
-    known = (state >= 0) & (state < mdp.states) & (action >= 0) & (action < mdp.joint_actions)
-    state, action = np.where(known, state, 0), np.where(known, action, 0)
-    likely = (mdp.next_state[state, action] == next_state[:, np.newaxis]) & (
-        mdp.probability[state, action] > 0
-    )
-    paid = mdp.rewards[state, action].sum(axis=-1) == rewards[:, np.newaxis]
-    outcome = np.argmax(likely * 2 + (likely & paid), axis=1)
-    found = known & likely.any(axis=1)
-    return np.where(found, mdp.events[state, action, outcome], np.uint32(0))
-
-
-# --- values --------------------------------------------------------------------------------------------
-
-
-def filler(parts: Sequence[Part], column: NDArray[Any], what: str) -> Callable[[int, Any], None]:
-    """Return what puts a value of a space into a row of a column.
-
-    Raises:
-        RecordingError: (what is returned) a value is not of its space.
-    """
-    if not parts:
-        return lambda _row, _value: None
-    columns = [(part.keys, _within(column, part)) for part in parts]
-
-    def put_one(row: int, value: Any) -> None:
-        try:
-            only[row] = value
-        except (TypeError, ValueError) as error:
-            raise _no_value(what, error) from error
-
-    def put(row: int, value: Any) -> None:
-        try:
-            for keys, own in columns:
-                inside = value
-                for key in keys:
-                    inside = inside[key]
-                own[row] = inside
-        except (TypeError, ValueError, LookupError) as error:
-            raise _no_value(what, error) from error
-
-    if len(columns) == 1 and not columns[0][0]:
-        only = columns[0][1]
-        return put_one
-    return put
-
-
-def _within(column: NDArray[Any], part: Part) -> NDArray[Any]:
-    for name in part.fields:
-        column = column[name]
-    return column
-
-
-def _no_value(what: str, error: Exception) -> RecordingError:
-    return RecordingError(f"found an {what} that is not of the environment's {what} space ({error}).")
-
-
-def check_value(parts: Sequence[Part], value: Any) -> None:
-    """Refuse a value of another shape; warn of numbers that the space's dtype cannot hold exactly.
-
-    Raises:
-        RecordingError: it is one.
-    """
-    for part in parts:
-        inside = value
-        try:
-            for key in part.keys:
-                inside = inside[key]
-        except (TypeError, LookupError) as error:
-            raise _no_value("observation", error) from error
-        if part.dtype is None:
-            continue
-        found, expected = np.asarray(inside), part.dtype
-        name = "".join(f"[{key!r}]" for key in part.keys)
-        if found.shape != expected.shape:
-            raise RecordingError(
-                f"found observation{name} of shape {found.shape}, expected {expected.shape} by its space."
-            )
-        with np.errstate(all="ignore"):
-            kept = found.astype(expected.base)
-        if not np.array_equal(kept, found, equal_nan=found.dtype.kind == "f"):
-            warnings.warn(
-                f"observation{name} comes as {found.dtype} and is recorded, rounded, as the {expected.base} "
-                "of its space",
-                RuntimeWarning,
-                stacklevel=6,
-            )
-
-
-def value_bytes(parts: Sequence[Part], value: Any) -> bytes:
-    """Return a value of a space as it stands in a recording.
-
-    Raises:
-        RecordingError: it is not of the space.
-    """
-    pieces = []
-    try:
-        for part in parts:
-            inside = value
-            for key in part.keys:
-                inside = inside[key]
-            if part.dtype is None:
-                pieces.append(encode_text(inside))
-            else:
-                array = np.empty(part.dtype.shape, part.dtype.base)
-                array[...] = inside
-                pieces.append(array.tobytes())
-    except (TypeError, ValueError, LookupError, AttributeError) as error:
-        raise _no_value("observation or action", error) from error
-    return b"".join(pieces)
-
-
-def _whole(value: Any, what: str) -> int:
-    """Return a whole number that may stand in an array of one.
-
-    Raises:
-        RecordingError: it is none.
-    """
-    array = np.asarray(value)
-    if array.size != 1 or array.dtype.kind not in "iub":
-        raise RecordingError(f"found the {what} {value!r}, expected a whole number of its Discrete space.")
-    return int(array.reshape(()))
 
 
 ROWS: Final[dict[str, type[Rows]]] = {

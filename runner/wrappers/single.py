@@ -101,7 +101,7 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         result = self._env_step(action)
         observation, reward, terminated, truncated, info = result
         with self._lock:
-            if self._loop.active is not self._rows or self._loop.closed:
+            if self._loop.active is not self._rows:
                 self._loop.activate(self._rows)
             self._take(action, observation, reward, terminated, truncated)
         if self._watched:

@@ -18,7 +18,7 @@ from runner.recording import schema
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
 from runner.wrappers.described import Described, Part, parts_of
-from runner.wrappers.rows import check_value
+from runner.wrappers.values import check_value
 
 Flags = NDArray[np.bool_]
 

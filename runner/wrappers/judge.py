@@ -1,0 +1,76 @@
+"""Penalties and events of episodes, counted by an environment's arrays for a block of steps at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.mdp import Mdp
+
+
+class Judge:
+    """Counts the penalties and events of episodes, where the environment's arrays say what they are."""
+
+    def __init__(self, mdp: Mdp | None) -> None:
+        self._mdp = mdp
+        self._counts = np.zeros((1, 1), np.int64)
+        """[rows + 1, events + 1]: events and penalties before each row, counted from the first."""
+        self._carried = np.zeros(1 + (len(mdp.event_names) if mdp else 0), np.int64)
+        """Those of the episode under way, before the first row."""
+
+    def judge(
+        self,
+        rewards: NDArray[np.float64],
+        state: NDArray[Any],
+        action: NDArray[Any],
+        next_state: NDArray[Any],
+    ) -> None:
+        """Look at rows."""
+        mdp = self._mdp
+        if mdp is None:
+            return
+        bits = np.zeros((len(rewards) + 1, len(self._carried)), np.int64)
+        bits[1:, -1] = rewards < mdp.penalty_below
+        if mdp.event_names:
+            names = np.arange(len(mdp.event_names), dtype=np.uint32)
+            bits[1:, :-1] = (_events(mdp, rewards, state, action, next_state)[:, np.newaxis] >> names) & 1
+        self._counts = bits.cumsum(axis=0)
+
+    def fill(self, episodes: NDArray[np.void], first: NDArray[Any], last: NDArray[Any]) -> None:
+        """Fill in the counts of episodes from their first and last rows; those before 0 are carried."""
+        mdp = self._mdp
+        if mdp is None:
+            return
+        counts = self._counts[last + 1] - self._counts[np.maximum(first, 0)]
+        counts[first < 0] += self._carried
+        episodes["penalties"] = counts[:, -1]
+        episodes["events"] = counts[:, :-1]
+        wanted = [mdp.event_names.index(name) for name in mdp.success_events]
+        episodes["success"] = (counts[:, wanted] > 0).any(axis=1)
+
+    def carry(self, start: int) -> None:
+        """Keep what the episode that began at this row has counted, for the rows to come."""
+        if self._mdp is not None:
+            kept = self._carried if start < 0 else 0
+            self._carried = self._counts[-1] - self._counts[max(start, 0)] + kept
+
+
+def _events(
+    mdp: Mdp,
+    rewards: NDArray[np.float64],
+    state: NDArray[Any],
+    action: NDArray[Any],
+    next_state: NDArray[Any],
+) -> NDArray[np.uint32]:
+    """Return the events of steps: those of the outcome that has their next state, and their reward if any."""
+    known = (state >= 0) & (state < mdp.states) & (action >= 0) & (action < mdp.joint_actions)
+    state, action = np.where(known, state, 0), np.where(known, action, 0)
+    likely = (mdp.next_state[state, action] == next_state[:, np.newaxis]) & (
+        mdp.probability[state, action] > 0
+    )
+    paid = mdp.rewards[state, action].sum(axis=-1) == rewards[:, np.newaxis]
+    outcome = np.argmax(likely * 2 + (likely & paid), axis=1)
+    found = known & likely.any(axis=1)
+    return np.where(found, mdp.events[state, action, outcome], np.uint32(0))

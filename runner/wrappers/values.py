@@ -1,0 +1,123 @@
+"""Values of spaces, put where they are written from; what is not of its space is refused."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording.spaces import encode_text
+from runner.wrappers.described import Part
+
+
+def filler(parts: Sequence[Part], column: NDArray[Any], what: str) -> Callable[[int, Any], None]:
+    """Return what puts a value of a space into a row of a column.
+
+    Raises:
+        RecordingError: (what is returned) a value is not of its space.
+    """
+    if not parts:
+        return lambda _row, _value: None
+    columns = [(part.keys, _within(column, part)) for part in parts]
+
+    def put_one(row: int, value: Any) -> None:
+        try:
+            only[row] = value
+        except (TypeError, ValueError) as error:
+            raise _no_value(what, error) from error
+
+    def put(row: int, value: Any) -> None:
+        try:
+            for keys, own in columns:
+                inside = value
+                for key in keys:
+                    inside = inside[key]
+                own[row] = inside
+        except (TypeError, ValueError, LookupError) as error:
+            raise _no_value(what, error) from error
+
+    if len(columns) == 1 and not columns[0][0]:
+        only = columns[0][1]
+        return put_one
+    return put
+
+
+def _within(column: NDArray[Any], part: Part) -> NDArray[Any]:
+    for name in part.fields:
+        column = column[name]
+    return column
+
+
+def _no_value(what: str, error: Exception) -> RecordingError:
+    return RecordingError(f"found an {what} that is not of the environment's {what} space ({error}).")
+
+
+def check_value(parts: Sequence[Part], value: Any) -> None:
+    """Refuse a value of another shape; warn of numbers that the space's dtype cannot hold exactly.
+
+    Raises:
+        RecordingError: it is one.
+    """
+    for part in parts:
+        inside = value
+        try:
+            for key in part.keys:
+                inside = inside[key]
+        except (TypeError, LookupError) as error:
+            raise _no_value("observation", error) from error
+        if part.dtype is None:
+            continue
+        found, expected = np.asarray(inside), part.dtype
+        name = "".join(f"[{key!r}]" for key in part.keys)
+        if found.shape != expected.shape:
+            raise RecordingError(
+                f"found observation{name} of shape {found.shape}, expected {expected.shape} by its space."
+            )
+        with np.errstate(all="ignore"):
+            kept = found.astype(expected.base)
+        if not np.array_equal(kept, found, equal_nan=found.dtype.kind == "f"):
+            warnings.warn(
+                f"observation{name} comes as {found.dtype} and is recorded, rounded, as the {expected.base} "
+                "of its space",
+                RuntimeWarning,
+                stacklevel=6,
+            )
+
+
+def value_bytes(parts: Sequence[Part], value: Any) -> bytes:
+    """Return a value of a space as it stands in a recording.
+
+    Raises:
+        RecordingError: it is not of the space.
+    """
+    pieces = []
+    try:
+        for part in parts:
+            inside = value
+            for key in part.keys:
+                inside = inside[key]
+            if part.dtype is None:
+                pieces.append(encode_text(inside))
+            else:
+                array = np.empty(part.dtype.shape, part.dtype.base)
+                array[...] = inside
+                pieces.append(array.tobytes())
+    except (TypeError, ValueError, LookupError, AttributeError) as error:
+        raise _no_value("observation or action", error) from error
+    return b"".join(pieces)
+
+
+def whole_number(value: Any, what: str) -> int:
+    """Return a whole number that may stand in an array of one.
+
+    Raises:
+        RecordingError: it is none.
+    """
+    array = np.asarray(value)
+    if array.size != 1 or array.dtype.kind not in "iub":
+        raise RecordingError(f"found the {what} {value!r}, expected a whole number of its Discrete space.")
+    return int(array.reshape(()))
