@@ -23,7 +23,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from runner.errors import RecordingError
+from runner.errors import RecordingError, RunnerError
 from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES
@@ -236,10 +236,10 @@ class Recording:
         """Refuse a recording of somebody's own loop.
 
         Raises:
-            RecordingError: it is one; `purpose` says what it cannot be used for.
+            RunnerError: it is one; `purpose` says what it cannot be used for.
         """
         if self.kind != "job":
-            raise RecordingError(
+            raise RunnerError(
                 f"{self.path}: was recorded from somebody's own loop, by {self.config.get('made_by')}; "
                 f"{purpose} is for runs that were trained here."
             )

@@ -22,6 +22,9 @@ def test_the_public_names():
         "frames",
         "list_runs",
         "open_recording",
+        "record",
+        "record_parallel",
+        "record_vector",
         "run",
         "run_all",
     ]
