@@ -83,8 +83,16 @@ class Recorded(Generic[R]):
 class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     """A Gymnasium environment whose every reset and step is recorded; made by `record`."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], loop: Loop[Rows], phase: str = "train") -> None:
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        loop: Loop[Rows],
+        phase: str = "train",
+        owner: RecordedEnv | None = None,
+    ) -> None:
         gymnasium.Wrapper.__init__(self, env)
+        self._owner = owner
+        """Who closes the recording, if another one; kept alive as long as this is."""
         self._env_step = env.step
         self._lock = loop.lock
         self._watched = bool(loop.plan.info or loop.plan.frames_every)
@@ -125,17 +133,19 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         return result
 
     def close(self) -> None:
-        """Close the environment and the recording, as finished."""
+        """Close the environment and the recording, as finished; not that of another it is recorded into."""
         try:
             self.env.close()
         finally:
-            self._loop.close()
+            if self._owner is None:
+                self._loop.close()
 
     def __exit__(self, *raised: Any) -> Literal[False]:
         try:
             self.env.close()
         finally:
-            self._leave(raised[1])
+            if self._owner is None:
+                self._leave(raised[1])
         return False
 
     def _watch(self, info: Mapping[str, Any], over: bool) -> None:
@@ -215,7 +225,7 @@ def _beside(env: gymnasium.Env[Any, Any], into: RecordedEnv, phase: str) -> Reco
         raise ConfigError("into: found an environment of other spaces than the run's, expected the same")
     if phase == into._phase:
         raise ConfigError(f"phase: found {phase!r} for both environments of a run, expected one each")
-    return RecordedEnv(env, loop, phase)
+    return RecordedEnv(env, loop, phase, into)
 
 
 def plan_of(
