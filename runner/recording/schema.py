@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, Final
 
 import numpy as np
@@ -343,7 +343,7 @@ MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 """The same, for one message: opcode, length, channel, sequence, log time, publish time."""
 
 
-@cache
+@lru_cache(64)
 def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
     """Return the dtype of a whole MCAP message record of a fixed-width message.
 
