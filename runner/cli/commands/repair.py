@@ -23,8 +23,17 @@ _WORDS: Final = {
     "/eval/episode": "evaluation episodes",
     "/train/metrics": "reports of training",
     "/eval/metrics": "evaluations",
+    "/eval/optimality": "exact measures",
     "/q_table": "Q-table snapshots",
     "/log": "log lines",
+    "/train/reset": "resets",
+    "/eval/reset": "evaluation resets",
+    "/train/info": "infos",
+    "/eval/info": "evaluation infos",
+    "/scalar": "numbers logged",
+    "/array": "arrays",
+    "/train/frame": "frames",
+    "/eval/frame": "evaluation frames",
 }
 
 
@@ -91,7 +100,7 @@ def _in_words(done: Repair, run: Run | None) -> dict[str, str]:
         told["lost"] = "\n".join(_losses(done))
     if done.original is not None:
         told["damaged"] = f"{done.original} is kept"
-    if run is not None and not done.lossless:
+    if run is not None and not done.lossless and "made_by" not in run.facts.get("config", {}):
         told["next"] = f"dualtaxi resume {run.run_id}"
     return told
 

@@ -114,6 +114,8 @@ def _tables(recording: Recording) -> list[dict[str, Any]]:
     """Return size and fill of each table, as last reported."""
     from runner.frames import agents_of
 
+    if recording.kind != "job":
+        return []  # what a loop learned is its own
     reports = [*recording.metrics("train"), *recording.metrics("eval")]
     last = max(reports, key=lambda report: report["step"], default=None)
     agents = agents_of(recording)

@@ -139,6 +139,19 @@ def test_a_loop_is_packed_and_unpacked_to_the_same_bytes(folder, tmp_path):
     assert there.summary["content_digest"] == runner.find_run("rooms", folder).summary["content_digest"]
 
 
+def test_a_killed_loop_is_told_mended_and_compared(folder, tmp_path):
+    whole = runner.find_run("pole", folder)
+    cut = tmp_path / "k" / "recording.mcap"
+    cut.parent.mkdir()
+    cut.write_bytes(whole.recording.read_bytes()[:-2000])
+    for words in (("ls",), ("show", str(cut)), ("verify", str(cut))):
+        dualtaxi(tmp_path, *words)
+    mended = dualtaxi(tmp_path, "repair", str(cut))
+    assert "resets" in mended.output
+    assert dualtaxi(tmp_path, "show", str(cut)).exit_code == 0
+    assert dualtaxi(tmp_path, "diff", str(cut), str(whole.recording)).exit_code in (0, 1)
+
+
 def test_an_interrupted_loop_is_not_resumed(tmp_path):
     env = runner.record(make("FrozenLake-v1"), tmp_path, name="cut")
     list(play(env, 50))
