@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +19,7 @@ from runner import runs
 from runner.errors import Diverged, RunnerError, StorageError
 from runner.job import Job
 from runner.learning.learner import Learner
-from runner.mdp import description_bytes, load_mdp
+from runner.mdp import Mdp, description_bytes, load_mdp
 from runner.observer import Observer
 from runner.origin import configured_tables, settle
 from runner.planning import Yardstick
@@ -47,7 +47,7 @@ class Progress:
     eval_steps: int = 0
     bytes_written: int = 0
     evaluations: list[dict[str, Any]] = field(default_factory=list)
-    """The metrics of every evaluation so far."""
+    """The metrics of every evaluation so far; under `optimality` the exact ones, if they are taken."""
 
 
 Report = Callable[[Progress], None]
@@ -60,6 +60,7 @@ def run_job(
     report: Report = lambda _: None,
     stop: Stop = lambda: False,
     observer: Observer | None = None,
+    mdp: Mdp | None = None,
 ) -> Run:
     """Train, evaluate and record a job; return its run, finished or interrupted.
 
@@ -70,13 +71,14 @@ def run_job(
         stop: asked every few milliseconds; when it says True the recording is closed properly and the
             run is marked interrupted.
         observer: shown every step and metric as they come.
+        mdp: the job's environment, if it is loaded already.
 
     Raises:
         RunnerError: the environment cannot be used, or the disk is full; the run is then marked failed.
     """
     started = time.monotonic()
     with _failing(run):
-        mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
+        mdp = mdp or load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
         job, run = settle(job, run)
         learner = Learner(job.config, mdp, job.seed, configured_tables(job, run, mdp))
         file = _create(run.folder / runs.RECORDING_FILE)
@@ -274,6 +276,7 @@ class Session:
         position = {name: metrics[name] for name in ("step", "episode", "evaluation")}
         topic = schema.OPTIMALITY_TOPIC
         self.recorder.message(topic, encode(topic.message, position | exact))
+        self._progress.evaluations[-1] = metrics | {"optimality": exact}
 
     @cached_property
     def _yardstick(self) -> Yardstick:
@@ -394,7 +397,16 @@ def _describe(file: RecordingFile, job: Job, run: Run, learner: Learner, made_by
     )
     file.add_metadata("config", {"json": json.dumps(job.config.to_mapping(), sort_keys=True)})
     file.add_metadata("provenance", made_by)
+    for name, (media_type, data) in _environment(mdp).items():
+        file.add_attachment(name, media_type, data)
+
+
+@lru_cache(maxsize=4)
+def _environment(mdp: Mdp) -> dict[str, tuple[str, bytes]]:
+    """Return the attachments that tell of an environment, by name: media type and content."""
     description = json.loads(description_bytes(mdp)) | {"arrays": sorted(mdp.arrays())}
-    file.add_attachment("environment.json", "application/json", json.dumps(description, indent=1).encode())
-    for name, array in sorted(mdp.arrays().items()):
-        file.add_attachment(f"environment/{name}.npy.zst", "application/zstd", pack_array(array))
+    told = {"environment.json": ("application/json", json.dumps(description, indent=1).encode())}
+    return told | {
+        f"environment/{name}.npy.zst": ("application/zstd", pack_array(array))
+        for name, array in sorted(mdp.arrays().items())
+    }

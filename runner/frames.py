@@ -174,7 +174,7 @@ def evaluation_records(recording: Recording) -> list[dict[str, Any]]:
     trials, and under `training` what `training_records` has.
     """
     agents, events = agents_of(recording), event_names_of(recording)
-    return [_evaluation_record(metrics, agents, events) for metrics in recording.metrics("eval")]
+    return [evaluation_record(metrics, agents, events) for metrics in recording.metrics("eval")]
 
 
 def training_records(recording: Recording) -> list[dict[str, Any]]:
@@ -201,9 +201,10 @@ def environment_of(recording: Recording) -> dict[str, Any]:
     return dict(json.loads(recording.attachment("environment.json")))
 
 
-def _evaluation_record(
+def evaluation_record(
     metrics: Mapping[str, Any], agents: Sequence[str], events: Sequence[str]
 ) -> dict[str, Any]:
+    """Return an evaluation's metrics, as recorded, under the names of `evaluation_records`."""
     known = metrics["successes"] >= 0
     return {
         "evaluation": metrics["evaluation"],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,14 +24,22 @@ class Job:
 
     def content(self) -> dict[str, Any]:
         """Return what determines the content of the job's recording, by key."""
-        mapping = self.config.to_mapping()
-        return {key: value for key, value in mapping.items() if key not in NOT_CONTENT} | {"seed": self.seed}
+        return _content(self.config.to_mapping(), self.seed)
 
     @property
     def identity(self) -> str:
         """A hash of `content()`: equal jobs, equal identities, whatever they are called."""
-        text = json.dumps(self.content(), sort_keys=True, separators=(",", ":"))
-        return blake3(text.encode()).hexdigest()[:32]
+        return identity_of(self.config.to_mapping(), self.seed)
+
+
+def identity_of(config: Mapping[str, Any], seed: int) -> str:
+    """Return the identity of the job of a resolved configuration, given as plain values, and a seed."""
+    text = json.dumps(_content(config, seed), sort_keys=True, separators=(",", ":"))
+    return blake3(text.encode()).hexdigest()[:32]
+
+
+def _content(config: Mapping[str, Any], seed: int) -> dict[str, Any]:
+    return {key: value for key, value in config.items() if key not in NOT_CONTENT} | {"seed": seed}
 
 
 def jobs_of(config: ExperimentConfig) -> Iterator[Job]:

@@ -8,6 +8,7 @@ import platform
 import socket
 import subprocess
 import sys
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -18,16 +19,23 @@ PACKAGES = ("numpy", "numba", "llvmlite", "gymnasium", "mcap", "protobuf", "zsta
 
 def provenance() -> dict[str, str]:
     """Return versions, host, processor, git state and command line, as text by key."""
+    return _installed() | {
+        "host": socket.gethostname(),
+        "user": _user(),
+        "command": " ".join(sys.argv),
+        "directory": str(Path.cwd()),
+    }
+
+
+@cache
+def _installed() -> dict[str, str]:
+    """Return what does not change while a process lives: what it runs on, and the code it has loaded."""
     facts = {
         "dualtaxi": __version__,
         "python": platform.python_version(),
         "platform": platform.platform(),
         "machine": platform.machine(),
         "processor": _processor(),
-        "host": socket.gethostname(),
-        "user": _user(),
-        "command": " ".join(sys.argv),
-        "directory": str(Path.cwd()),
     }
     return facts | {f"package.{name}": _version(name) for name in PACKAGES} | _git()
 

@@ -27,7 +27,7 @@ ORDER = """
     execution export
     verify
     resume
-    again notebook
+    again notebook sweep
     api
     wrappers
     cli
@@ -89,6 +89,7 @@ def test_learning_knows_numbers_and_nothing_of_files_clocks_or_commands():
         "__future__",
         "typing",
         "collections",
+        "functools",
         "math",
         "numpy",
         "numba",

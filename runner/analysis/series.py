@@ -92,10 +92,10 @@ def read_series(recording: Recording) -> RunSeries:
     if recording.kind != "job":
         return loop_series(recording)
     evaluations = evaluation_records(recording)
-    training = [(record["episode"], _training(record)) for record in training_records(recording)]
-    training += [(record["episode"], _training(record["training"])) for record in evaluations]
+    training = [(record["episode"], training_readings(record)) for record in training_records(recording)]
+    training += [(record["episode"], training_readings(record["training"])) for record in evaluations]
     agents = agents_of(recording)
-    exact = {measures["evaluation"]: _exact(measures, agents) for measures in recording.optimality()}
+    exact = {measures["evaluation"]: exact_readings(measures, agents) for measures in recording.optimality()}
     return RunSeries(
         run_id=recording.run["run_id"],
         name=recording.run["name"],
@@ -103,7 +103,7 @@ def read_series(recording: Recording) -> RunSeries:
         finished=recording.result.get("status") == "finished",
         config=recording.config,
         evaluation=[
-            (record["episode"], _evaluation(record) | exact.get(record["evaluation"], {}))
+            (record["episode"], evaluation_readings(record) | exact.get(record["evaluation"], {}))
             for record in evaluations
         ],
         training=sorted(training, key=lambda entry: entry[0]),
@@ -183,7 +183,8 @@ def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[int
 # --- inside -------------------------------------------------------------------------------------------
 
 
-def _evaluation(record: Mapping[str, Any]) -> Readings:
+def evaluation_readings(record: Mapping[str, Any]) -> Readings:
+    """Return the readings of a record of `runner.frames.evaluation_records`."""
     trials = record["trials"]
     known = {} if record["finish_percent"] is None else {"finish_percent": {"": record["finish_percent"]}}
     events: Readings = {}
@@ -198,7 +199,7 @@ def _evaluation(record: Mapping[str, Any]) -> Readings:
     return known | means | events
 
 
-def _exact(measures: Mapping[str, Any], agents: Sequence[str]) -> Readings:
+def exact_readings(measures: Mapping[str, Any], agents: Sequence[str]) -> Readings:
     """Return exact measures beside the optimum's."""
     readings = {
         name: {"": measures[name], "optimum": measures[f"optimal_{name}"]}
@@ -212,7 +213,8 @@ def _exact(measures: Mapping[str, Any], agents: Sequence[str]) -> Readings:
     return {f"exact.{name}": lines for name, lines in readings.items()}
 
 
-def _training(side: Mapping[str, Any]) -> Readings:
+def training_readings(side: Mapping[str, Any]) -> Readings:
+    """Return the readings of training from a report, or from the training side of an evaluation."""
     counts = {entry["reward"]: entry["steps"] for entry in side["reward_counts"]}
     steps = sum(counts.values())
     length = side["mean_length"]

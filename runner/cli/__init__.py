@@ -21,6 +21,7 @@ from runner.errors import RunnerError, StorageError, nearest
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Do": {
         "run": ("runner.cli.commands.run", "Train, evaluate and record an experiment."),
+        "sweep": ("runner.cli.commands.sweep", "Run an experiment with many values; tell which are best."),
         "resume": (
             "runner.cli.commands.resume",
             "Go on with a run that was interrupted, as if it never had been.",

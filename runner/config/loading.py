@@ -46,10 +46,10 @@ def load(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Experim
             line for each problem, with file, line, column and key.
     """
     file = FilePath(path)
-    document = read_yaml(_text(file), str(file))
+    document = read_yaml(read_text(file), str(file))
     if document.value is None and not document.problems:
         raise ConfigError(f"{file}:1:1: the file is empty, expected at least `episodes`")
-    return _experiment(document, overrides, file.stem, named_by=f"the file's name, {file.stem!r},")
+    return experiment_in(document, overrides, file.stem, named_by=f"the file's name, {file.stem!r},")
 
 
 def from_mapping(
@@ -70,10 +70,15 @@ def from_mapping(
             f"found a run made by {values['made_by']}: it was recorded from somebody's own training loop, "
             "which alone can do it again. It can be looked at, compared and checked, not redone."
         )
-    return _experiment(Document(values), overrides, name, named_by=repr(name))
+    return experiment_in(Document(values), overrides, name, named_by=repr(name))
 
 
-def _text(file: FilePath) -> str:
+def read_text(file: FilePath) -> str:
+    """Return what stands in a file.
+
+    Raises:
+        ConfigError: it cannot be read, is too large, or is no text.
+    """
     try:
         with file.open("rb") as stream:
             content = stream.read(MAX_BYTES + 1)
@@ -100,9 +105,10 @@ def _similar(file: FilePath) -> str:
         return ""
 
 
-def _experiment(
+def experiment_in(
     document: Document, overrides: Sequence[str], name: str, *, named_by: str
 ) -> ExperimentConfig:
+    """Return the experiment that a document describes; arguments and errors as for `load`."""
     if not isinstance(document.value, Mapping):
         problem = Problem(
             (), f"found {found(document.value)}, expected keys and values, such as episodes: 1000"

@@ -20,9 +20,13 @@ def override(document: Document, overrides: Sequence[str]) -> None:
     A key on the way to KEY that holds something else than a mapping becomes one. A section that the
     document does not mention starts from its default, so that only the value named is changed.
     """
+    put(document, [_parse(text) for text in overrides])
+
+
+def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) -> None:
+    """Put values at paths of `document`, as `override` does; each knows its places itself."""
     assigned: set[str] = set()
-    for text in overrides:
-        path, read = _parse(text)
+    for path, read in values:
         assigned.add(path[0])
         for rival in _RIVALS.get(path[0], ()):
             if rival not in assigned:
@@ -30,7 +34,8 @@ def override(document: Document, overrides: Sequence[str]) -> None:
         for length in range(1, len(path)):
             if not isinstance(_at(document.value, path[:length]), Mapping | list | tuple):
                 start = {} if path[0] in document.value else _default(path[0])
-                _assign(document, path[:length], Document(start, {(): read.places[()]}))
+                place = {here: place for here, place in read.places.items() if not here}
+                _assign(document, path[:length], Document(start, place))
         _assign(document, path, read)
 
 

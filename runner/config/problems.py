@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from runner.config.document import Document, Place, Problem
-from runner.config.schema import choices_of, expected, keys_of, schema_at
+from runner.config.schema import Schema, choices_of, expected, keys_of, schema_at
 from runner.config.values import REFUSED, Path
 from runner.errors import ConfigError, nearest
 
@@ -19,13 +19,22 @@ _UNKNOWN = "extra_forbidden"
 _FOLLOWS = "default_factory_not_called"
 """A default that depends on another value, which is wrong: that one is told."""
 _BRANCHES = frozenset(
-    ("number", "array", "Linear", "Exponential", "Piecewise", "RandomTable", "RunTable", "SeedRange")
+    (
+        *("number", "array", "Linear", "Exponential", "Piecewise"),
+        *("RandomTable", "RunTable", "SeedRange", "Range", "path", "mapping"),
+    )
 )
 """The names by which a location tells which branch of a union was taken; none is a key."""
 
 
-def problems_in(error: ValidationError, value: object) -> list[Problem]:
-    """Return what is wrong with `value`, the mapping that was validated, and leave out what only follows."""
+def problems_in(error: ValidationError, value: object, schema: Schema | None = None) -> list[Problem]:
+    """Return what is wrong with `value`, the mapping that was validated, and leave out what only follows.
+
+    Args:
+        error: what pydantic says.
+        value: what was validated.
+        schema: what was expected, without references; a configuration's unless given.
+    """
     details = error.errors(include_url=False, include_input=False)
     paths = [_path(detail) for detail in details]
     unknown = [path for path, detail in zip(paths, details, strict=True) if detail["type"] == _UNKNOWN]
@@ -37,7 +46,7 @@ def problems_in(error: ValidationError, value: object) -> list[Problem]:
             continue
         if detail["type"] == "too_short" and any(other[:-1] == path for other in paths if other):
             continue
-        problems.append(_problem(path, detail, value))
+        problems.append(_problem(path, detail, value, schema))
     return problems
 
 
@@ -79,10 +88,10 @@ def found(value: object) -> str:  # noqa: PLR0911 - one line a kind
             return f"a Python {type(value).__name__}"
 
 
-def _problem(path: Path, detail: ErrorDetails, value: object) -> Problem:
+def _problem(path: Path, detail: ErrorDetails, value: object, schema: Schema | None) -> Problem:
     if detail["type"] == REFUSED:
         return Problem(path, detail["msg"])
-    around = schema_at(detail["loc"][:-1])
+    around = schema_at(detail["loc"][:-1], schema)
     if detail["type"] == _UNKNOWN:
         known = keys_of(around)
         return Problem(
@@ -90,7 +99,7 @@ def _problem(path: Path, detail: ErrorDetails, value: object) -> Problem:
         )
     if detail["type"] == "invalid_key":
         return Problem((*path[:-1], str(path[-1])), "unknown key, which is not even text")
-    here = schema_at(detail["loc"])
+    here = schema_at(detail["loc"], schema)
     if detail["type"] == "missing":
         if not isinstance(path[-1], int):
             return Problem(path, f"missing, expected {expected(here)}")

@@ -39,13 +39,30 @@ def _schema() -> dict[str, Any]:
     }
 
 
-def schema_at(location: tuple[str | int, ...]) -> Schema:
-    """Return the schema of the value at `location`, or an empty one.
+def without_references(schema: Mapping[str, Any]) -> Schema:
+    """Return a schema with each `$ref` followed and its name as `ref`; it must not contain itself."""
+
+    def followed(node: Any) -> Any:
+        if isinstance(node, list):
+            return [followed(item) for item in node]
+        if not isinstance(node, dict):
+            return node
+        if "$ref" in node:
+            name = node["$ref"].rpartition("/")[2]
+            return {"ref": name, **followed(schema["$defs"][name])}
+        return {key: followed(value) for key, value in node.items() if key != "$defs"}
+
+    found: Schema = followed(schema)
+    return found
+
+
+def schema_at(location: tuple[str | int, ...], schema: Schema | None = None) -> Schema:
+    """Return the schema of the value at `location`, or an empty one; `schema` is a configuration's if None.
 
     Besides keys and list positions, a location may name the branch of a union on its way: the model's
     name for a mapping, the JSON type for anything else.
     """
-    node: Schema = _schema()
+    node: Schema = _schema() if schema is None else schema
     for part in location:
         node = next((found for branch in branches(node) for found in _inside(branch, part)), {})
     return node
@@ -73,6 +90,8 @@ def _inside(branch: Schema, part: str | int) -> Iterator[Schema]:
         yield branch["properties"][part]
     elif part == branch.get("ref", branch.get("type")):
         yield branch
+    elif isinstance(branch.get("additionalProperties"), dict):
+        yield branch["additionalProperties"]
 
 
 def keys_of(node: Schema) -> list[str]:

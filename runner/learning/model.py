@@ -8,6 +8,7 @@ up in arrays of a few dozen entries.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -53,8 +54,9 @@ class Model(NamedTuple):
     """Steps after which an episode is truncated; 0 for never."""
 
 
+@lru_cache(maxsize=4)
 def build_model(mdp: Mdp, tables: str) -> Model:
-    """Return `mdp` prepared for one `joint` table, or for one table `per_agent`."""
+    """Return `mdp` prepared for one `joint` table, or for one table `per_agent`; not to be changed."""
     width = (mdp.joint_actions,) if tables == "joint" else mdp.action_counts
     stride = tuple(math.prod(width[i + 1 :]) for i in range(len(width)))
     joint = np.arange(mdp.joint_actions, dtype=np.int64)

@@ -1,0 +1,324 @@
+"""`dualtaxi sweep`: an experiment with many values, and what came of it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import click
+
+from runner.cli import INTERRUPTED
+from runner.cli.options import json_option, recordings_option
+from runner.cli.output import amount, draw, facts, print_json, say, size
+
+if TYPE_CHECKING:
+    from runner.sweep.local import Workers
+    from runner.sweep.model import Sweep
+    from runner.sweep.plan import Plan
+    from runner.sweep.trials import Standing, Trials
+
+START: Final = "start"
+
+
+class _StartsUnlessTold(click.Group):
+    """What is no command of its own is the file of a sweep to start."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command that is meant."""
+        if args[0] in self.commands:
+            return super().resolve_command(ctx, args)
+        return START, self.commands[START], args
+
+
+@click.group("sweep", cls=_StartsUnlessTold, context_settings={"ignore_unknown_options": True})
+def command() -> None:
+    """Run an experiment with many values; tell which are best.
+
+    `dualtaxi sweep FILE` is short for `dualtaxi sweep start FILE`.
+
+    \b
+    Examples:
+      dualtaxi sweep start configs/sweeps/hyperparameters.yaml --dry-run
+      dualtaxi sweep start configs/sweeps/hyperparameters.yaml --workers 2
+      dualtaxi sweep show hyperparameters
+    """  # noqa: D301 - Click wants the backspace itself
+
+
+@command.command(START)
+@click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
+@click.option(
+    "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes.  [default: one a processor]"
+)
+@click.option(
+    "--ray",
+    "ray",
+    is_flag=False,
+    flag_value="",
+    metavar="[ADDRESS]",
+    help="Have the runs done by Ray: a cluster's, or without ADDRESS one of this machine.",
+)
+@click.option("--resume", "resuming", is_flag=True, help="Go on with a sweep that was begun.")
+@click.option("--accept-changes", is_flag=True, help="Go on although the file, or the code, has changed.")
+@click.option("--dry-run", is_flag=True, help="Say what would run, and how much disk it takes.")
+@click.option("--name", help="What the sweep is called.  [default: as the file says, or is called]")
+@json_option
+@recordings_option
+@click.pass_context
+def start(
+    ctx: click.Context,
+    file: Path,
+    workers: int | None,
+    ray: str | None,
+    resuming: bool,
+    accept_changes: bool,
+    dry_run: bool,
+    name: str | None,
+    as_json: bool,
+    recordings: Path | None,
+) -> None:
+    """Run the sweep in FILE: many runs of one experiment with other values.
+
+    Each trial is an ordinary run a seed, tagged sweep=NAME, in the recordings folder. A sweep that was
+    killed or interrupted is gone on with by --resume: finished runs are not repeated, unfinished ones are
+    resumed, and what comes out is what would have come out. It depends neither on the number of workers
+    nor on where they run.
+
+    Exit code 0 when all is done, 1 when runs failed or a limit was reached, 130 when interrupted.
+
+    \b
+    Examples:
+      dualtaxi sweep start configs/sweeps/hyperparameters.yaml --dry-run
+      dualtaxi sweep start configs/sweeps/hyperparameters.yaml --workers 2
+      dualtaxi sweep start configs/sweeps/hyperparameters.yaml --resume
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.api import checked_name, interruptible
+    from runner.runs import recordings_folder
+    from runner.sweep import state
+    from runner.sweep.loading import load_sweep
+    from runner.sweep.plan import plan_of, require_disk, room
+    from runner.sweep.search import require_optuna
+    from runner.sweep.trials import run_sweep
+
+    require_optuna()
+    folder = recordings_folder(recordings)
+    sweep = load_sweep(file, checked_name(name))
+    plan = plan_of(sweep)
+    if dry_run:
+        _tell_plan(sweep, plan, as_json)
+        return
+    with state.held(sweep.name, folder):
+        state.begin(sweep, folder, resuming, accept_changes)
+        before = len(state.runs_of(sweep.name, folder))
+        require_disk(plan, before, folder)
+        say(f"{sweep.name}: {plan.runs:,} runs, about {size(plan.bytes)}; {before:,} are begun already.")
+        with (
+            _workers(workers, ray, plan.runs) as those,
+            interruptible(second=signal.SIG_DFL) as interrupt,
+            _table(sweep) as report,
+        ):
+            trials, standing = run_sweep(
+                sweep,
+                folder,
+                those,
+                stop=interrupt,
+                report=report,
+                room=room(sweep.file.limits, plan, folder, before),
+                accept_changes=accept_changes,
+            )
+    _tell(sweep, trials, standing, as_json)
+    if standing.stopped or standing.failed:
+        ctx.exit(INTERRUPTED if interrupt.came else 1)
+
+
+@command.command("show")
+@click.argument("name")
+@click.option("--all", "every", is_flag=True, help="Show every trial, not only the best.")
+@click.option("--best", type=click.Path(path_type=Path), metavar="FILE", help="Write the best configuration.")
+@click.option("--force", is_flag=True, help="Replace the file if it exists.")
+@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for a note or an issue.")
+@json_option
+@recordings_option
+def show(
+    name: str,
+    every: bool,
+    best: Path | None,
+    force: bool,
+    as_markdown: bool,
+    as_json: bool,
+    recordings: Path | None,
+) -> None:
+    """Rank the trials of the sweep NAME, with intervals over seeds; tell what mattered.
+
+    A trial counts by the median over its seeds; beside it stands the interquartile mean (IQM) with its
+    95 % bootstrap interval, for four seeds and more. What mattered is Optuna's PED-ANOVA importance.
+
+    \b
+    Examples:
+      dualtaxi sweep show hyperparameters
+      dualtaxi sweep show hyperparameters --best best.yaml
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.sections import print_sections
+    from runner.errors import RunnerError
+    from runner.export.report_runs import require_new, write_text_new
+    from runner.runs import recordings_folder
+    from runner.sweep.results import SHOWN, results_of, sections
+    from runner.sweep.state import read_sweep
+
+    folder = recordings_folder(recordings)
+    if best is not None:
+        require_new(best, force)
+    results = results_of(read_sweep(name, folder), folder)
+    if as_json:
+        print_json(
+            {
+                "name": name,
+                "objective": results.sweep.objective.model_dump(mode="json"),
+                "trials": results.trials,
+                "ranking": [dataclasses.asdict(entry) for entry in results.ranking],
+                "importance": results.importance,
+                "best": results.best and results.best.number,
+            }
+        )
+    else:
+        print_sections(sections(results, None if every else SHOWN), as_markdown)
+    if best is not None:
+        if results.best_yaml is None:
+            raise RunnerError(f"the sweep {name!r} has no finished trial yet, so there is no best one.")
+        write_text_new(best, force, results.best_yaml)
+        say(f"{best}: the best configuration; `dualtaxi run {best}` runs it.")
+
+
+@command.command("ls")
+@recordings_option
+@json_option
+def ls(recordings: Path | None, as_json: bool) -> None:
+    """List the sweeps of a recordings folder.
+
+    \b
+    Example:
+      dualtaxi sweep ls
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.runs import recordings_folder
+    from runner.sweep.state import sweeps_in
+
+    names = sweeps_in(recordings_folder(recordings))
+    if as_json:
+        print_json(names)
+    else:
+        click.echo("\n".join(names) or "no sweeps yet; `dualtaxi sweep FILE` begins one")
+
+
+@contextlib.contextmanager
+def _workers(count: int | None, ray: str | None, runs: int) -> Iterator[Workers]:
+    """Give those who do the runs; not more of them than runs."""
+    most = min(count or os.cpu_count() or 1, runs)
+    if ray is None:
+        from runner.sweep.local import LocalWorkers
+
+        with LocalWorkers(most) as local:
+            yield local
+    else:
+        from runner.sweep.cluster import RayWorkers
+
+        with RayWorkers(count, ray or None, runs) as remote:
+            yield remote
+
+
+@contextlib.contextmanager
+def _table(sweep: Sweep) -> Iterator[Any]:
+    """Give what is told the standing: it keeps a table up to date, where there is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.live import Live
+
+    with Live(console=Console(stderr=True, highlight=False), transient=True, refresh_per_second=4) as live:
+        yield lambda standing: live.update(facts(_standing(sweep, standing)))
+
+
+def _standing(sweep: Sweep, standing: Standing) -> dict[str, str]:
+    """Return how a sweep stands, in words."""
+    from runner.cli.output import duration
+    from runner.sweep.results import spoken, words
+
+    left = standing.runs - standing.done - standing.failed
+    here = standing.begun - standing.running
+    rate = here / standing.seconds if standing.seconds and here > 0 else 0.0
+    bar = "█" * round(20 * standing.done / max(standing.runs, 1))
+    told = {
+        sweep.name: f"{bar:░<20} {standing.done:,} of {standing.runs:,} runs, {standing.running} running"
+        + (f", {standing.pruned:,} given up" if standing.pruned else "")
+        + (f", {standing.failed:,} failed" if standing.failed else ""),
+        "rate": (f"{rate:.1f} runs/s, {duration(left / rate)} left" if rate else "–")
+        + f", {duration(standing.seconds)} so far, {size(standing.bytes)} of disk",
+    }
+    if standing.best is not None:
+        told["best"] = f"{spoken(standing.best.value)} with {words(standing.best.values)}"
+    return told
+
+
+def _tell_plan(sweep: Sweep, plan: Plan, as_json: bool) -> None:
+    """Say what would run."""
+    values = {path: _described(parameter) for path, parameter in sweep.file.parameters.items()}
+    if as_json:
+        print_json(dataclasses.asdict(plan) | {"name": sweep.name, "bytes": plan.bytes, "parameters": values})
+        return
+    draw(
+        facts(
+            {
+                "sweep": f"{sweep.name}, {sweep.file.strategy}",
+                "runs": f"{plan.runs:,}: {plan.trials:,} trials, {len(sweep.seeds)} seeds each, of "
+                f"{amount(sweep.base.episodes)} episodes",
+                **values,
+                "objective": sweep.objective.described,
+                "disk": f"about {size(plan.bytes)}, {size(plan.bytes_a_run)} a run",
+            }
+        )
+    )
+
+
+def _described(parameter: Any) -> str:
+    if isinstance(parameter, list):
+        return ", ".join(map(str, parameter))
+    kind = ", log" if parameter.log else f", step {parameter.step:g}" if parameter.step else ""
+    return f"{parameter.low:g} to {parameter.high:g}{kind}"
+
+
+def _tell(sweep: Sweep, trials: Trials, standing: Standing, as_json: bool) -> None:
+    """Say what came of it."""
+    from runner.sweep.results import words
+
+    best = trials.best()
+    if as_json:
+        print_json(
+            {
+                "name": sweep.name,
+                "runs": standing.runs,
+                "done": standing.done,
+                "pruned": standing.pruned,
+                "failed": standing.failed,
+                "stopped": standing.stopped or None,
+                "seconds": round(standing.seconds, 3),
+                "bytes": standing.bytes,
+                "best": best and {"trial": best.number, "value": best.value, "values": best.values},
+            }
+        )
+    else:
+        told = _standing(sweep, standing)
+        if best is not None:
+            told["best"] = f"{best.value:g} in trial {best.number}: {words(best.values)}"
+        draw(facts(told | {"next": f"dualtaxi sweep show {sweep.name}"}))
+    for trial in trials.told:
+        for error in trial.errors:
+            say(f"Failed: trial {trial.number}, {error}")
+    if standing.stopped:
+        say(f"Stopped: {standing.stopped}. --resume goes on from there.")

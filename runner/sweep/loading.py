@@ -1,0 +1,160 @@
+"""A sweep file to a `Sweep`; whatever is wrong is told at once, with line and key."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from runner.config import ConfigError, ExperimentConfig, from_mapping, load
+from runner.config.document import Document, Problem, read_yaml
+from runner.config.loading import experiment_in, read_text
+from runner.config.overrides import put
+from runner.config.problems import found, problems_in, refuse
+from runner.config.schema import Schema, without_references
+from runner.errors import EnvironmentNotUsable
+from runner.sweep.model import Range, Sweep, SweepFile
+
+MAX_NAME = 50
+"""Of a sweep's name, which stands in a tag of its runs."""
+
+
+def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
+    """Return the sweep that a YAML file describes.
+
+    Args:
+        path: the file; its name without the ending names the sweep, unless it says another.
+        name: what the sweep is called instead.
+
+    Raises:
+        ConfigError: the file cannot be read, or does not describe a sweep. The message has a line for each
+            problem, with file, line, column and key.
+    """
+    file = Path(path)
+    document = read_yaml(read_text(file), str(file))
+    return _sweep(document, name, file.stem, file.parent)
+
+
+def from_values(values: Mapping[str, Any]) -> Sweep:
+    """Return the sweep that plain values describe, as `Sweep.to_mapping` gives them.
+
+    Raises:
+        ConfigError: they do not.
+    """
+    return _sweep(Document(dict(values)), None, "sweep", Path())
+
+
+def with_values(base: ExperimentConfig, values: Mapping[str, Any]) -> ExperimentConfig:
+    """Return an experiment with other values, by path.
+
+    Raises:
+        ConfigError: they do not go together.
+    """
+    return from_mapping(base.to_mapping(), [f"{path}={json.dumps(value)}" for path, value in values.items()])
+
+
+@cache
+def _schema() -> Schema:
+    return without_references(SweepFile.model_json_schema())
+
+
+def _sweep(document: Document, name: str | None, stem: str, beside: Path) -> Sweep:
+    if not isinstance(document.value, Mapping):
+        problem = Problem(
+            (), f"found {found(document.value)}, expected keys and values, such as base and trials"
+        )
+        raise refuse([*document.problems, problem], document)
+    try:
+        file = SweepFile.model_validate(dict(document.value))
+    except ValidationError as error:
+        problems = problems_in(error, document.value, _schema())
+        raise refuse([*document.problems, *problems], document) from None
+    if document.problems:
+        raise refuse(document.problems, document)
+    called = name or file.name or stem
+    if len(called) > MAX_NAME:
+        raise ConfigError(
+            f"name: found {len(called)} characters, expected at most {MAX_NAME}: runs carry it."
+        )
+    base = _base(file, document, called, beside)
+    _check_parameters(file, base, document)
+    spelled = file.model_copy(update={"name": called, "base": base.to_mapping()})
+    return Sweep(called, spelled, base)
+
+
+def _base(file: SweepFile, document: Document, name: str, beside: Path) -> ExperimentConfig:
+    """Return the base with the sweep's name, seeds and recording put in."""
+    if isinstance(file.base, str):
+        experiment = load(beside / file.base)
+        within = Document(experiment.to_mapping())
+    else:
+        within = _below(document, "base")
+    at = {key: _below(document, key).places for key in ("seeds", "recording")}
+    seeds = file.model_dump(mode="json")["seeds"]
+    values: list[tuple[tuple[str, ...], Document]] = [
+        (("name",), Document(name)),
+        (("seeds",), Document(seeds, at["seeds"])),
+    ]
+    for key, value in file.recording.items():
+        places = {where[1:]: place for where, place in at["recording"].items() if where[:1] == (key,)}
+        values.append((("recording", key), Document(value, places)))
+    put(within, values)
+    return experiment_in(within, (), name, named_by=repr(name))
+
+
+def _below(document: Document, key: str) -> Document:
+    """Return the part of a document under a key, with its places."""
+    places = {where[1:]: place for where, place in document.places.items() if where[:1] == (key,)}
+    return Document(document.value.get(key), places)
+
+
+def _check_parameters(file: SweepFile, base: ExperimentConfig, document: Document) -> None:
+    """Try every end and choice of each parameter, the others at their first."""
+    first = {path: next(_samples(parameter)) for path, parameter in file.parameters.items()}
+    lines: dict[str, None] = {}
+    for path, parameter in file.parameters.items():
+        for number, sample in enumerate(_samples(parameter)):
+            try:
+                experiment = _placed(base, first | {path: sample}, document)
+                if number == 0 or path.startswith("env."):
+                    _check_environment(experiment, path, document)
+            except ConfigError as error:
+                lines |= dict.fromkeys(str(error).split("\n"))
+    if lines:
+        raise ConfigError("\n".join(lines))
+
+
+def _samples(parameter: Range | list[Any]) -> Iterator[Any]:
+    if isinstance(parameter, Range):
+        kind = int if parameter.whole else float
+        yield from (kind(parameter.low), kind(parameter.high))
+    else:
+        yield from parameter
+
+
+def _placed(base: ExperimentConfig, values: Mapping[str, Any], document: Document) -> ExperimentConfig:
+    """Return the base with values, whose mistakes are told at the parameters' places."""
+    within = Document(base.to_mapping())
+    places = {path: document.place(("parameters", path)) for path in values}
+    put(
+        within,
+        [
+            (tuple(path.split(".")), Document(value, {(): place} if (place := places[path]) else {}))
+            for path, value in values.items()
+        ],
+    )
+    return experiment_in(within, (), base.name, named_by=repr(base.name))
+
+
+def _check_environment(experiment: ExperimentConfig, path: str, document: Document) -> None:
+    from runner.mdp import load_mdp
+
+    try:
+        load_mdp(experiment.env.id, experiment.env.kwargs, experiment.rewards)
+    except EnvironmentNotUsable as error:
+        raise refuse([Problem(("parameters", path), str(error))], document) from None

@@ -1,0 +1,208 @@
+"""What a sweep file may say, and the sweep that it means."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from runner.config import ExperimentConfig
+from runner.config.model import Name, Seed, SeedRange, Seeds
+from runner.config.values import Count, Section, refusal
+
+Strategy = Literal["grid", "random", "tpe", "genetic"]
+At = Literal["last", "best", "area", "first_over"]
+Direction = Literal["maximize", "minimize"]
+
+
+class Range(Section):
+    """Numbers from `low` to `high`, both included; whole ones if both are whole."""
+
+    low: int | float = Field(description="The lowest value.")
+    high: int | float = Field(description="The highest value.")
+    log: bool = Field(default=False, description="Draw evenly in the logarithm, for values over magnitudes.")
+    step: int | float | None = Field(
+        default=None, gt=0, description="Only low, low + step, ...; a grid needs it."
+    )
+
+    @model_validator(mode="after")
+    def _is_a_range(self) -> Self:
+        if not self.low < self.high:
+            raise refusal(("high",), f"found {self.high:g}, expected a number above low, {self.low:g}")
+        if self.log and self.low <= 0:
+            raise refusal(("low",), f"found {self.low:g}, expected a number above 0: log is true")
+        if self.log and self.step is not None:
+            raise refusal(("step",), f"found {self.step:g}, but log is true: leave out one of them")
+        return self
+
+    @property
+    def whole(self) -> bool:
+        """Whether its values are whole numbers."""
+        return all(isinstance(bound, int) for bound in (self.low, self.high, self.step or 1))
+
+
+def _parameter_kind(value: object) -> str | None:
+    if isinstance(value, Mapping | Range):
+        return "Range"
+    return "array" if isinstance(value, list | tuple) else None
+
+
+_Choices = Annotated[list[Any], Field(min_length=1)]
+Parameter = Annotated[
+    Annotated[_Choices, Tag("array")] | Annotated[Range, Tag("Range")], Discriminator(_parameter_kind)
+]
+"""What is tried: each of a list, or numbers of a range."""
+
+
+class Objective(Section):
+    """What a trial is judged by: the median over its seeds of a metric at a moment."""
+
+    metric: str = Field(
+        default="finish_percent",
+        min_length=1,
+        description="A recorded metric, such as finish_percent, mean_length, mean_return.taxi_1 or "
+        "exact.finish_percent.",
+    )
+    at: At = Field(
+        default="last",
+        description="The last evaluation; the best one; area: the mean over training, by area under the "
+        "curve; first_over: after how many episodes `level` is first reached.",
+    )
+    level: float | None = Field(default=None, description="For first_over.")
+    direction: Direction = Field(default="maximize", description="What is better: more, or less.")
+
+    @model_validator(mode="after")
+    def _level_goes_with_first_over(self) -> Self:
+        if self.at == "first_over" and self.level is None:
+            raise refusal(("level",), "found null, expected a number: at is first_over")
+        if self.at == "first_over" and self.direction == "maximize":
+            message = "found 'maximize', expected 'minimize': first_over counts episodes until a level"
+            raise refusal(("direction",), message)
+        if self.at != "first_over" and self.level is not None:
+            raise refusal(("level",), f"found {self.level:g}, but at is {self.at}: only first_over has one")
+        return self
+
+    @property
+    def sign(self) -> float:
+        """1 if more is better, else -1."""
+        return 1.0 if self.direction == "maximize" else -1.0
+
+    @property
+    def described(self) -> str:
+        """The objective in words: `exact.finish_percent, last, maximize`."""
+        at = f"first at {self.level:g}" if self.at == "first_over" else self.at
+        return f"{self.metric}, {at}, {self.direction}"
+
+
+class Pruning(Section):
+    """When a run is given up: its best reading so far is worse than what most trials had by then."""
+
+    after: Count = Field(description="No run is given up before so many training episodes.")
+    trials: Count = Field(default=5, description="Nor before so many trials are finished.")
+    percentile: Annotated[float, Field(gt=0, lt=100)] = Field(
+        default=50.0, description="Worse than this share of the finished trials, in percent; 50: the median."
+    )
+
+
+class Limits(Section):
+    """Where a sweep stops; it can be gone on with after they were raised."""
+
+    runs: Count | None = Field(default=None, description="The most runs.")
+    seconds: Annotated[float, Field(gt=0)] | None = Field(default=None, description="The longest time.")
+    disk: Count | None = Field(default=None, description="The most bytes of all its recordings.")
+
+
+_SweepSeeds = Annotated[
+    Annotated[Seeds, Tag("array")] | Annotated[SeedRange, Tag("SeedRange")],
+    Discriminator(lambda value: "SeedRange" if isinstance(value, Mapping | SeedRange) else "array"),
+]
+_Base = Annotated[
+    Annotated[str, Tag("path")] | Annotated[dict[str, Any], Tag("mapping")],
+    Discriminator(lambda value: "mapping" if isinstance(value, Mapping) else "path"),
+]
+
+
+class SweepFile(Section):
+    """A sweep as a YAML file describes it."""
+
+    name: Name | None = Field(
+        default=None, description="What it is called: the file's name without its ending."
+    )
+    base: _Base = Field(
+        description="The experiment: a configuration, or the path of one, seen from this file."
+    )
+    strategy: Strategy = Field(description="Which values are tried: all of a grid, or as many as `trials`.")
+    parameters: Annotated[dict[str, Parameter], Field(min_length=1)] = Field(
+        description="By path of the configuration, such as evaluation.trials: a list, or low and high."
+    )
+    trials: Count | None = Field(default=None, description="How many; a grid tries all of its points.")
+    batch: Annotated[int, Field(ge=1, le=10_000)] = Field(
+        default=10,
+        description="How many trials are suggested at once; a generation, if genetic. What is suggested "
+        "follows from the batches before, so that it does not depend on the number of workers.",
+    )
+    seeds: _SweepSeeds = Field(
+        default=(0,), description="Each trial is run with each: a list, or the first and how many."
+    )
+    search_seed: Seed = Field(default=0, description="What the suggestions follow from.")
+    objective: Objective = Field(default=Objective(), description="What is looked for.")
+    pruning: Pruning | None = Field(default=None, description="Hopeless runs are given up; null: never.")
+    limits: Limits = Field(default=Limits(), description="Where it stops.")
+    recording: dict[str, Any] = Field(
+        default_factory=lambda: {"steps": "none"},
+        description="Put over the base's `recording`; by default steps are left out, to be recorded where "
+        "one wants to look (dualtaxi rerecord).",
+    )
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if self.strategy == "grid":
+            if self.trials is not None:
+                raise refusal(("trials",), f"found {self.trials}, but a grid tries all of its points")
+            for name, parameter in self.parameters.items():
+                if isinstance(parameter, Range) and parameter.step is None and not parameter.whole:
+                    raise refusal(("parameters", name), "found a range without step: a grid needs one")
+                if isinstance(parameter, Range) and parameter.log:
+                    raise refusal(("parameters", name, "log"), "found true, but a grid has steps")
+        elif self.trials is None:
+            raise refusal(("trials",), f"missing, expected a whole number: {self.strategy} has no end")
+        if self.pruning is not None and self.objective.at == "first_over":
+            raise refusal(("pruning",), "found one, but objective.at is first_over, which can come late")
+        return self
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep, checked against its configuration."""
+
+    name: str
+    file: SweepFile
+    """As described, with the base spelled out."""
+    base: ExperimentConfig
+    """Its seeds and its recording are the sweep's."""
+
+    @property
+    def objective(self) -> Objective:
+        """What is looked for."""
+        return self.file.objective
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Each trial's."""
+        return self.base.seeds
+
+    def config(self, values: Mapping[str, Any]) -> ExperimentConfig:
+        """Return the experiment with these values of the parameters.
+
+        Raises:
+            ConfigError: they do not go together.
+        """
+        from runner.sweep.loading import with_values
+
+        return with_values(self.base, values)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values, fit for JSON and YAML, which `from_values` takes back to an equal sweep."""
+        return self.file.model_dump(mode="json") | {"name": self.name}

@@ -1,0 +1,141 @@
+"""What a sweep is going to take, found out by a run of one episode; and where it must stop."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from runner.config import ExperimentConfig, from_mapping
+from runner.errors import StorageError
+from runner.execution import run_job
+from runner.job import Job
+from runner.mdp import Mdp, load_mdp
+from runner.recording.reader import open_recording
+from runner.runs import create_run
+from runner.sweep.model import Limits, Sweep
+from runner.sweep.readings import curve_of
+from runner.sweep.search import Search
+from runner.sweep.trials import Standing
+
+BYTES_A_STEP: Final = 17
+BYTES_AN_EPISODE: Final = 40
+BYTES_AN_EVALUATION: Final = 1500
+TYPICAL_LENGTH: Final = 0.1
+"""Of a training episode, as a share of the step limit."""
+TABLE_SHARE: Final = 0.75
+"""What a learned table keeps of its bytes when it is compressed."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be done."""
+
+    trials: int
+    runs: int
+    bytes_a_run: int
+    """About; recordings grow with what is learned."""
+
+    @property
+    def bytes(self) -> int:
+        """Of all runs together, about."""
+        return self.runs * self.bytes_a_run
+
+
+def plan_of(sweep: Sweep) -> Plan:
+    """Return what a sweep is going to take, tried out by its first trial with one episode.
+
+    Raises:
+        RunnerError: the environment cannot be used, or the objective is not recorded.
+    """
+    search = Search(sweep.file)
+    config = sweep.config(search.ask(1)[0])
+    mdp = load_mdp(config.env.id, config.env.kwargs, config.rewards)
+    size = _try_out(config, mdp, sweep.objective.metric)
+    trials = search.trials
+    return Plan(trials, trials * len(sweep.seeds), size + _growth(config, mdp))
+
+
+def _try_out(config: ExperimentConfig, mdp: Mdp, metric: str) -> int:
+    """Return the bytes of a run of one episode, after its readings were looked at."""
+    values = config.to_mapping()
+    if config.evaluation is not None:
+        values["evaluation"] = values["evaluation"] | {"every": 1, "trials": 1}
+    short = from_mapping(values, ["episodes=1"])
+    with tempfile.TemporaryDirectory() as folder:
+        run = create_run(Path(folder), short, short.seeds[0])
+        run = run_job(Job(short, short.seeds[0]), run, mdp=mdp)
+        with open_recording(run.recording) as recording:
+            curve_of(recording, metric)
+            return recording.size
+
+
+def _growth(config: ExperimentConfig, mdp: Mdp) -> int:
+    """Return about how many bytes all that one episode does not show will take."""
+    counts = (mdp.joint_actions,) if config.tables == "joint" else mdp.action_counts
+    table = mdp.states * sum(counts) * 8
+    snapshots = 1 + (config.episodes // config.snapshots.every if config.snapshots.every else 0)
+    evaluations, trials = 0, 0
+    if config.evaluation is not None:
+        evaluations = config.episodes // config.evaluation.every + 1
+        trials = evaluations * config.evaluation.trials
+    steps = mdp.step_limit * TYPICAL_LENGTH * (config.episodes + trials)
+    return round(
+        snapshots * table * TABLE_SHARE
+        + (config.episodes + trials) * BYTES_AN_EPISODE
+        + evaluations * BYTES_AN_EVALUATION
+        + (steps * BYTES_A_STEP if config.recording.steps == "all" else 0)
+    )
+
+
+def require_disk(plan: Plan, done: int, recordings: Path) -> None:
+    """Refuse a sweep that the disk would not hold.
+
+    Args:
+        plan: what it takes.
+        done: runs that are there already.
+        recordings: the folder they go to.
+
+    Raises:
+        StorageError: there is too little.
+    """
+    needed, free = max(0, plan.runs - done) * plan.bytes_a_run, free_bytes(recordings)
+    if needed > free:
+        raise StorageError(
+            f"{recordings}: {plan.runs - done:,} runs need about {needed / 1e9:,.1f} GB, and "
+            f"{free / 1e9:,.1f} GB are free: free some, choose another --recordings, or try fewer values."
+        )
+
+
+def free_bytes(folder: Path) -> int:
+    """Return how much the disk of a folder, which need not exist, would still take."""
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    return shutil.disk_usage(there).free
+
+
+def room(limits: Limits, plan: Plan, recordings: Path, before: int) -> Callable[[Standing], str]:
+    """Return what says why no further run may begin.
+
+    Args:
+        limits: the sweep's.
+        plan: what a run takes.
+        recordings: where to.
+        before: the sweep's runs that there were.
+    """
+
+    def reason(standing: Standing) -> str:
+        under_way = (standing.running + 1) * plan.bytes_a_run
+        if limits.runs is not None and before + standing.begun >= limits.runs:
+            return f"limits.runs: {limits.runs:,} runs were begun"
+        if limits.seconds is not None and standing.seconds >= limits.seconds:
+            return f"limits.seconds: {limits.seconds:g} s are over"
+        if limits.disk is not None and standing.bytes + under_way > limits.disk:
+            return f"limits.disk: {standing.bytes:,} of {limits.disk:,} bytes are used"
+        if free_bytes(recordings) < under_way:
+            return f"the disk of {recordings} is full: a run needs about {plan.bytes_a_run:,} bytes"
+        return ""
+
+    return reason

@@ -1,0 +1,116 @@
+"""What a run is measured by: any recorded metric, at a moment of its training."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from runner.analysis.compare.statistics import NEVER
+from runner.analysis.series import evaluation_readings, exact_readings, training_readings
+from runner.errors import RunnerError, nearest
+from runner.frames import agents_of, evaluation_record, event_names_of
+from runner.recording.reader import Recording
+from runner.sweep.model import Objective
+
+Curve = dict[int, float]
+"""Reading by training episode."""
+
+
+def curve_of(recording: Recording, metric: str) -> Curve:
+    """Return the readings of a metric at the evaluations of a recording; those that are unknown left out.
+
+    Raises:
+        RunnerError: the metric is in none of them.
+    """
+    agents, events = agents_of(recording), event_names_of(recording)
+    exact = list(recording.optimality())
+    found = [
+        (metrics["episode"], readings(metrics, measures, agents, events))
+        for metrics, measures in itertools.zip_longest(recording.metrics("eval"), exact)
+        if metrics is not None
+    ]
+    curve = {episode: read[metric] for episode, read in found if metric in read}
+    if not curve:
+        raise never_recorded(metric, {name for _, read in found for name in read})
+    return {episode: reading for episode, reading in curve.items() if math.isfinite(reading)}
+
+
+def readings(
+    metrics: Mapping[str, Any],
+    exact: Mapping[str, Any] | None,
+    agents: Sequence[str],
+    events: Sequence[str],
+) -> dict[str, float]:
+    """Return the readings of an evaluation by name; `mean_return` without an agent if there is but one.
+
+    Args:
+        metrics: of the evaluation, as recorded.
+        exact: its exact measures, if they were taken.
+        agents: the learners.
+        events: the environment's.
+    """
+    record = evaluation_record(metrics, agents, events)
+    told = evaluation_readings(record) | training_readings(record["training"])
+    if exact is not None:
+        told |= exact_readings(exact, agents)
+    flat = {
+        (f"{metric}.{line}" if line else metric): value
+        for metric, lines in told.items()
+        for line, value in lines.items()
+    }
+    alone = {metric: next(iter(lines.values())) for metric, lines in told.items() if len(lines) == 1}
+    return flat | alone
+
+
+def never_recorded(metric: str, known: set[str]) -> RunnerError:
+    """Return the error of an objective that no evaluation has."""
+    if not known:
+        return RunnerError(
+            f"objective.metric: {metric!r} was never recorded: there are no evaluations. "
+            "Set `evaluation` in the base."
+        )
+    hint = nearest(metric, known)
+    if metric.startswith("exact.") and not any(name.startswith("exact.") for name in known):
+        hint = " Set `evaluation: {exact: true}` in the base for exact measures."
+    listed = ", ".join(sorted(name for name in known if not name.startswith("training.reward.")))
+    return RunnerError(f"objective.metric: {metric!r} was never recorded; there are {listed}.{hint}")
+
+
+def value_of(objective: Objective, curve: Curve) -> float:
+    """Return what a run is worth; NEVER for a level that is not reached; nan without a reading."""
+    if not curve:
+        return math.nan
+    episodes = sorted(curve)
+    values = [curve[episode] for episode in episodes]
+    match objective.at:
+        case "last":
+            return values[-1]
+        case "best":
+            return objective.sign * max(objective.sign * value for value in values)
+        case "area":
+            if len(values) == 1:
+                return values[0]
+            return float(np.trapezoid(values, episodes)) / (episodes[-1] - episodes[0])
+        case "first_over":
+            assert objective.level is not None
+            rising = values[0] < objective.level
+            crossed = (
+                episode
+                for episode in episodes
+                if (curve[episode] >= objective.level if rising else curve[episode] <= objective.level)
+            )
+            return float(next(crossed, NEVER))
+
+
+def hopeless(objective: Objective, curve: Curve, bounds: Mapping[int, float]) -> bool:
+    """Return whether the best reading so far is worse than the last bound that a curve came to."""
+    passed = [episode for episode in bounds if curve and episode <= max(curve)]
+    if not passed:
+        return False
+    at = max(passed)
+    best = max((objective.sign * value for episode, value in curve.items() if episode <= at), default=-np.inf)
+    return bool(best < objective.sign * bounds[at])

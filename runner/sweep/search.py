@@ -1,0 +1,182 @@
+"""Which values are tried next: Optuna's samplers, asked in batches and told in the order of the trials.
+
+The same told values give the same suggestions. So a search that was cut off is done again from what its
+runs gave, and goes on as if it never had been; nothing of it needs to be kept on disk.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from runner.errors import MissingExtra
+from runner.sweep.model import Objective, Range, SweepFile
+
+
+def require_optuna() -> Any:
+    """Return the module `optuna`, which says no more than it must.
+
+    Raises:
+        MissingExtra: it is not installed.
+    """
+    try:
+        import optuna
+    except ImportError as error:
+        raise MissingExtra("optuna", "sweep", "a sweep") from error
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    return optuna
+
+
+class Search:
+    """Suggests values for trials.
+
+    Args:
+        file: the sweep's.
+
+    Raises:
+        MissingExtra: Optuna is not installed.
+    """
+
+    def __init__(self, file: SweepFile) -> None:
+        optuna = require_optuna()
+        self._file = file
+        self._space = {path: distribution(parameter) for path, parameter in file.parameters.items()}
+        self._study = optuna.create_study(sampler=_sampler(file), direction=file.objective.direction)
+        self._asked: dict[int, Any] = {}
+        self.trials = file.trials or math.prod(len(points(each)) for each in file.parameters.values())
+        """How many there are to be."""
+
+    def ask(self, count: int) -> list[dict[str, Any]]:
+        """Return the values of the next trials, by path; fewer where the search ends."""
+        start = len(self._asked)
+        suggested = []
+        for number in range(start, min(start + count, self.trials)):
+            if self._file.strategy == "grid":
+                self._study.enqueue_trial(self._grid_point(number))
+            trial = self._study.ask(self._space)
+            self._asked[number] = trial
+            suggested.append(_plain(self._file.parameters, trial.params))
+        return suggested
+
+    def tell(self, number: int, value: float | None, pruned: bool, curve: Mapping[int, float]) -> None:
+        """Say what came of a trial: its value, that it was given up, or (None) that it failed."""
+        from optuna.trial import TrialState
+
+        trial = self._asked[number]
+        if value is None:
+            self._study.tell(trial, state=TrialState.FAIL)
+            return
+        for episode, reading in curve.items():
+            trial.report(reading, episode)
+        if pruned:
+            self._study.tell(trial, state=TrialState.PRUNED)
+        else:
+            self._study.tell(trial, value)
+
+    def importance(self) -> dict[str, float]:
+        """Return how much each parameter decides, summing up to 1; empty if too little is known.
+
+        S. Watanabe, A. Bansal and F. Hutter, "PED-ANOVA: efficiently quantifying hyperparameter importance
+        in arbitrary subspaces", IJCAI 2023.
+        """
+        from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+        from optuna.trial import TrialState
+
+        done = self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        if len({trial.value for trial in done}) < 2:
+            return {}
+        found = get_param_importances(self._study, evaluator=PedAnovaImportanceEvaluator())
+        return {name: float(share) for name, share in found.items() if math.isfinite(share)}
+
+    def _grid_point(self, number: int) -> dict[str, Any]:
+        """Return a point of the grid, the last parameter changing fastest, as Optuna has it."""
+        rest, point = number, {}
+        for path, parameter in reversed(self._file.parameters.items()):
+            choices = points(parameter)
+            rest, at = divmod(rest, len(choices))
+            choice = choices[at]
+            point[path] = choice if isinstance(parameter, Range) else json.dumps(choice)
+        return point
+
+
+def distribution(parameter: Range | list[Any]) -> Any:
+    """Return Optuna's distribution of a parameter; choices are JSON, as they may be of any kind."""
+    from optuna import distributions
+
+    if not isinstance(parameter, Range):
+        return distributions.CategoricalDistribution([json.dumps(choice) for choice in parameter])
+    if parameter.whole:
+        step = int(parameter.step or 1)
+        return distributions.IntDistribution(
+            int(parameter.low), _last(parameter), log=parameter.log, step=step
+        )
+    return distributions.FloatDistribution(
+        float(parameter.low), float(_last(parameter)), log=parameter.log, step=parameter.step
+    )
+
+
+def points(parameter: Range | list[Any]) -> list[Any]:
+    """Return the points of a grid along a parameter."""
+    if not isinstance(parameter, Range):
+        return list(parameter)
+    step = parameter.step or 1
+    count = _steps(parameter) + 1
+    numbers = [parameter.low + step * number for number in range(count)]
+    return [int(number) if parameter.whole else float(number) for number in numbers]
+
+
+def _steps(parameter: Range) -> int:
+    step = parameter.step or 1
+    return math.floor((parameter.high - parameter.low) / step + 1e-9)
+
+
+def _last(parameter: Range) -> Any:
+    """Return the highest value that is reached in whole steps."""
+    if parameter.step is None:
+        return parameter.high
+    return parameter.low + parameter.step * _steps(parameter)
+
+
+def bounds(objective: Objective, curves: list[dict[int, float]], percentile: float) -> dict[int, float]:
+    """Return by episode what the best reading so far must not be worse than.
+
+    Args:
+        objective: says what is better.
+        curves: of the trials that are finished: reading by episode.
+        percentile: the share of them that a run may be worse than.
+    """
+    bests: dict[int, list[float]] = {}
+    for curve in curves:
+        episodes = sorted(curve)
+        best = list(itertools.accumulate((objective.sign * curve[e] for e in episodes), max))
+        for episode, reading in zip(episodes, best, strict=True):
+            bests.setdefault(episode, []).append(reading)
+    return {
+        episode: objective.sign * float(np.percentile(readings, percentile))
+        for episode, readings in sorted(bests.items())
+    }
+
+
+def _plain(parameters: Mapping[str, Range | list[Any]], suggested: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        path: suggested[path] if isinstance(parameter, Range) else json.loads(suggested[path])
+        for path, parameter in parameters.items()
+    }
+
+
+def _sampler(file: SweepFile) -> Any:
+    from optuna import samplers
+
+    seed = file.search_seed % 2**32
+    match file.strategy:
+        case "tpe":
+            return samplers.TPESampler(seed=seed)
+        case "genetic":
+            return samplers.NSGAIISampler(population_size=max(2, file.batch), seed=seed)
+        case _:
+            return samplers.RandomSampler(seed=seed)

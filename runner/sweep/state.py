@@ -1,0 +1,158 @@
+"""A sweep on disk: the file as it was resolved, beside the runs. What has been done, the runs themselves say.
+
+recordings/.sweeps/NAME/sweep.yaml   the sweep, its base spelled out
+recordings/k3v9m2xq/labels.json      a run of it: the tag sweep=NAME
+"""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from runner.config.document import read_yaml, write_yaml
+from runner.config.loading import read_text
+from runner.errors import ConfigError, RunnerError, StorageError, nearest
+from runner.job import identity_of
+from runner.runs import Run, list_runs
+from runner.sweep.loading import from_values
+from runner.sweep.model import Sweep
+from runner.sweep.task import is_over
+
+FOLDER: Final = ".sweeps"
+FILE: Final = "sweep.yaml"
+LOCK: Final = "owner.lock"
+FREE: Final = ("limits",)
+"""What may change when a sweep is gone on with: what is done follows from the rest."""
+
+
+def tag_of(name: str) -> str:
+    """Return the tag of a sweep's runs."""
+    return f"sweep={name}"
+
+
+def folder_of(name: str, recordings: Path) -> Path:
+    """Return the folder of a sweep; it need not exist."""
+    return recordings / FOLDER / name
+
+
+def sweeps_in(recordings: Path) -> list[str]:
+    """Return the names of the sweeps of a recordings folder."""
+    return sorted(file.parent.name for file in (recordings / FOLDER).glob(f"*/{FILE}"))
+
+
+def read_sweep(name: str, recordings: Path) -> Sweep:
+    """Return a sweep as it was begun.
+
+    Raises:
+        RunnerError: there is none of this name, or its file was damaged.
+    """
+    known = sweeps_in(recordings)
+    if name not in known:
+        listed = f" There are {', '.join(known)}." if known else " `dualtaxi sweep FILE` begins one."
+        raise RunnerError(f"no sweep {name!r} in {recordings}.{nearest(name, known) or listed}")
+    path = folder_of(name, recordings) / FILE
+    try:
+        return from_values(read_yaml(read_text(path), str(path)).value)
+    except (ConfigError, TypeError, ValueError) as error:
+        raise RunnerError(f"{path}: is no sweep any more: {error}") from error
+
+
+def begin(sweep: Sweep, recordings: Path, resume: bool, accept_changes: bool) -> None:
+    """Write a sweep down, or find it as it was begun.
+
+    Args:
+        sweep: what is to be done.
+        recordings: the folder of its runs.
+        resume: whether it may be there already.
+        accept_changes: whether it may have been another then.
+
+    Raises:
+        RunnerError: there is one of this name already, or there is none, or it was another.
+        StorageError: the folder cannot be written.
+    """
+    there = sweep.name in sweeps_in(recordings)
+    if there and not resume:
+        raise RunnerError(
+            f"a sweep {sweep.name!r} is in {recordings} already: --resume goes on with it, --name calls this "
+            "one otherwise."
+        )
+    if there and not accept_changes:
+        changed = differences(read_sweep(sweep.name, recordings).to_mapping(), sweep.to_mapping())
+        if changed:
+            raise RunnerError(
+                f"the sweep {sweep.name!r} was begun with something else:\n"
+                + "\n".join(f"  {key}: {before}, now {now}" for key, before, now in changed)
+                + "\n--accept-changes goes on all the same, and runs that still belong to it count; "
+                "--name begins another."
+            )
+    _write(folder_of(sweep.name, recordings), write_yaml(sweep.to_mapping()))
+
+
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Return what differs between two sweeps: path, value before, value now."""
+    ours, theirs = (dict(_flat({k: v for k, v in each.items() if k not in FREE})) for each in (before, now))
+    missing = "nothing"
+    return [
+        (key, str(ours.get(key, missing)), str(theirs.get(key, missing)))
+        for key in dict.fromkeys([*ours, *theirs])
+        if ours.get(key, missing) != theirs.get(key, missing)
+    ]
+
+
+@contextlib.contextmanager
+def held(name: str, recordings: Path) -> Iterator[None]:
+    """Keep every other process from doing this sweep meanwhile.
+
+    Raises:
+        RunnerError: one does.
+        StorageError: the folder cannot be written.
+    """
+    from filelock import FileLock, Timeout
+
+    folder = folder_of(name, recordings)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / LOCK)
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise RunnerError(f"the sweep {name!r} is being done by another process; let it.") from error
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def runs_of(name: str, recordings: Path) -> dict[str, Run]:
+    """Return the runs of a sweep by the identity of their job: where there are two, the one that is over."""
+    found: dict[str, Run] = {}
+    for run in list_runs(recordings):
+        if tag_of(name) in run.tags:
+            identity = identity_of(run.facts["config"], run.seed)
+            if identity not in found or (is_over(run) and not is_over(found[identity])):
+                found[identity] = run
+    return found
+
+
+def _write(folder: Path, text: str) -> None:
+    fresh = folder / f"{FILE}.{secrets.token_hex(4)}.tmp"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        fresh.write_text(text, encoding="utf-8")
+        fresh.replace(folder / FILE)
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
+    finally:
+        fresh.unlink(missing_ok=True)
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value

@@ -1,0 +1,161 @@
+"""One run of a sweep, as a worker does it: begun, gone on with, or only read when it is finished."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from runner.config import from_mapping
+from runner.errors import RunnerError
+from runner.execution import Progress, run_job
+from runner.job import Job
+from runner.labels import Labels, change_labels
+from runner.mdp import Mdp, load_mdp
+from runner.recording.reader import open_recording
+from runner.resume import resume
+from runner.runs import Run, create_run, find_run, unless_empty
+from runner.sweep.model import Objective
+from runner.sweep.readings import Curve, curve_of, hopeless, readings
+
+PRUNED: Final = "pruned"
+"""The tag of a run that was given up."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A run that is wanted: a trial's configuration with a seed."""
+
+    identity: str
+    """Of its job."""
+    seed: int
+    config: dict[str, Any]
+    name: str
+    tags: tuple[str, ...]
+    recordings: str
+    objective: Objective
+    bounds: Mapping[int, float] = field(default_factory=dict)
+    """By episode what a run must reach, or be given up."""
+    run_id: str = ""
+    """The run that there is already; empty if it is to be begun."""
+    accept_changes: bool = False
+    """Whether to go on with a run that other code began."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of a task."""
+
+    status: Literal["finished", "pruned", "interrupted", "failed"]
+    run_id: str = ""
+    curve: Curve = field(default_factory=dict)
+    digest: str = ""
+    bytes: int = 0
+    seconds: float = 0.0
+    """What learning and recording took; of a run that was only read, when it was made."""
+    error: str = ""
+
+
+def do(task: Task, stop: Callable[[], bool]) -> Result:
+    """Do a task; what a user can mend comes back as a failed result.
+
+    Args:
+        task: what to do.
+        stop: asked every few milliseconds whether to stop; the run is then interrupted, its recording kept.
+    """
+    try:
+        run = _run(task, stop)
+        return result_of(run, task.objective) if is_over(run) else Result("interrupted", run.run_id)
+    except RunnerError as error:
+        return Result("failed", task.run_id, error=str(error))
+
+
+def result_of(run: Run, objective: Objective) -> Result:
+    """Return what came of a run that is finished, or was given up.
+
+    Raises:
+        RunnerError: its recording cannot be read, or the objective was never recorded.
+    """
+    with open_recording(run.recording) as recording:
+        curve = curve_of(recording, objective.metric)
+        size = recording.size
+    return Result(
+        "pruned" if PRUNED in run.tags else "finished",
+        run.run_id,
+        curve,
+        str(run.summary.get("content_digest", "")),
+        size,
+        float(run.summary.get("seconds", 0.0)),
+    )
+
+
+def is_over(run: Run) -> bool:
+    """Return whether there is nothing left to do for a run."""
+    return run.status == "finished" or PRUNED in run.tags
+
+
+def _run(task: Task, stop: Callable[[], bool]) -> Run:
+    if task.run_id:
+        run = find_run(task.run_id, Path(task.recordings))
+        if is_over(run):
+            return run
+        watch = _Watch(task, _mdp_of(task), stop)
+        return watch.labelled(resume(run, task.accept_changes, watch.report, watch.stop))
+    job = Job(from_mapping(task.config), task.seed)
+    mdp = _mdp_of(task)
+    watch = _Watch(task, mdp, stop)
+    run = create_run(Path(task.recordings), job.config, task.seed, task.name)
+    with unless_empty(run):
+        change_labels(run.folder, lambda _: Labels(tags=tuple(sorted(task.tags))))
+        return watch.labelled(run_job(job, run, watch.report, watch.stop, mdp=mdp))
+
+
+class _Watch:
+    """Gives a run up when it is hopeless."""
+
+    def __init__(self, task: Task, mdp: Mdp, stop: Callable[[], bool]) -> None:
+        self._task = task
+        self._stop = stop
+        joint = task.config["tables"] == "joint" and len(mdp.agents) > 1
+        self._agents = ("agency",) if joint else mdp.agents
+        self._events = mdp.event_names
+        self._curve: Curve = {}
+        self._seen = 0
+        self._hopeless = False
+
+    def report(self, progress: Progress) -> None:
+        """Look at the evaluations that are new."""
+        if not self._task.bounds:
+            return
+        for metrics in progress.evaluations[self._seen :]:
+            read = readings(metrics, metrics.get("optimality"), self._agents, self._events)
+            if self._task.objective.metric in read:
+                self._curve[metrics["episode"]] = read[self._task.objective.metric]
+        self._seen = len(progress.evaluations)
+        done = progress.episode >= progress.episodes
+        self._hopeless = not done and hopeless(self._task.objective, self._curve, self._task.bounds)
+
+    def stop(self) -> bool:
+        """Return whether the run is to stop."""
+        return self._hopeless or self._stop()
+
+    def labelled(self, run: Run) -> Run:
+        """Return a run, tagged if it was given up."""
+        if not self._hopeless or run.status == "finished":
+            return run
+        change_labels(run.folder, lambda said: Labels(said.name, (*said.tags, PRUNED), said.note))
+        return Run(run.folder, run.facts)
+
+
+def _mdp_of(task: Task) -> Mdp:
+    env = task.config["env"]
+    return _mdp(env["id"], json.dumps(env["kwargs"], sort_keys=True), task.config["rewards"])
+
+
+@lru_cache(maxsize=4)
+def _mdp(env_id: str, kwargs: str, rewards: str) -> Mdp:
+    """Return an environment; a worker loads it once."""
+    return load_mdp(env_id, json.loads(kwargs), rewards)

@@ -1,0 +1,337 @@
+"""The trials of a sweep, batch by batch: from what is recorded, or by having workers run them."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from runner.config import ConfigError
+from runner.job import identity_of
+from runner.runs import Run
+from runner.sweep import state
+from runner.sweep.local import Workers
+from runner.sweep.model import Sweep
+from runner.sweep.readings import Curve, value_of
+from runner.sweep.search import Search, bounds
+from runner.sweep.task import Result, Task, is_over, result_of
+
+INTERRUPTED: Final = "interrupted"
+WAIT_SECONDS: Final = 0.2
+
+
+@dataclass
+class Trial:
+    """Values of the parameters, and what came of them."""
+
+    number: int
+    values: dict[str, Any]
+    config: dict[str, Any]
+    """The configuration as plain values; empty if the values do not go together."""
+    identities: dict[int, str]
+    """Seed to the identity of its job; empty as well."""
+    error: str = ""
+    results: dict[int, Result] = field(default_factory=dict)
+    """By seed, as far as they are known."""
+    seed_values: dict[int, float] = field(default_factory=dict)
+    """By seed, what its run is worth; a run that was given up is worth what it had then."""
+
+    @property
+    def state(self) -> Literal["finished", "pruned", "failed", "unfinished"]:
+        """Whether all its runs are over; pruned if half of them were given up."""
+        states = [result.status for result in self.results.values()]
+        if self.error or "failed" in states:
+            return "failed"
+        if len(states) < len(self.identities) or "interrupted" in states:
+            return "unfinished"
+        return "pruned" if 2 * states.count("pruned") >= len(states) else "finished"
+
+    @property
+    def value(self) -> float | None:
+        """The median over its seeds; None if it has none."""
+        known = [value for value in self.seed_values.values() if not math.isnan(value)]
+        return statistics.median(known) if known and self.state in ("finished", "pruned") else None
+
+    @property
+    def curve(self) -> Curve:
+        """The median over its seeds by episode, as far as all of them came."""
+        curves = [result.curve for result in self.results.values() if result.curve]
+        shared = set.intersection(*(set(curve) for curve in curves)) if curves else set()
+        return {episode: float(np.median([curve[episode] for curve in curves])) for episode in sorted(shared)}
+
+    def take(self, seed: int, result: Result, sweep: Sweep) -> None:
+        """Take in what came of a seed."""
+        self.results[seed] = result
+        if result.status in ("finished", "pruned"):
+            self.seed_values[seed] = value_of(sweep.objective, result.curve)
+
+    @property
+    def errors(self) -> list[str]:
+        """Why it failed."""
+        said = [f"seed {seed}: {result.error}" for seed, result in self.results.items() if result.error]
+        return [self.error] if self.error else said
+
+
+@dataclass
+class Standing:
+    """How far a sweep is, as its `report` is told."""
+
+    runs: int
+    """Runs to do, with those that are done."""
+    trials: int
+    done: int = 0
+    running: int = 0
+    pruned: int = 0
+    failed: int = 0
+    begun: int = 0
+    """Runs that this process had begun, or gone on with."""
+    bytes: int = 0
+    seconds: float = 0.0
+    best: Trial | None = None
+    stopped: str = ""
+    """Why it stopped before its end; empty if it did not."""
+
+
+Report = Callable[[Standing], None]
+
+
+class Trials:
+    """A sweep's trials; each batch follows from what came of those before.
+
+    Args:
+        sweep: whose.
+    """
+
+    def __init__(self, sweep: Sweep) -> None:
+        self.sweep = sweep
+        self.search = Search(sweep.file)
+        self.told: list[Trial] = []
+        adaptive = sweep.file.strategy in ("tpe", "genetic") or sweep.file.pruning is not None
+        self._size = sweep.file.batch if adaptive else self.search.trials
+
+    def ask(self) -> list[Trial]:
+        """Return the next batch; empty at the end."""
+        start = len(self.told)
+        return [
+            self._trial(start + i, values)
+            for i, values in enumerate(self.search.ask(self._size) if start < self.search.trials else ())
+        ]
+
+    def tell(self, batch: list[Trial]) -> None:
+        """Take in a batch whose runs are all over, or failed."""
+        for trial in batch:
+            self.search.tell(trial.number, trial.value, trial.state == "pruned", trial.curve)
+            self.told.append(trial)
+
+    def bounds(self) -> Curve:
+        """Return what the runs of the next batch must reach, by episode."""
+        plan = self.sweep.file.pruning
+        curves = [trial.curve for trial in self.told if trial.state == "finished"]
+        if plan is None or len(curves) < plan.trials:
+            return {}
+        found = bounds(self.sweep.objective, curves, plan.percentile)
+        return {episode: bound for episode, bound in found.items() if episode >= plan.after}
+
+    def best(self) -> Trial | None:
+        """Return the finished trial with the best value, the first of several."""
+        return best_of(self.told, self.sweep)
+
+    def _trial(self, number: int, values: dict[str, Any]) -> Trial:
+        try:
+            config = self.sweep.config(values).to_mapping()
+        except ConfigError as error:
+            return Trial(number, values, {}, {}, str(error))
+        return Trial(number, values, config, {seed: identity_of(config, seed) for seed in self.sweep.seeds})
+
+
+def best_of(trials: list[Trial], sweep: Sweep) -> Trial | None:
+    """Return the finished trial with the best value, the first of several; None if none is finished."""
+    finished = [(trial.value, trial) for trial in trials if trial.state == "finished"]
+    valued = [(value, trial) for value, trial in finished if value is not None]
+    sign = sweep.objective.sign
+    return max(valued, key=lambda pair: (sign * pair[0], -pair[1].number))[1] if valued else None
+
+
+def recorded(trials: Trials, recordings: Path) -> Iterator[Trial]:
+    """Yield the trials of a sweep as far as its runs are recorded, each as it stands.
+
+    Raises:
+        RunnerError: a run cannot be read.
+    """
+    sweep, known = trials.sweep, state.runs_of(trials.sweep.name, recordings)
+    while batch := trials.ask():
+        for trial in batch:
+            _take_recorded(trial, known, sweep)
+            yield trial
+        if any(trial.state == "unfinished" for trial in batch):
+            return
+        trials.tell(batch)
+
+
+def run_sweep(
+    sweep: Sweep,
+    recordings: Path,
+    workers: Workers,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    report: Report = lambda _: None,
+    room: Callable[[Standing], str] = lambda _: "",
+    accept_changes: bool = False,
+) -> tuple[Trials, Standing]:
+    """Run what is left of a sweep; return its trials, and how it stands.
+
+    Args:
+        sweep: written down by `state.begin`.
+        recordings: the folder of its runs.
+        workers: those who do the runs.
+        stop: asked several times a second whether to stop.
+        report: called with the standing several times a second.
+        room: says why no further run may begin; empty if one may.
+        accept_changes: go on with runs that were begun by other code.
+
+    Raises:
+        RunnerError: a run that is there cannot be read.
+    """
+    trials = Trials(sweep)
+    standing = Standing(trials.search.trials * len(sweep.seeds), trials.search.trials)
+    watch = Watch(stop, report, room)
+    known = state.runs_of(sweep.name, recordings)
+    seen: dict[str, Result] = {}
+    while batch := trials.ask():
+        work = _Batch(sweep, batch, recordings, standing, known, seen)
+        work.prepare(trials.bounds(), accept_changes)
+        work.run(workers, watch)
+        if standing.stopped:
+            break
+        trials.tell(batch)
+        standing.best = trials.best()
+    report(standing)
+    return trials, standing
+
+
+@dataclass(frozen=True)
+class Watch:
+    """What a sweep asks and tells while it goes on, as `run_sweep` has it."""
+
+    stop: Callable[[], bool]
+    report: Report
+    room: Callable[[Standing], str]
+
+
+class _Batch:
+    """The runs of one batch of trials: each job once, also if two trials want it."""
+
+    def __init__(
+        self,
+        sweep: Sweep,
+        batch: list[Trial],
+        recordings: Path,
+        standing: Standing,
+        known: Mapping[str, Run],
+        seen: dict[str, Result],
+    ) -> None:
+        self._sweep, self._batch, self._recordings = sweep, batch, recordings
+        self._standing, self._known, self._seen = standing, known, seen
+        self._retried: set[str] = set()
+        self._waiting: deque[Task] = deque()
+
+    def prepare(self, bounds: Curve, accept_changes: bool) -> None:
+        """Take in the runs that are over, and find out which are left to do."""
+        tasks: dict[str, Task] = {}
+        for trial in self._batch:
+            self._standing.failed += len(self._sweep.seeds) if trial.error else 0
+            for seed, identity in trial.identities.items():
+                result = self._result_of(identity)
+                if result is None:
+                    task = self._task(trial, seed, bounds)
+                    tasks.setdefault(identity, replace(task, accept_changes=accept_changes))
+                else:
+                    trial.take(seed, result, self._sweep)
+                    self._count(result)
+        self._waiting.extend(tasks.values())
+
+    def run(self, workers: Workers, watch: Watch) -> None:
+        """Have every run done; or say in the standing why not, when those under way have come to rest."""
+        began, before = time.monotonic(), self._standing.seconds
+        standing = self._standing
+        while standing.running or (self._waiting and not standing.stopped):
+            if not standing.stopped and watch.stop():
+                standing.stopped = INTERRUPTED
+                workers.stop()
+            self._give(workers, watch)
+            standing.seconds = before + time.monotonic() - began
+            watch.report(standing)
+            for task, result in workers.collect(WAIT_SECONDS):
+                standing.running -= 1
+                self._take(task, result)
+
+    def _give(self, workers: Workers, watch: Watch) -> None:
+        """Give tasks to those who are idle, while there is room for their runs."""
+        standing = self._standing
+        while self._waiting and workers.idle and not standing.stopped:
+            standing.stopped = watch.room(standing)
+            if not standing.stopped:
+                workers.give(self._waiting.popleft())
+                standing.begun += 1
+                standing.running += 1
+
+    def _take(self, task: Task, result: Result | None) -> None:
+        """Take in what came of a task; that of a worker that died is tried once more."""
+        if result is None and task.identity not in self._retried:
+            self._retried.add(task.identity)
+            there = state.runs_of(self._sweep.name, self._recordings).get(task.identity)
+            self._waiting.appendleft(replace(task, run_id=there.run_id if there is not None else ""))
+            return
+        result = result or Result("failed", task.run_id, error="its worker died twice")
+        if result.status == "interrupted" and not self._standing.stopped:
+            result = replace(result, status="failed", error="it was interrupted from elsewhere")
+        if result.status in ("finished", "pruned"):
+            self._seen[task.identity] = result
+        for trial in self._batch:
+            for seed, identity in trial.identities.items():
+                if identity == task.identity:
+                    trial.take(seed, result, self._sweep)
+                    self._count(result)
+
+    def _count(self, result: Result) -> None:
+        standing = self._standing
+        standing.bytes += result.bytes
+        standing.done += result.status in ("finished", "pruned")
+        standing.pruned += result.status == "pruned"
+        standing.failed += result.status == "failed"
+
+    def _result_of(self, identity: str) -> Result | None:
+        """Return what came of a job, if its run is over."""
+        run = self._known.get(identity)
+        if identity not in self._seen and run is not None and is_over(run):
+            self._seen[identity] = result_of(run, self._sweep.objective)
+        return self._seen.get(identity)
+
+    def _task(self, trial: Trial, seed: int, bounds: Curve) -> Task:
+        identity = trial.identities[seed]
+        return Task(
+            identity=identity,
+            seed=seed,
+            config=trial.config,
+            name=self._sweep.name,
+            tags=(state.tag_of(self._sweep.name), f"trial={trial.number}"),
+            recordings=str(self._recordings),
+            objective=self._sweep.objective,
+            bounds=bounds,
+            run_id=self._known[identity].run_id if identity in self._known else "",
+        )
+
+
+def _take_recorded(trial: Trial, known: Mapping[str, Run], sweep: Sweep) -> None:
+    """Take in the runs of a trial that are over."""
+    for seed, identity in trial.identities.items():
+        run = known.get(identity)
+        if run is not None and is_over(run):
+            trial.take(seed, result_of(run, sweep.objective), sweep)

@@ -1,0 +1,33 @@
+"""A small sweep that is done, and a file of it."""
+
+from __future__ import annotations
+
+import pytest
+from sweeping import described, swept
+
+from runner.config.document import write_yaml
+from runner.sweep.loading import from_values
+
+
+@pytest.fixture(scope="session")
+def sweep():
+    return from_values(described())
+
+
+@pytest.fixture(scope="session")
+def done(sweep, tmp_path_factory):
+    """The small sweep, done: folder, trials, standing."""
+    folder = tmp_path_factory.mktemp("swept")
+    return folder, *swept(folder, sweep)
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Return what writes a sweep's file."""
+
+    def write(**changes):
+        path = tmp_path / "small.yaml"
+        path.write_text(write_yaml(described(**changes)))
+        return path
+
+    return write

@@ -1,0 +1,69 @@
+"""A small sweep, and workers that need no process of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from runner.sweep import state
+from runner.sweep.task import do
+from runner.sweep.trials import run_sweep
+
+BASE = {
+    "env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": False}},
+    "episodes": 60,
+    "evaluation": {"every": 20, "trials": 5},
+    "snapshots": {"every": None},
+    "epsilon": 0.3,
+}
+
+
+def described(**changes):
+    """Return a sweep as a file says it, with changes."""
+    return {
+        "name": "small",
+        "base": BASE,
+        "strategy": "tpe",
+        "trials": 6,
+        "batch": 2,
+        "parameters": {"step_size": {"low": 0.1, "high": 1.0}, "discount": [0.5, 0.9]},
+        "seeds": [0, 1],
+        "objective": {"metric": "training.mean_reward", "at": "last"},
+    } | changes
+
+
+class Here:
+    """Does each task at once; stops by itself after so many, or as if its worker had died."""
+
+    def __init__(self, most=10**9, dying=()):
+        self.done, self.most, self.dying, self.answers, self.given = 0, most, set(dying), [], []
+
+    @property
+    def idle(self):
+        return 1 - len(self.answers)
+
+    def give(self, task):
+        self.given.append(task)
+        self.done += 1
+        died = self.done in self.dying
+        self.answers.append((task, None if died else do(task, lambda: self.done > self.most)))
+
+    def collect(self, seconds):
+        answers, self.answers = self.answers, []
+        return answers
+
+    def stop(self):
+        pass
+
+
+def swept(folder: Path, sweep, workers=None, **options):
+    """Do a sweep and return its trials and standing."""
+    state.begin(sweep, folder, resume=True, accept_changes=False)
+    return run_sweep(sweep, folder, workers or Here(), **options)
+
+
+def digests(trials):
+    """Return what is compared of trials: values, and the digest of every run."""
+    return [
+        (t.values, t.state, t.value, {seed: t.results[seed].digest for seed in sorted(t.results)})
+        for t in trials.told
+    ]

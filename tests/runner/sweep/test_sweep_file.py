@@ -1,0 +1,95 @@
+"""A sweep file: what it means, and how its mistakes are told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from sweeping import BASE, described
+
+from runner.config import ConfigError
+from runner.sweep.loading import from_values, load_sweep
+from runner.sweep.plan import plan_of
+
+SHIPPED = sorted((Path(__file__).parents[3] / "configs" / "sweeps").glob("*.yaml"))
+
+
+def refused(file, **changes):
+    with pytest.raises(ConfigError) as caught:
+        load_sweep(file(**changes))
+    return str(caught.value)
+
+
+def test_a_sweep_is_its_own_plain_values_again(sweep):
+    assert from_values(sweep.to_mapping()) == sweep
+    assert sweep.base.recording.steps == "none"
+    assert sweep.seeds == (0, 1)
+
+
+def test_a_base_is_found_from_the_file(tmp_path, file):
+    from runner.config.document import write_yaml
+
+    (tmp_path / "base.yaml").write_text(write_yaml(BASE))
+    assert load_sweep(file(base="base.yaml")) == load_sweep(file())
+
+
+def test_an_unknown_parameter_is_told_with_its_place_and_the_nearest_name(file):
+    told = refused(file, parameters={"step_sise": [0.1], "discount": [0.9]})
+    assert "small.yaml:" in told
+    assert "step_sise: unknown key. Did you mean 'step_size'?" in told
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"parameters": {"step_size": {"low": 0.5, "high": 0.5}}}, 'parameters."step_size"'),
+        ({"parameters": {"step_size": {"low": 0.5, "high": 0.5}}}, "above low, 0.5"),
+        ({"parameters": {"step_size": []}}, "found an empty list"),
+        ({"parameters": {"step_size": {"low": 0.5, "high": 2.0}}}, "step_size: found 2.0"),
+        ({"parameters": {"step_size": {"low": 0, "high": 1.0, "log": True}}}, "above 0: log is true"),
+        ({"strategy": "gird"}, "Did you mean 'grid'?"),
+        ({"strategy": "grid"}, "a grid tries all of its points"),
+        ({"strategy": "grid", "trials": None}, "a grid needs one"),
+        ({"trials": None}, "tpe has no end"),
+        ({"objectiv": {}}, "unknown key. Did you mean 'objective'?"),
+        (
+            {"objective": {"metric": "finish_percent", "at": "first_over"}},
+            "expected a number: at is first_over",
+        ),
+        ({"base": BASE | {"episods": 5}}, "episods: unknown key"),
+        ({"base": "nowhere.yaml"}, "no such file"),
+        ({"recording": {"steps": "some"}}, "recording.steps: found 'some'"),
+        ({"seeds": [1, 1]}, "found 1 for the second time"),
+        ({"parameters": {"env.kwargs.is_slipery": [True]}}, "is_slipery"),
+    ],
+)
+def test_a_mistake_is_told(file, changes, expected):
+    assert expected.replace('."step_size"', ".step_size") in refused(file, **changes)
+
+
+def test_an_environments_reward_that_it_does_not_have_is_told_with_its_place(file):
+    base = BASE | {"env": {"id": "dualtaxi:DualTaxi-v1"}}
+    told = refused(file, base=base, parameters={"env.kwargs.rewards.pick_up": [1, 2]})
+    assert "small.yaml:" in told
+    assert "did you mean 'pickup'" in told
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_a_shipped_sweep_can_be_run(path):
+    plan = plan_of(load_sweep(path))
+    assert plan.runs >= plan.trials > 1
+    assert plan.bytes > 10**6
+
+
+def test_what_is_shipped_is_found():
+    assert {"hyperparameters", "modes", "rewards"} <= {path.stem for path in SHIPPED}
+
+
+def test_an_objective_that_is_never_recorded_is_refused_with_what_there_is():
+    for metric, expected in (
+        ("finish_procent", "Did you mean 'finish_percent'?"),
+        ("exact.value", "evaluation: {exact: true}"),
+    ):
+        with pytest.raises(Exception, match="never recorded") as caught:
+            plan_of(from_values(described(objective={"metric": metric})))
+        assert expected in str(caught.value)

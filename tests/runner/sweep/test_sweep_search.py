@@ -1,0 +1,94 @@
+"""What is tried, what a run is worth, and when it is given up."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from sweeping import described
+
+from runner.sweep.model import Objective, SweepFile
+from runner.sweep.readings import hopeless, value_of
+from runner.sweep.search import Search, bounds
+
+CURVE = {0: 0.0, 100: 40.0, 200: 80.0, 300: 60.0}
+
+
+def searched(**changes):
+    return Search(SweepFile.model_validate(described(**changes)))
+
+
+def test_a_grid_is_all_points_in_order():
+    parameters = {"episodes": {"low": 1, "high": 6, "step": 2}, "discount": [0.5, 0.9]}
+    search = searched(strategy="grid", trials=None, parameters=parameters)
+    assert search.trials == 6
+    asked = search.ask(4) + search.ask(4)
+    assert [tuple(values.values()) for values in asked] == [
+        (episodes, discount) for episodes in (1, 3, 5) for discount in (0.5, 0.9)
+    ]
+
+
+def test_choices_may_be_of_any_kind():
+    choices = [{"schedule": "linear", "start": 1.0, "end": 0.1, "over": 10}, 0.5]
+    search = searched(strategy="grid", trials=None, parameters={"epsilon": choices})
+    assert [values["epsilon"] for values in search.ask(2)] == choices
+
+
+@pytest.mark.parametrize("strategy", ["random", "tpe", "genetic"])
+def test_the_same_told_gives_the_same_suggestions(strategy):
+    def suggestions():
+        search, asked = searched(strategy=strategy, trials=40, batch=5), []
+        for _ in range(8):
+            batch = search.ask(5)
+            for values in batch:
+                search.tell(len(asked), values["step_size"] * values["discount"], False, {})
+                asked.append(values)
+        return asked
+
+    first = suggestions()
+    assert first == suggestions()
+    assert len({str(values) for values in first}) > 20
+
+
+def test_a_search_finds_what_is_better_and_what_mattered():
+    search, tried = searched(trials=60), []
+    for number in range(60):
+        (values,) = search.ask(1)
+        tried.append(abs(values["step_size"] - 0.7))
+        search.tell(number, -tried[-1], False, {})
+    assert np.median(tried[40:]) < np.median(tried[:10])
+    shares = search.importance()
+    assert shares["step_size"] > shares["discount"]
+    assert sum(shares.values()) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("objective", "expected"),
+    [
+        ({}, 60.0),
+        ({"at": "best"}, 80.0),
+        ({"at": "best", "direction": "minimize"}, 0.0),
+        ({"at": "area"}, 50.0),
+        ({"at": "first_over", "level": 40.0, "direction": "minimize"}, 100.0),
+        ({"at": "first_over", "level": 90.0, "direction": "minimize"}, 1e100),
+    ],
+)
+def test_what_a_run_is_worth(objective, expected):
+    assert value_of(Objective(**objective), CURVE) == expected
+
+
+def test_a_run_without_readings_is_worth_nothing_known():
+    assert math.isnan(value_of(Objective(), {}))
+
+
+def test_a_run_is_hopeless_when_its_best_is_worse_than_most():
+    up = Objective()
+    limit = bounds(up, [CURVE, {0: 0.0, 100: 20.0, 200: 20.0}, {0: 0.0, 100: 60.0, 200: 10.0}], 50.0)
+    assert limit == {0: 0.0, 100: 40.0, 200: 60.0, 300: 80.0}
+    assert not hopeless(up, {0: 0.0}, limit)
+    assert not hopeless(up, {0: 0.0, 100: 45.0}, limit)
+    assert hopeless(up, {0: 0.0, 100: 45.0, 200: 30.0}, limit)
+    down = Objective(direction="minimize")
+    assert hopeless(down, {100: 30.0}, {100: 20.0})
+    assert not hopeless(down, {100: 10.0}, {100: 20.0})

@@ -1,0 +1,178 @@
+"""A sweep gives the same whoever does it, however often it is cut off."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+
+import pytest
+from sweeping import Here, described, digests, swept
+
+from runner.again import rerecord
+from runner.config import from_mapping
+from runner.errors import RunnerError
+from runner.execution import run_job
+from runner.job import Job
+from runner.labels import read_labels
+from runner.runs import create_run, find_run, list_runs
+from runner.sweep import state
+from runner.sweep.loading import from_values
+from runner.sweep.local import LocalWorkers
+from runner.sweep.results import ranking, results_of
+
+
+def test_each_run_is_an_ordinary_one_tagged_with_the_sweep(done):
+    folder, trials, standing = done
+    assert (standing.done, standing.failed, standing.stopped) == (12, 0, "")
+    for trial in trials.told:
+        for seed, result in trial.results.items():
+            run = find_run(result.run_id, folder)
+            assert (run.status, run.name, run.seed) == ("finished", "small", seed)
+            assert run.tags == ("sweep=small", f"trial={trial.number}")
+
+
+def test_a_run_is_what_it_would_be_alone_and_can_be_recorded_again(done, tmp_path):
+    folder, trials, _ = done
+    trial = trials.told[3]
+    config = from_mapping(trial.config, ["recording.steps=all"])
+    alone = run_job(Job(config, 1), create_run(tmp_path, config, 1))
+    assert alone.summary["content_digest"] == trial.results[1].digest
+    again = rerecord(find_run(trial.results[1].run_id, folder))
+    assert again.summary["content_digest"] == trial.results[1].digest
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_the_number_of_workers_changes_nothing(count, done, sweep, tmp_path):
+    with LocalWorkers(count) as workers:
+        trials, _ = swept(tmp_path, sweep, workers)
+    assert digests(trials) == digests(done[1])
+
+
+def test_a_sweep_that_was_cut_off_twice_goes_on_as_if_it_never_had_been(done, sweep, tmp_path):
+    first = Here(most=3)
+    _, standing = swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
+    assert standing.stopped == "interrupted"
+    second = Here(most=4)
+    swept(tmp_path, sweep, second, stop=lambda: second.done > 4)
+    third = Here()
+    trials, standing = swept(tmp_path, sweep, third)
+    assert digests(trials) == digests(done[1])
+    assert third.done == 12 - 3 - 4
+    assert len(list_runs(tmp_path)) == 12
+
+
+def test_a_finished_sweep_is_not_done_again(done, sweep):
+    folder, trials, _ = done
+    nobody = Here()
+    again, standing = swept(folder, sweep, nobody)
+    assert (nobody.done, standing.done) == (0, 12)
+    assert digests(again) == digests(trials)
+
+
+def test_a_worker_that_dies_is_tried_once_more(done, sweep, tmp_path):
+    trials, standing = swept(tmp_path, sweep, Here(dying={2, 5}))
+    assert standing.failed == 0
+    assert digests(trials) == digests(done[1])
+
+
+def test_a_worker_that_dies_twice_is_told_and_the_sweep_goes_on(tmp_path):
+    sweep = from_values(described(strategy="random", seeds=[0]))
+    trials, standing = swept(tmp_path, sweep, Here(dying={1, 2}))
+    assert (standing.done, standing.failed) == (5, 1)
+    assert [trial.state for trial in trials.told] == ["failed", *["finished"] * 5]
+    assert trials.told[0].errors == ["seed 0: its worker died twice"]
+
+
+def test_a_killed_process_is_replaced_and_its_run_gone_on_with(tmp_path):
+    base = described()["base"] | {"episodes": 400_000, "evaluation": {"every": 100_000, "trials": 5}}
+    sweep = from_values(described(strategy="random", trials=2, seeds=[0], base=base))
+    killed = []
+
+    def kill_one(standing):
+        workers = [p for p in multiprocessing.active_children() if p.name == "sweep-worker"]
+        if not killed and any(run.recording.exists() for run in list_runs(tmp_path)):
+            time.sleep(0.1)
+            killed.append(workers[0].pid)
+            os.kill(workers[0].pid, signal.SIGKILL)
+
+    with LocalWorkers(1) as workers:
+        trials, standing = swept(tmp_path, sweep, workers, report=kill_one)
+    assert killed
+    assert (standing.done, standing.failed) == (2, 0)
+    assert len(list_runs(tmp_path)) == 2
+    fresh, _ = swept(tmp_path / "fresh", sweep)
+    assert digests(trials) == digests(fresh)
+
+
+def test_hopeless_runs_are_given_up_and_stay_so(tmp_path):
+    objective = {"metric": "training.percent_filled", "at": "last"}
+    pruning = {"after": 20, "trials": 2, "percentile": 80}
+    parameters = {"epsilon": [0.0, 1.0], "step_size": {"low": 0.1, "high": 1.0}}
+    changes = {"trials": 12, "pruning": pruning, "objective": objective, "parameters": parameters}
+    sweep = from_values(described(strategy="random", seeds=[0], **changes))
+    trials, standing = swept(tmp_path / "a", sweep)
+    given_up = [trial for trial in trials.told if trial.state == "pruned"]
+    assert 0 < standing.pruned == len(given_up) < 12
+    run = find_run(given_up[0].results[0].run_id, tmp_path / "a")
+    assert run.status == "interrupted"
+    assert "pruned" in read_labels(run.folder).tags
+    with LocalWorkers(2) as workers:
+        others, _ = swept(tmp_path / "b", sweep, workers)
+    states = [(trial.values, trial.state, trial.value) for trial in trials.told]
+    assert states == [(trial.values, trial.state, trial.value) for trial in others.told]
+    assert {entry.state for entry in ranking(sweep, trials.told)[-len(given_up) :]} == {"pruned"}
+
+
+def test_two_trials_that_want_one_job_share_its_run(tmp_path):
+    sweep = from_values(described(strategy="random", trials=8, parameters={"discount": [0.5, 0.9]}))
+    workers = Here()
+    _, standing = swept(tmp_path, sweep, workers)
+    assert workers.done == 4
+    assert standing.done == 16
+
+
+def test_values_that_do_not_go_together_are_a_failed_trial(tmp_path):
+    base = described()["base"] | {"env": {"id": "dualtaxi:DualTaxi-v1"}, "mode": "competitive", "episodes": 2}
+    parameters = {
+        "mode": ["competitive", "cooperative"],
+        "quirks.second_table_uses_first_action": [False, True],
+    }
+    sweep = from_values(
+        described(strategy="grid", trials=None, seeds=[0], base=base, parameters=parameters, objective={})
+    )
+    trials, standing = swept(tmp_path, sweep)
+    assert [trial.state for trial in trials.told] == ["finished", "finished", "finished", "failed"]
+    assert "found tables: joint" in trials.told[3].errors[0]
+    assert standing.failed == 1
+
+
+def test_a_changed_sweep_is_refused_with_what_changed(sweep, tmp_path):
+    state.begin(sweep, tmp_path, resume=False, accept_changes=False)
+    changed = from_values(described(trials=9, limits={"runs": 3}))
+    with pytest.raises(RunnerError, match="trials: 6, now 9") as caught:
+        state.begin(changed, tmp_path, resume=True, accept_changes=False)
+    assert "limits" not in str(caught.value)
+    state.begin(changed, tmp_path, resume=True, accept_changes=True)
+    assert state.read_sweep("small", tmp_path) == changed
+
+
+def test_two_of_one_name_and_two_at_once_are_refused(sweep, tmp_path):
+    state.begin(sweep, tmp_path, resume=False, accept_changes=False)
+    with pytest.raises(RunnerError, match="--resume goes on with it"):
+        state.begin(sweep, tmp_path, resume=False, accept_changes=False)
+    one, other = state.held("small", tmp_path), state.held("small", tmp_path)
+    with one, pytest.raises(RunnerError, match="by another process"), other:
+        pass
+
+
+def test_results_rank_by_the_objective_with_intervals(tmp_path):
+    sweep = from_values(described(seeds=[0, 1, 2, 3, 4]))
+    trials, _ = swept(tmp_path, sweep)
+    results = results_of(sweep, tmp_path)
+    medians = [entry.median for entry in results.ranking]
+    assert medians == sorted(medians, reverse=True)
+    assert results.best.number == trials.best().number == results.ranking[0].number
+    top = results.ranking[0].iqm
+    assert top.low <= top.value <= top.high
