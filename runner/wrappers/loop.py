@@ -14,6 +14,7 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 import numpy as np
 from blake3 import blake3
 
+from runner import runs
 from runner.errors import ConfigError, RunnerError, StorageError
 from runner.mdp import Mdp
 from runner.provenance import provenance
@@ -182,10 +183,13 @@ class Loop(Generic[R]):
         try:
             self._file.add_metadata("run", facts)
             self._file.add_metadata("config", {"json": json.dumps(config, sort_keys=True)})
-            self._file.add_metadata("provenance", provenance())
+            made_by = provenance()
+            self._file.add_metadata("provenance", made_by)
             _write_environment(self._file, described, mdp)
         except OSError as error:
             raise storage_error(self._file, error) from error
+        told = {key: made_by[key] for key in runs.MADE_BY if key in made_by}
+        self.run = self.run.update(provenance=told)
         return facts
 
     # --- what is recorded -----------------------------------------------------------------------------
