@@ -22,6 +22,8 @@ from runner.export.rerun.scene import (
 
 TITLE_Y: Final = -0.62
 FACTS_BELOW: Final = 0.35
+LINE: Final = 0.3
+"""Between the lines below the grid."""
 
 
 class GridWriter(Sender):
@@ -79,11 +81,12 @@ class GridWriter(Sender):
         ]
 
     def _fact_points(self, n: int) -> NDArray[np.float32]:
-        """Return where `t` and the rewards are written: below the grid."""
-        count = 1 + len(self._words.rewards)
-        x = (np.arange(count) + 0.5) * self._scene.columns / count
-        points = np.stack((x, np.full(count, self._scene.rows + FACTS_BELOW)), axis=1).astype(np.float32)
-        return np.broadcast_to(points, (n, count, 2))
+        """Return where `t` and the rewards are written: below the grid, the rewards one below the other."""
+        rewards = len(self._words.rewards)
+        x = np.array([0.25] + [0.65] * rewards) * self._scene.columns
+        y = self._scene.rows + FACTS_BELOW + LINE * np.array([0, *range(rewards)])
+        points = np.stack((x, y), axis=1).astype(np.float32)
+        return np.broadcast_to(points, (n, 1 + rewards, 2))
 
     def _classes(self, records: NDArray[np.void], state: NDArray[np.int64]) -> NDArray[np.uint16]:
         """Return the label of each point of each step, by number."""

@@ -10,6 +10,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from runner.errors import RunnerError
+from runner.export.rerun import live as live_view
 from runner.export.rerun import viewer
 from runner.export.rerun.cache import exported
 from runner.export.rerun.live import LiveView
@@ -98,7 +99,8 @@ def test_a_live_view_takes_one_episode_in_so_many(pictured, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the viewer is ended, and writes none
-def test_a_viewer_gets_what_a_live_view_is_shown(pictured, tmp_path):
+def test_a_viewer_gets_what_a_live_view_is_shown(pictured, tmp_path, monkeypatch):
+    monkeypatch.setattr(live_view, "END_SECONDS", 120.0)  # a busy machine
     run = pictured("rivals")
     with open_recording(run.recording) as recording:
         (steps, *_), mdp = recording.blocks(schema.TRAIN_STEP), recording.mdp
