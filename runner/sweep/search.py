@@ -175,7 +175,7 @@ def _sampler(file: SweepFile) -> Any:
     seed = file.search_seed % 2**32
     match file.strategy:
         case "tpe":
-            return samplers.TPESampler(seed=seed)
+            return samplers.TPESampler(seed=seed, n_startup_trials=2 * file.batch)
         case "genetic":
             return samplers.NSGAIISampler(population_size=max(2, file.batch), seed=seed)
         case _:

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from runner.config.document import read_yaml, write_yaml
 from runner.config.loading import read_text
+from runner.documents import read_object, write_whole
 from runner.errors import ConfigError, RunnerError, StorageError, nearest
 from runner.job import identity_of
 from runner.runs import Run, list_runs
@@ -23,6 +24,8 @@ from runner.sweep.task import is_over
 
 FOLDER: Final = ".sweeps"
 FILE: Final = "sweep.yaml"
+FAILED: Final = "failed.json"
+MAX_FAILED_BYTES: Final = 8 << 20
 LOCK: Final = "owner.lock"
 FREE: Final = ("limits",)
 """What may change when a sweep is gone on with: what is done follows from the rest."""
@@ -136,6 +139,33 @@ def runs_of(name: str, recordings: Path) -> dict[str, Run]:
             if identity not in found or (is_over(run) and not is_over(found[identity])):
                 found[identity] = run
     return found
+
+
+def failures_of(name: str, recordings: Path) -> dict[str, str]:
+    """Return why jobs of a sweep failed, by identity; what cannot be understood counts as not failed."""
+    try:
+        found = read_object(folder_of(name, recordings) / FAILED, MAX_FAILED_BYTES)
+    except (OSError, ValueError):
+        return {}
+    return {identity: error for identity, error in found.items() if isinstance(error, str)}
+
+
+def note_failures(name: str, recordings: Path, failures: dict[str, str]) -> None:
+    """Write down why jobs of a sweep failed.
+
+    Raises:
+        StorageError: the folder cannot be written.
+    """
+    path = folder_of(name, recordings) / FAILED
+    try:
+        write_whole(path, failures)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror}).") from error
+
+
+def forget_failures(name: str, recordings: Path) -> None:
+    """Have the jobs of a sweep that failed tried again."""
+    (folder_of(name, recordings) / FAILED).unlink(missing_ok=True)
 
 
 def _write(folder: Path, text: str) -> None:

@@ -165,10 +165,13 @@ def recorded(trials: Trials, recordings: Path) -> Iterator[Trial]:
     Raises:
         RunnerError: a run cannot be read.
     """
-    sweep, known = trials.sweep, state.runs_of(trials.sweep.name, recordings)
+    record = _Record(trials.sweep, recordings)
     while batch := trials.ask():
         for trial in batch:
-            _take_recorded(trial, known, sweep)
+            for seed, identity in trial.identities.items():
+                result = record.result_of(identity)
+                if result is not None:
+                    trial.take(seed, result, trials.sweep)
             yield trial
         if any(trial.state == "unfinished" for trial in batch):
             return
@@ -202,10 +205,9 @@ def run_sweep(
     trials = Trials(sweep)
     standing = Standing(trials.search.trials * len(sweep.seeds), trials.search.trials)
     watch = Watch(stop, report, room)
-    known = state.runs_of(sweep.name, recordings)
-    seen: dict[str, Result] = {}
+    record = _Record(sweep, recordings)
     while batch := trials.ask():
-        work = _Batch(sweep, batch, recordings, standing, known, seen)
+        work = _Batch(sweep, batch, recordings, standing, record)
         work.prepare(trials.bounds(), accept_changes)
         work.run(workers, watch)
         if standing.stopped:
@@ -234,11 +236,10 @@ class _Batch:
         batch: list[Trial],
         recordings: Path,
         standing: Standing,
-        known: Mapping[str, Run],
-        seen: dict[str, Result],
+        record: _Record,
     ) -> None:
         self._sweep, self._batch, self._recordings = sweep, batch, recordings
-        self._standing, self._known, self._seen = standing, known, seen
+        self._standing, self._record = standing, record
         self._retried: set[str] = set()
         self._waiting: deque[Task] = deque()
 
@@ -248,7 +249,7 @@ class _Batch:
         for trial in self._batch:
             self._standing.failed += len(self._sweep.seeds) if trial.error else 0
             for seed, identity in trial.identities.items():
-                result = self._result_of(identity)
+                result = self._record.result_of(identity)
                 if result is None:
                     task = self._task(trial, seed, bounds)
                     tasks.setdefault(identity, replace(task, accept_changes=accept_changes))
@@ -286,14 +287,13 @@ class _Batch:
         """Take in what came of a task; that of a worker that died is tried once more."""
         if result is None and task.identity not in self._retried:
             self._retried.add(task.identity)
-            there = state.runs_of(self._sweep.name, self._recordings).get(task.identity)
-            self._waiting.appendleft(replace(task, run_id=there.run_id if there is not None else ""))
+            there = state.runs_of(self._sweep.name, self._recordings)
+            self._waiting.appendleft(replace(task, run_id=_id_in(there, task.identity)))
             return
         result = result or Result("failed", task.run_id, error="its worker died twice")
-        if result.status == "interrupted" and not self._standing.stopped:
-            result = replace(result, status="failed", error="it was interrupted from elsewhere")
-        if result.status in ("finished", "pruned"):
-            self._seen[task.identity] = result
+        if result.status == "interrupted":
+            self._standing.stopped = self._standing.stopped or INTERRUPTED
+        self._record.note(task.identity, result)
         for trial in self._batch:
             for seed, identity in trial.identities.items():
                 if identity == task.identity:
@@ -307,13 +307,6 @@ class _Batch:
         standing.pruned += result.status == "pruned"
         standing.failed += result.status == "failed"
 
-    def _result_of(self, identity: str) -> Result | None:
-        """Return what came of a job, if its run is over."""
-        run = self._known.get(identity)
-        if identity not in self._seen and run is not None and is_over(run):
-            self._seen[identity] = result_of(run, self._sweep.objective)
-        return self._seen.get(identity)
-
     def _task(self, trial: Trial, seed: int, bounds: Curve) -> Task:
         identity = trial.identities[seed]
         return Task(
@@ -325,13 +318,41 @@ class _Batch:
             recordings=str(self._recordings),
             objective=self._sweep.objective,
             bounds=bounds,
-            run_id=self._known[identity].run_id if identity in self._known else "",
+            run_id=_id_in(self._record.runs, identity),
         )
 
 
-def _take_recorded(trial: Trial, known: Mapping[str, Run], sweep: Sweep) -> None:
-    """Take in the runs of a trial that are over."""
-    for seed, identity in trial.identities.items():
-        run = known.get(identity)
-        if run is not None and is_over(run):
-            trial.take(seed, result_of(run, sweep.objective), sweep)
+class _Record:
+    """What is recorded of a sweep, and what came since.
+
+    A job that failed stays so: what was tried next follows from it. `state.forget_failures` lets it be tried
+    again.
+    """
+
+    def __init__(self, sweep: Sweep, recordings: Path) -> None:
+        self._sweep, self._recordings = sweep, recordings
+        self.runs = state.runs_of(sweep.name, recordings)
+        self._failures = state.failures_of(sweep.name, recordings)
+        self._results = {
+            identity: Result("failed", _id_in(self.runs, identity), error=error)
+            for identity, error in self._failures.items()
+        }
+
+    def result_of(self, identity: str) -> Result | None:
+        """Return what came of a job; None if its run is not over."""
+        run = self.runs.get(identity)
+        if identity not in self._results and run is not None and is_over(run):
+            self._results[identity] = result_of(run, self._sweep.objective)
+        return self._results.get(identity)
+
+    def note(self, identity: str, result: Result) -> None:
+        """Keep what came of a job."""
+        if result.status != "interrupted":
+            self._results[identity] = result
+        if result.status == "failed":
+            self._failures[identity] = result.error
+            state.note_failures(self._sweep.name, self._recordings, self._failures)
+
+
+def _id_in(runs: Mapping[str, Run], identity: str) -> str:
+    return runs[identity].run_id if identity in runs else ""

@@ -66,6 +66,7 @@ def command() -> None:
     help="Have the runs done by Ray: a cluster's, or without ADDRESS one of this machine.",
 )
 @click.option("--resume", "resuming", is_flag=True, help="Go on with a sweep that was begun.")
+@click.option("--retry-failed", is_flag=True, help="With --resume: try again what failed.")
 @click.option("--accept-changes", is_flag=True, help="Go on although the file, or the code, has changed.")
 @click.option("--dry-run", is_flag=True, help="Say what would run, and how much disk it takes.")
 @click.option("--name", help="What the sweep is called.  [default: as the file says, or is called]")
@@ -78,6 +79,7 @@ def start(
     workers: int | None,
     ray: str | None,
     resuming: bool,
+    retry_failed: bool,
     accept_changes: bool,
     dry_run: bool,
     name: str | None,
@@ -116,6 +118,8 @@ def start(
         return
     with state.held(sweep.name, folder):
         state.begin(sweep, folder, resuming, accept_changes)
+        if retry_failed:
+            state.forget_failures(sweep.name, folder)
         before = len(state.runs_of(sweep.name, folder))
         require_disk(plan, before, folder)
         say(f"{sweep.name}: {plan.runs:,} runs, about {size(plan.bytes)}; {before:,} are begun already.")

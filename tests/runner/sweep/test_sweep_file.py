@@ -82,7 +82,7 @@ def test_a_shipped_sweep_can_be_run(path):
 
 
 def test_what_is_shipped_is_found():
-    assert {"hyperparameters", "modes", "rewards"} <= {path.stem for path in SHIPPED}
+    assert {"algorithms", "hyperparameters", "modes", "rewards"} <= {path.stem for path in SHIPPED}
 
 
 def test_an_objective_that_is_never_recorded_is_refused_with_what_there_is():

@@ -83,6 +83,12 @@ def test_a_worker_that_dies_twice_is_told_and_the_sweep_goes_on(tmp_path):
     assert (standing.done, standing.failed) == (5, 1)
     assert [trial.state for trial in trials.told] == ["failed", *["finished"] * 5]
     assert trials.told[0].errors == ["seed 0: its worker died twice"]
+    again, standing = swept(tmp_path, sweep)
+    assert (standing.begun, digests(again)) == (0, digests(trials))
+    assert len(results_of(sweep, tmp_path).ranking) == 6
+    state.forget_failures("small", tmp_path)
+    _, standing = swept(tmp_path, sweep)
+    assert (standing.done, standing.failed, standing.begun) == (6, 0, 1)
 
 
 def test_a_killed_process_is_replaced_and_its_run_gone_on_with(tmp_path):
