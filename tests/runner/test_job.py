@@ -35,6 +35,10 @@ OTHER = {
     "snapshots": {"snapshots": {"every": 10}},
     "a quirk": {"quirks": {"bootstrap_after_termination": True}},
 }
+OF_ONE_ALGORITHM = {
+    "hysteretic": ("hysteretic_q_learning", {"decrease": 0.01}, {"decrease": 0.02}),
+    "wolf_phc": ("wolf_phc", {"win": 0.05}, {"win": 0.04}),
+}
 
 
 def job(seed: int = 3, **values) -> Job:
@@ -55,9 +59,17 @@ def test_the_seed_changes_the_identity():
     assert len({job(seed).identity for seed in (0, 1, 3, 2**64 - 1)}) == 4
 
 
-def test_every_key_of_a_configuration_is_in_one_of_the_two_lists():
+@pytest.mark.parametrize("key", OF_ONE_ALGORITHM)
+def test_a_section_of_one_algorithm_counts_by_its_values(key):
+    algorithm, default, other = OF_ONE_ALGORITHM[key]
+    bare = {"mode": "competitive", "algorithm": algorithm}
+    assert job(**bare, **{key: default}).identity == job(**bare).identity
+    assert job(**bare, **{key: other}).identity != job(**bare).identity
+
+
+def test_every_key_of_a_configuration_is_in_one_of_the_lists():
     tried = {key for values in (*SAME.values(), *OTHER.values()) for key in values} - {"mode"}
-    assert tried == set(ExperimentConfig.model_fields)
+    assert tried | set(OF_ONE_ALGORITHM) == set(ExperimentConfig.model_fields)
 
 
 def test_content_is_json_and_survives_a_file():

@@ -52,7 +52,7 @@ def test_the_experiments_that_are_promised_are_there():
         ),
         *("cooperative", "competitive", "random", "quick"),
         *("taxi", "frozen_lake", "frozen_lake_slippery", "cliff_walking"),
-        *("sarsa", "hysteretic"),
+        *("sarsa", "hysteretic", "optimal"),
     }
 
 
