@@ -6,6 +6,7 @@ import contextlib
 import io
 import re
 import shlex
+import shutil
 import sys
 from pathlib import Path
 
@@ -38,12 +39,19 @@ WITH_EXAMPLES = [page for page in PAGES if examples(page)]
 
 
 @pytest.fixture(scope="session")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as the pages take it to be: with the shipped configurations and a run of one of them."""
-    made = tmp_path_factory.mktemp("documented")
-    (made / "configs").symlink_to(ROOT / "configs", target_is_directory=True)
-    runner.run(ROOT / "configs" / "quick.yaml", recordings=made / "recordings")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recordings folder with a run of a shipped configuration, not to be changed."""
+    made = tmp_path_factory.mktemp("documented") / "recordings"
+    runner.run(ROOT / "configs" / "quick.yaml", recordings=made)
     return made
+
+
+@pytest.fixture
+def folder(tmp_path: Path, recordings: Path) -> Path:
+    """A folder as a page takes it to be: with the shipped configurations and a run of one of them."""
+    (tmp_path / "configs").symlink_to(ROOT / "configs", target_is_directory=True)
+    shutil.copytree(recordings, tmp_path / "recordings")
+    return tmp_path
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ from runner.recording import schema
 from runner.recording.schema import Topic
 
 FORMAT: Final = "dualtaxi archive"
-VERSION: Final = 0
+VERSION: Final = 1
 
 STEPS: Final = "steps.parquet"
 EPISODES: Final = "episodes.parquet"

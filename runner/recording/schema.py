@@ -18,7 +18,7 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, ti
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 from numpy.typing import NDArray
 
-FORMAT_VERSION: Final = 0
+FORMAT_VERSION: Final = 1
 PROFILE: Final = "dualtaxi"
 STEP_NANOSECONDS: Final = 100_000_000
 """Logical time of one environment step: 0.1 s, so that playback at 1x shows ten steps a second."""

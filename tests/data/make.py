@@ -12,6 +12,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from blake3 import blake3
 
 import runner
@@ -21,9 +22,14 @@ from runner.config import load
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.runs import Run
+from runner.wrappers import loop
+from tests.runner.wrappers.loops import make as make_env
+from tests.runner.wrappers.loops import play
 
 HERE = Path(__file__).parent
 NAMES = ("cooperative", "competitive")
+LOOPS = {"taxi": "Taxi-v4", "pole": "CartPole-v1", "rooms": "RoomsText"}
+"""A loop of each kind: steps, transitions of fixed width, and of variable width."""
 
 
 def expectations(path: Path) -> dict[str, Any]:
@@ -46,11 +52,23 @@ def expectations(path: Path) -> dict[str, Any]:
         }
 
 
+def loop_expectations(path: Path) -> dict[str, Any]:
+    """Return what a recording of a loop holds, in few words: every step of it among them, as a hash."""
+    with open_recording(path) as recording:
+        hashes = {phase: blake3() for phase in ("train", "eval")}
+        for phase, whole in hashes.items():
+            for step in recording.transitions(phase):
+                whole.update(repr(step).encode())
+        return {
+            "content_digest": recording.result["content_digest"],
+            "messages": recording.result["messages"],
+            "steps": {phase: whole.hexdigest() for phase, whole in hashes.items()},
+        }
+
+
 def make(name: str) -> None:
     """Make one of them, with nothing in it that tells of the machine but its kind."""
-    packages = {f"package.{package}": version(package) for package in ("numpy", "numba", "llvmlite")}
-    made_by = {"dualtaxi": runner.__version__, "python": platform.python_version(), **packages}
-    execution.provenance = lambda: made_by | {"machine": platform.machine()}
+    execution.provenance = made_by
     config = load(HERE / f"{name}.yaml")
     facts = {
         "run_id": name,
@@ -64,8 +82,35 @@ def make(name: str) -> None:
         done.recording.replace(HERE / f"{name}.mcap")
 
 
+def make_loop(name: str) -> None:
+    """Make the recording of a loop that acts at random, with all that a loop can record but frames."""
+    loop.provenance = made_by
+    with tempfile.TemporaryDirectory() as folder:
+        env = make_env(LOOPS[name])
+        with runner.record(env, folder, name=name, seed=5, info=["luck"], config={"kept": True}) as rec:
+            for _ in play(rec, 150):
+                pass
+            rec.log("loss", 0.25)
+            rec.log("note", "half way")
+            rec.snapshot("weights", np.arange(6.0).reshape(2, 3))
+            with rec.phase("eval"):
+                for _ in play(rec, 30, seed=6):
+                    pass
+        rec.run.recording.replace(HERE / f"{name}.mcap")
+
+
+def made_by() -> dict[str, str]:
+    """Return a provenance that tells nothing of the machine but its kind."""
+    packages = {f"package.{package}": version(package) for package in ("numpy", "numba", "llvmlite")}
+    own = {"dualtaxi": runner.__version__, "python": platform.python_version()}
+    return own | packages | {"machine": platform.machine()}
+
+
 if __name__ == "__main__":
     for name in NAMES:
         make(name)
+    for name in LOOPS:
+        make_loop(name)
     found = {name: expectations(HERE / f"{name}.mcap") for name in NAMES}
+    found |= {name: loop_expectations(HERE / f"{name}.mcap") for name in LOOPS}
     (HERE / "digests.json").write_text(json.dumps(found, indent=1) + "\n")

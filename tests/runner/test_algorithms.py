@@ -16,7 +16,7 @@ from runner.recording import schema
 from runner.resume import resume
 from runner.runs import list_runs
 from runner.verify import verify
-from tests.runner.recording.making import TAXIS, experiment, make_run
+from tests.runner.recording.making import SAMPLED, TAXIS, experiment, make_run
 from tests.runner.test_resume import LONG, kill_when, posix, start
 
 TEAM = {"mode": "cooperative"}
@@ -26,7 +26,7 @@ ALGORITHMS = {
     "expected_sarsa": TWO,
     "double_q_learning": TWO | {"initial_q": "random"},
     "hysteretic_q_learning": TWO,
-    "wolf_phc": TWO,
+    "wolf_phc": TWO | SAMPLED,
 }
 KINDS = {
     "double_q_learning": ["q", "q_1", "q_2"],

@@ -12,7 +12,7 @@ from runner.analysis.tables import history_of
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.verify import verify
-from tests.data.make import NAMES, expectations
+from tests.data.make import LOOPS, NAMES, expectations, loop_expectations
 
 DATA = Path(__file__).parents[1] / "data"
 EXPECTED = json.loads((DATA / "digests.json").read_text())
@@ -37,7 +37,7 @@ def test_they_are_what_their_jobs_give(name, rerun):
 
 
 def test_they_have_every_kind_of_message(name):
-    assert set(EXPECTED[name]["messages"]) == {topic.name for topic in schema.TOPICS} - {"/eval/optimality"}
+    assert set(EXPECTED[name]["messages"]) == {topic.name for topic in schema.TOPICS}
 
 
 def test_each_state_has_its_history(name):
@@ -47,3 +47,19 @@ def test_each_state_has_its_history(name):
         history = history_of(recording, state, len(steps))
         assert history.visits[0].sum() == (steps["state"] == state).sum()
         assert history.changed_step.max() < len(steps)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_what_kept_loops_hold(name):
+    path = DATA / f"{name}.mcap"
+    assert loop_expectations(path) == EXPECTED[name]
+    found = verify(path)
+    assert found.finding == ""
+    assert found.content_digest == EXPECTED[name]["content_digest"]
+    assert path.stat().st_size < 50_000
+
+
+def test_kept_loops_have_every_kind_of_message_but_frames():
+    kept = {topic for name in LOOPS for topic in EXPECTED[name]["messages"]}
+    every = {topic.name for name in schema.LOOP_TOPICS for topic in schema.KINDS[name]}
+    assert kept == every - {"/train/frame", "/eval/frame"}

@@ -269,6 +269,6 @@ def test_no_file_of_an_archive_is_outside_of_it(archive, tmp_path, name):
 def test_an_archive_of_a_later_version_is_refused_by_its_version(archive, tmp_path):
     folder = shutil.copytree(archive, tmp_path / "later")
     path = folder / layout.MANIFEST
-    path.write_text(path.read_text().replace('"version": 0', '"version": 7'))
-    with pytest.raises(RecordingError, match="version 7, expected 0"):
+    path.write_text(path.read_text().replace('"version": 1', '"version": 7'))
+    with pytest.raises(RecordingError, match="version 7, expected 1"):
         check(folder)

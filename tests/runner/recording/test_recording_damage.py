@@ -20,6 +20,7 @@ from runner.recording.integrity import check_integrity
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
 CHUNK, MESSAGE_INDEX, DATA_END = 6, 7, 15
+VERSION = str(schema.FORMAT_VERSION)
 
 
 def records_of(data: bytes) -> Iterator[tuple[int, int, int]]:
@@ -290,11 +291,18 @@ def test_a_hostile_chunk_is_refused(kind, lake, tmp_path):
     "entries",
     [
         {},
-        {"format_version": "0"},
-        {"format_version": "0", "learners": "many", "events": "0"},
-        {"format_version": "0", "learners": "-1", "events": "0"},
-        {"format_version": "0", "learners": "1000000000000", "events": "0"},
-        {"format_version": "0", "learners": "1", "events": "0", "run_id": "x", "name": "x", "seed": "one"},
+        {"format_version": VERSION},
+        {"format_version": VERSION, "learners": "many", "events": "0"},
+        {"format_version": VERSION, "learners": "-1", "events": "0"},
+        {"format_version": VERSION, "learners": "1000000000000", "events": "0"},
+        {
+            "format_version": VERSION,
+            "learners": "1",
+            "events": "0",
+            "run_id": "x",
+            "name": "x",
+            "seed": "one",
+        },
     ],
     ids=str,
 )
