@@ -128,7 +128,7 @@ def _stub(place: str, manifest: Manifest, recording_bytes: int) -> dict[str, Any
 @contextlib.contextmanager
 def _sound(run: Run) -> Iterator[Recording]:
     """Give the recording of a run; damage found in it is told with what mends it."""
-    mend = f"`dualtaxi repair {run.run_id}` makes the recording whole."
+    mend = f"`dualtaxi repair {run.run_id}` mends it."
     try:
         with open_recording(run.recording) as recording:
             if not recording.finished:
@@ -137,7 +137,7 @@ def _sound(run: Run) -> Iterator[Recording]:
                     raise RecordingError(f"{run.recording}: {contents.reason}: it is damaged.")
             yield recording
     except RecordingError as error:
-        if not run.recording.exists():
+        if not run.recording.exists() or "`dualtaxi repair" in str(error):
             raise
         raise RecordingError(f"{error} {mend}") from error
 

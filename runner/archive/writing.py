@@ -77,14 +77,16 @@ def write_archive(
         RecordingError: the recording is damaged, or holds what no recorder writes.
         OSError: the folder cannot be written.
     """
-    recording.require_job("an archive of tables")
+    recording.require_job("an archive of tables", "`dualtaxi pack` puts it into one file.")
     manifest = _Writing(recording, folder, report).write()
     (folder / layout.MANIFEST).write_bytes(manifest.to_json())
     return manifest
 
 
 def _shape(recording: Recording) -> Shape:
-    recording.require_job("a table of its steps")
+    recording.require_job(
+        "a table of its steps", "`runner.open_recording` reads its steps, docs/record-your-own.md says how."
+    )
     return shape_of(recording.run, recording.mdp, str(recording.path))
 
 

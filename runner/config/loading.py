@@ -68,7 +68,8 @@ def from_mapping(
     if "made_by" in values:
         raise ConfigError(
             f"found a run made by {values['made_by']}: it was recorded from somebody's own training loop, "
-            "which alone can do it again. It can be looked at, compared and checked, not redone."
+            "which alone can do it again. It can be looked at, compared, checked and exported, not redone, "
+            "and no table is known of it."
         )
     return experiment_in(Document(values), overrides, name, named_by=repr(name))
 

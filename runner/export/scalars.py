@@ -2,6 +2,8 @@
 
     train/mean_length, train/percent_filled/taxi_1, train/reward_counts/-1, train/epsilon, ...
     eval/finish_percent, eval/mean_return/taxi_1, eval/events/taxi_1.drop_off, eval/training/epsilon, ...
+    eval/exact/value/taxi_1, eval/exact/optimal_value, ... with `evaluation: {exact: true}`
+    train/logged/loss, ... what somebody's own loop logged
 
 What is unknown (a mean over no episode, success where the environment does not say what it is) is left
 out, so every number is one that was recorded, unchanged.
@@ -18,9 +20,14 @@ from typing import Any
 from runner.errors import RecordingError
 from runner.frames import agents_of, event_names_of
 from runner.recording.reader import Recording
-from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.schema import SCALAR_TOPIC, STEP_NANOSECONDS
 
 _OF_TRAINING = ("mean_length", "zero_cells", "percent_filled", "epsilon", "step_size", "discount")
+_EXACT = {
+    **{name: name for name in ("finish_percent", "timeout_percent", "mean_length", "mean_penalties")},
+    **{"mean_returns": "mean_return", "values": "value", "best_responses": "best_response"},
+    **{f"optimal_{name}": f"optimal_{name}" for name in ("value", "finish_percent", "mean_length")},
+}
 _OF_EVALUATION = ("trials", "successes", "finish_percent", "mean_penalties", "terminations")
 
 
@@ -35,13 +42,13 @@ class Measures:
     step: int
     """Training steps taken."""
     episode: int
-    """Training episodes done."""
+    """Training episodes done; with what a loop logged in evaluation, episodes of evaluation."""
     values: Mapping[str, float]
     """By name, without the phase."""
 
 
 def measures(recording: Recording) -> Iterator[Measures]:
-    """Yield the reports of training, then the evaluations, one by one, in order.
+    """Yield the reports of training, the evaluations, their exact measures, and what a loop logged, in order.
 
     Raises:
         RecordingError: the recording is damaged.
@@ -56,6 +63,21 @@ def measures(recording: Recording) -> Iterator[Measures]:
                 }
             position = metrics["log_time"] // STEP_NANOSECONDS
             yield Measures(phase, position, metrics["step"], metrics["episode"], values)
+    for exact in recording.optimality():
+        position = exact["log_time"] // STEP_NANOSECONDS
+        yield Measures("eval", position, exact["step"], exact["episode"], exact_values(exact, agents))
+    if recording.kind != "job":
+        yield from _logged(recording)
+
+
+def _logged(recording: Recording) -> Iterator[Measures]:
+    """Yield the finite numbers that a loop logged."""
+    for scalar in recording.decoded(SCALAR_TOPIC):
+        if math.isfinite(scalar["value"]):
+            position = scalar["log_time"] // STEP_NANOSECONDS
+            step = scalar["step"] if scalar["phase"] == "train" else position - scalar["step"]
+            values = {f"logged/{scalar['name']}": scalar["value"]}
+            yield Measures(scalar["phase"], position, step, scalar["episode"], values)
 
 
 def training_values(metrics: Mapping[str, Any], agents: Sequence[str]) -> dict[str, float]:
@@ -78,6 +100,14 @@ def evaluation_values(
     values |= _named("mean_length", metrics["eval_mean_length"], agents)
     values |= _named("mean_return", metrics["mean_returns"], agents)
     return values | _named("events", metrics["events"], events)
+
+
+def exact_values(exact: Mapping[str, Any], agents: Sequence[str]) -> dict[str, float]:
+    """Return the exact measures of a greedy policy, by name."""
+    values: dict[str, float] = {}
+    for field, name in _EXACT.items():
+        values |= _named(f"exact/{name}", exact[field], agents)
+    return values
 
 
 def created(recording: Recording) -> float:

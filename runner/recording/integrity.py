@@ -45,7 +45,9 @@ def check_integrity(path: Path) -> None:
             _check_beginning(stream, path)
         contents = survey(path, keep_result=True, check=_IndexCheck(path).take)
         if contents.reason:
-            raise RecordingError(f"{path}: {contents.reason.removeprefix(f'{path}: ')}; `repair` mends it.")
+            raise RecordingError(
+                f"{path}: {contents.reason.removeprefix(f'{path}: ')}; `dualtaxi repair` mends it."
+            )
         with RecordingFile.inspect(path, contents) as file:
             expected = file.tail()
         with path.open("rb") as stream:

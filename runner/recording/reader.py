@@ -232,16 +232,16 @@ class Recording:
         """The topics that a recording of its kind has."""
         return schema.KINDS[self.kind]
 
-    def require_job(self, purpose: str) -> None:
+    def require_job(self, purpose: str, instead: str) -> None:
         """Refuse a recording of somebody's own loop.
 
         Raises:
-            RunnerError: it is one; `purpose` says what it cannot be used for.
+            RunnerError: it is one; `purpose` says what it cannot be used for, `instead` what can be done.
         """
         if self.kind != "job":
             raise RunnerError(
                 f"{self.path}: was recorded from somebody's own loop, by {self.config.get('made_by')}; "
-                f"{purpose} is for runs that were trained here."
+                f"{purpose} is for runs that were trained here. {instead}"
             )
 
     @cached_property

@@ -117,7 +117,10 @@ class RecordStore:
 
     def _unpacked(self, entry: ChunkEntry) -> bytes:
         where = self._where(entry)
-        head, records = unpack_chunk(self._body(entry), where)
+        try:
+            head, records = unpack_chunk(self._body(entry), where)
+        except RecordingError as error:
+            raise RecordingError(f"{error}; `dualtaxi repair` mends it.") from error
         if head.uncompressed_size != entry.uncompressed_size:
             raise RecordingError(
                 f"{where}: declares {head.uncompressed_size} bytes, expected {entry.uncompressed_size}."
@@ -127,7 +130,7 @@ class RecordStore:
     def _body(self, entry: ChunkEntry) -> memoryview:
         record = self.record(entry.offset, entry.length)
         if record[0] != _OPCODE or int.from_bytes(record[1:9], "little") != entry.length - 9:
-            raise RecordingError(f"{self._where(entry)}: found no chunk of {entry.length} bytes there.")
+            raise RecordingError(f"{self._where(entry)}: found no chunk of {entry.length} bytes there")
         return memoryview(record)[9:]
 
     def _where(self, entry: ChunkEntry) -> str:

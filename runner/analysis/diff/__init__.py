@@ -104,6 +104,8 @@ def diff(
         "costs": changes_in(_costs(a), _costs(b)),
         "notes": notes,
     }
+    if first:
+        facts |= {"provenance": [], "costs": []}
     if same:
         return RunDiff(**facts)
     seen = None
@@ -166,9 +168,11 @@ def _settings(recording: Recording) -> dict[str, Any]:
 
 
 def _costs(recording: Recording) -> dict[str, Any]:
+    """Return steps taken, whether recorded or not, episodes, and the size of the file."""
+    done = recording.result
     return {
-        "train_steps": recording.count(schema.TRAIN_STEP),
-        "eval_steps": recording.count(schema.EVAL_STEP),
+        "train_steps": done.get("train_steps", recording.count(schema.TRAIN_STEP)),
+        "eval_steps": done.get("eval_steps", recording.count(schema.EVAL_STEP)),
         "episodes": recording.count(schema.TRAIN_EPISODE),
         "bytes": recording.size,
     }

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli.commands.export_rerun import EpisodeRanges
-from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.options import find_recorded, recordings_option, run_argument
 from runner.cli.output import say
 from runner.cli.progress import counting
 
@@ -59,7 +59,7 @@ def command(
     from runner.recording.reader import open_recording
 
     require_packages()
-    with open_recording(find(run_name, recordings).recording) as recording:
+    with open_recording(find_recorded(run_name, recordings).recording) as recording:
         require_steps(recording)
         path = output / dataset_id(recording)
         total = recording.count(schema.PHASES[phase][1])

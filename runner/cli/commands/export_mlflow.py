@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.options import find_recorded, recordings_option, run_argument
 from runner.cli.output import say
 
 
@@ -42,7 +42,7 @@ def command(
     from runner.recording.reader import open_recording
 
     require_packages()
-    with open_recording(find(run_name, recordings).recording) as recording:
+    with open_recording(find_recorded(run_name, recordings).recording) as recording:
         done = export(recording, tracking, experiment, with_recording, force)
         for note in (*shortcomings(recording), *done.notes):
             say(note)

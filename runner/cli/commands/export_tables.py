@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli.commands.export_rerun import EpisodeRanges
-from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.options import find_recorded, recordings_option, run_argument
 from runner.cli.output import say, size
 from runner.cli.progress import counting
 
@@ -73,7 +73,7 @@ def _export(
     from runner.export.tables import OURS, Choice, write_tables
     from runner.recording.reader import open_recording
 
-    run = find(run_name, recordings)
+    run = find_recorded(run_name, recordings)
     path = output or Path(f"{run.facts['name']}-{run.run_id}-{form}")
     choice = Choice(phase or ("train" if episodes else ""), episodes or ())
     with open_recording(run.recording) as recording:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find, recordings_option, run_argument
+from runner.cli.options import find_recorded, recordings_option, run_argument
 from runner.cli.output import say
 
 
@@ -37,7 +37,7 @@ def command(run_name: str, output: Path | None, force: bool, recordings: Path | 
     from runner.recording.reader import open_recording
 
     require_packages()
-    run = find(run_name, recordings)
+    run = find_recorded(run_name, recordings)
     path = output or Path("tensorboard", f"{run.facts['name']}-{run.run_id}")
     with open_recording(run.recording) as recording:
         with new_folder(path, force, OURS) as folder:

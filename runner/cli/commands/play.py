@@ -134,8 +134,12 @@ def _chosen(recording: Recording, episode: int | None, trial: tuple[int, int] | 
             )
     known = [metrics["episode"] for metrics in evaluations]
     nearest = min(known, key=lambda one: abs(one - after), default=None)
-    hint = "there are no evaluations" if nearest is None else f"the nearest is after {nearest}"
-    raise RecordingError(f"--eval: no evaluation after {after} training episodes; {hint} (of {len(known)}).")
+    if nearest is None:
+        raise RecordingError("--eval: the run has no evaluations; --episode plays a training episode.")
+    raise RecordingError(
+        f"--eval: no evaluation after {after:,} training episodes; the nearest of {len(known)} is after "
+        f"{nearest:,}."
+    )
 
 
 def _show(played: Episode, speed: float) -> None:

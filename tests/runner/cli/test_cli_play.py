@@ -66,7 +66,7 @@ def test_a_trial_of_an_evaluation(recorded, recorded_run, trial, number):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--eval", "21:0"], "the nearest is after 20"),
+        (["--eval", "21:0"], "the nearest of 4 is after 20"),
         (["--eval", "20:5"], "expected one from 0 to 4"),
         (["--eval", "x"], "expected N:TRIAL"),
         (["--eval", "3:x"], "expected N:TRIAL"),
@@ -86,7 +86,7 @@ def test_without_evaluations_the_last_episode_is_played(command, tiny):
     command("run", tiny, "--set", "evaluation=null")
     assert "training episode 29" in command("play", "@latest").stdout
     result = command("play", "@latest", "--eval", "0:0")
-    assert "there are no evaluations" in result.stderr
+    assert "the run has no evaluations; --episode plays" in result.stderr
 
 
 def test_without_a_scene_states_are_numbers(command, tiny):

@@ -100,6 +100,7 @@ def assert_measures(run, metrics):
             for name, value in found.values.items()
         ]
         (last,) = recording.metrics("eval")[-1:]
+        (exact,) = list(recording.optimality())[-1:]
     assert (
         list(zip(*(metrics[c] for c in ("phase", "step", "episode", "metric", "value")), strict=True))
         == expected
@@ -110,6 +111,8 @@ def assert_measures(run, metrics):
     assert named["finish_percent"] == last["finish_percent"]
     assert named["mean_return/taxi_2"] == last["mean_returns"][1]
     assert named["training/percent_filled/taxi_1"] == last["percent_filled"][0]
+    assert named["exact/value/taxi_1"] == exact["values"][0]
+    assert named["exact/optimal_mean_length"] == exact["optimal_mean_length"]
     assert named["events/taxi_1.drop_off"] + named["events/taxi_2.drop_off"] == last["successes"]
 
 
