@@ -39,14 +39,20 @@ def read_object(path: str | os.PathLike[str], most: int) -> dict[str, Any]:
     return found
 
 
-def write_whole(path: Path, value: dict[str, Any]) -> None:
+def write_whole(path: Path, value: dict[str, Any], mode: int = 0o666) -> None:
     """Replace a file whole: a reader sees the old one or the new one.
+
+    Args:
+        path: the file.
+        value: what it will hold.
+        mode: who may read and write it, less what the process's mask takes away.
 
     Raises:
         OSError: it cannot be written; it is as before.
     """
     fresh = path.with_suffix(f".{secrets.token_hex(4)}.tmp")
     try:
+        fresh.touch(mode, exist_ok=False)
         fresh.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         fresh.replace(path)
     except OSError:

@@ -16,7 +16,8 @@ without a traceback and exits with `exit_code`.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 
 class RunnerError(Exception):
@@ -25,8 +26,21 @@ class RunnerError(Exception):
     exit_code = 2
 
 
+class Located(NamedTuple):
+    """What is wrong with one value of a configuration; line and column from 1, 0 if it stands in no file."""
+
+    path: str
+    line: int
+    column: int
+    message: str
+
+
 class ConfigError(RunnerError):
     """A configuration cannot be used; the message lists every problem, one a line."""
+
+    def __init__(self, message: str, problems: Sequence[Located] = ()) -> None:
+        super().__init__(message)
+        self.problems = tuple(problems)
 
 
 class EnvironmentNotUsable(RunnerError):

@@ -15,7 +15,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -23,8 +23,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 from runner.documents import read_object, write_whole
-from runner.errors import RecordingError, RunNotFound, StorageError, nearest
-from runner.labels import Labels, read_labels
+from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError, nearest
+from runner.labels import Labels, change_labels, read_labels
 from runner.owner import lives, owner
 
 if TYPE_CHECKING:  # listing runs is to be quick
@@ -364,6 +364,19 @@ def runs_in(folder: Path) -> Iterator[Run]:
     if (folder / RECORDING_FILE).is_file():
         with contextlib.suppress(RecordingError):
             yield _from_recording(folder / RECORDING_FILE)
+
+
+def relabel(run: Run, change: Callable[[Labels], Labels]) -> Labels:
+    """Change what people say of a run, beside its recording, and return it.
+
+    Raises:
+        RunnerError: its recording stands alone, or what is to be said cannot be.
+    """
+    if run.recording.name != RECORDING_FILE:
+        raise RunnerError(
+            f"{run.recording}: found a recording that stands alone, expected a run in a folder of its own."
+        )
+    return change_labels(run.folder, change)
 
 
 def _is_run(facts: dict[str, Any]) -> bool:

@@ -29,6 +29,7 @@ ORDER = """
     resume
     again notebook sweep
     api
+    service
     wrappers
     cli
 """

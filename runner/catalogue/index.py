@@ -35,6 +35,8 @@ INDEX_FILE: Final = "catalogue.sqlite"
 _APPLICATION: Final = 0x44546178  # "DTax"
 _VERSION: Final = zlib.crc32(",".join(["1", *Row._meta.sorted_field_names]).encode()) >> 1
 """Of the columns, and of what is put in them (the number before them); another one is thrown away."""
+_HEAD_BYTES: Final = 100
+"""Of an SQLite file; at 24 stands how often it was changed."""
 _BUSY_SECONDS: Final = 60
 _SETTLED_NS: Final = 2 * 10**9
 """Files that changed so recently may change again without a trace: they are read again next time."""
@@ -200,8 +202,29 @@ class Seen(NamedTuple):
     """Bytes of its recording."""
 
 
+class Version(NamedTuple):
+    """What tells one state of the index from another."""
+
+    file: int
+    changes: int
+
+
+def version() -> Version | None:
+    """Return what changes with every change of the index; None if there is none that can be read."""
+    try:
+        with index_path().open("rb", buffering=0) as stream:
+            head = stream.read(_HEAD_BYTES)
+            return Version(os.fstat(stream.fileno()).st_ino, int.from_bytes(head[24:28], "big"))
+    except OSError:
+        return None
+
+
 def look(
-    roots: Sequence[Path], work: Callable[[Index], Found], tell: Tell = lambda _: None, anew: bool = False
+    roots: Sequence[Path],
+    work: Callable[[Index], Found],
+    tell: Tell = lambda _: None,
+    anew: bool = False,
+    as_known: bool = False,
 ) -> Found:
     """Return what some work finds in the index of these folders, brought up to date before.
 
@@ -210,6 +233,7 @@ def look(
         work: done once, or once more if the index turns out to be damaged.
         tell: told what a user is to know of the index itself.
         anew: whether to forget first what is known of these folders.
+        as_known: whether to answer from what is known of them, without looking at them again.
 
     Raises:
         StorageError: a recordings folder cannot be read.
@@ -217,6 +241,9 @@ def look(
     for _ in range(2):
         try:
             with contextlib.closing(_opened(tell)) as database:
+                if as_known:
+                    with database.atomic("DEFERRED"):
+                        return work(Index(database, roots))
                 return _look(database, roots, work, anew)
         except (OperationalError, OSError) as error:
             tell(f"The index {index_path()} cannot be used ({error}); the folders are read without it.")

@@ -65,6 +65,10 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "pack": ("runner.cli.commands.pack", "Put a run into one file, to hand to a colleague."),
         "unpack": ("runner.cli.commands.unpack", "Take a run out of the file that `pack` wrote."),
     },
+    "Serve": {
+        "serve": ("runner.cli.commands.serve", "Open the runs to browsers and programs, over HTTP."),
+        "token": ("runner.cli.commands.token", "Make, list and revoke the tokens that a service asks for."),
+    },
     "Set up": {
         "config": ("runner.cli.commands.config", "Check a configuration; print the schema of one."),
         "completion": ("runner.cli.commands.completion", "Print the completion script of a shell."),

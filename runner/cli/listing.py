@@ -1,33 +1,16 @@
-"""Rows of the catalogue, shown: as a table, as JSON, as CSV."""
+"""Rows of the catalogue, shown: as a table, as CSV."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import click
 
-from runner.catalogue.fields import FIELDS, SETTING, Kind, field_of
+from runner.catalogue.columns import as_json, moment, value
+from runner.catalogue.fields import FIELDS, Kind
 from runner.cli.output import UNKNOWN, age, console, draw, duration, number, size, table
-from runner.errors import RunnerError
-from runner.runs import RECORDING_FILE
 
-if TYPE_CHECKING:
-    from runner.catalogue.index import Index
-
-MADE: Final = ("same_as", "path")
-"""Columns that are no fields: the run that recorded the same content first, and the recording's path."""
-PROGRAMS: Final = (
-    *("run_id", "name", "config", "seed", "status", "tags", "note", "created"),
-    *("episodes", "episodes_to_do", "train_steps", "eval_steps", "seconds"),
-    *("finish_percent", "mean_length", "mean_penalties", "bytes", "content_digest", "same_as"),
-    *("mode", "environment", "host", "git", "archive", "path"),
-)
-"""What programs are told of a run, unless they ask for other columns."""
-_FIELD_OF: Final = {"run_id": "id", "tags": "tag", "content_digest": "digest"}
 _HEADINGS: Final = {"finish_percent": "finished %", "bytes": "size", "tag": "tags", "same_as": "same as"}
 _NARROWEST: Final = 14
 """The width at which a shrinking column can still be read."""
@@ -35,50 +18,6 @@ _MISSED: Final = ("config", "bytes", "episodes", "seed", "folder", "age")
 _OFTEN_EMPTY: Final = ("tag", "same_as", "note", "archive")
 _LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
 _SHRINKING: Final = ("name", "config", "tags", "note", "environment", "host", "archive", "folder", "path")
-
-
-def columns_of(text: str) -> list[str]:
-    """Return the columns that a list of names, separated by commas, asks for.
-
-    Raises:
-        RunnerError: there is no such column.
-    """
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    if not names:
-        raise RunnerError("--columns: found nothing, expected names such as id,name,finish_percent.")
-    return [name if name in MADE or name.startswith(SETTING) else field_of(name).name for name in names]
-
-
-def with_originals(rows: list[dict[str, Any]], index: Index) -> list[dict[str, Any]]:
-    """Return rows with `same_as`: the id of another run that recorded the same content first, or None."""
-    originals = index.originals()
-    for row in rows:
-        first = originals.get(row["digest"])
-        elsewhere = first is not None and first[:2] != (row["root"], row["entry"])
-        row["same_as"] = first[2] if first and elsewhere else None
-    return rows
-
-
-def value(row: dict[str, Any], column: str) -> Any:
-    """Return what programs are told of a run in a column."""
-    name = _FIELD_OF.get(column, column)
-    if name.startswith(SETTING):
-        return json.loads(row["settings"]).get(name.removeprefix(SETTING))
-    match name:
-        case "tag":
-            return row["tags"].split()
-        case "created":
-            return _moment(row).isoformat(timespec="milliseconds")
-        case "age":
-            return round((datetime.now(UTC) - _moment(row)).total_seconds())
-        case "path":
-            return str(Path(row["root"], row["entry"], RECORDING_FILE))
-    return row[FIELDS[name].column or name] if name in FIELDS else row[name]
-
-
-def as_json(row: dict[str, Any], columns: Sequence[str] = PROGRAMS) -> dict[str, Any]:
-    """Return what programs are told of a run, by column."""
-    return {column: value(row, column) for column in columns}
 
 
 def print_csv(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
@@ -158,7 +97,7 @@ def _cell(row: dict[str, Any], column: str) -> str:
     if found is None or found == []:
         return "" if column in _OFTEN_EMPTY else UNKNOWN
     if column == "created":
-        return f"{_moment(row):%Y-%m-%d %H:%M}"
+        return f"{moment(row):%Y-%m-%d %H:%M}"
     if column in _IN_WORDS:
         return _IN_WORDS[column](found)
     plain = column in FIELDS and isinstance(found, int)
@@ -178,7 +117,3 @@ _IN_WORDS: Final[dict[str, Callable[[Any], str]]] = {
 def printable(text: str) -> str:
     """Return a text on one line, without what would move a terminal's cursor or change its colours."""
     return "".join(character if character.isprintable() else " " for character in text)
-
-
-def _moment(row: dict[str, Any]) -> datetime:
-    return datetime.fromtimestamp(row["created"] / 1000, UTC)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,6 @@ from runner.runs import RECORDING_FILE, RUN_FILE, recordings_folder
 if TYPE_CHECKING:
     from runner.api import Interrupt
     from runner.execution import Report
-    from runner.labels import Labels
     from runner.runs import Run
 
 
@@ -41,21 +40,6 @@ def recording_of(name: str, recordings: Path | None) -> tuple[Path, Run | None]:
             if path.is_file():
                 return path, None
         raise
-
-
-def relabel(run: Run, change: Callable[[Labels], Labels]) -> Labels:
-    """Change what people say of a run, beside its recording, and return it.
-
-    Raises:
-        RunnerError: its recording stands alone, or what is to be said cannot be.
-    """
-    from runner.labels import change_labels
-
-    if run.recording.name != RECORDING_FILE:
-        raise RunnerError(
-            f"{run.recording}: found a recording that stands alone, expected a run in a folder of its own."
-        )
-    return change_labels(run.folder, change)
 
 
 def refuse_running(run: Run | None) -> None:

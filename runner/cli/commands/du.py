@@ -40,10 +40,10 @@ def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as
       dualtaxi du
       dualtaxi du status:finished age:>30d --limit 5
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.catalogue.columns import with_originals
     from runner.catalogue.filters import parse
     from runner.catalogue.index import look
     from runner.catalogue.usage import usages
-    from runner.cli.listing import with_originals
 
     chosen = parse(" ".join(words))
 

@@ -68,22 +68,24 @@ def command(
       dualtaxi ls 'created:[2026-01-01 TO *] (seed:<3 OR age:<12h)' --columns id,seed,config,digest
       dualtaxi ls --quiet name:quick
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.catalogue.columns import PROGRAMS, columns_of
+    from runner.catalogue.columns import as_json as told
     from runner.catalogue.filters import parse
     from runner.cli import listing
 
     if sum((quiet, as_csv, as_json)) > 1:
         raise click.UsageError("--quiet, --csv and --json are three ways to print; choose one.")
     chosen = parse(" ".join(words))
-    shown = listing.columns_of(columns) if columns else None
+    shown = columns_of(columns) if columns else None
     if limit is None and not (quiet or as_csv or as_json) and sys.stdout.isatty():
         limit = ON_A_TERMINAL
     rows, total = _found(recordings, chosen, sort, limit, offset)
     if quiet:
         click.echo("".join(f"{row['id']}\n" for row in rows), nl=False)
     elif as_json:
-        print_json([listing.as_json(row, shown or listing.PROGRAMS) for row in rows])
+        print_json([told(row, shown or PROGRAMS) for row in rows])
     elif as_csv:
-        listing.print_csv(rows, shown or listing.PROGRAMS)
+        listing.print_csv(rows, shown or PROGRAMS)
     elif rows:
         usual = listing.usual_columns(rows, len(recordings))
         listing.print_table(rows, shown or listing.fitting(rows, usual))
@@ -94,8 +96,8 @@ def _found(
     recordings: tuple[Path, ...], chosen: Filter, sort: str, limit: int | None, offset: int
 ) -> tuple[list[dict[str, Any]], int]:
     """Return the rows to show, and how many fit the filter."""
+    from runner.catalogue.columns import with_originals
     from runner.catalogue.index import look, order_of
-    from runner.cli.listing import with_originals
 
     order = order_of(sort)
 

@@ -53,8 +53,8 @@ def command(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
 
 
 def _found(index: Index) -> _Found:
+    from runner.catalogue.columns import with_originals
     from runner.catalogue.filters import Filter
-    from runner.cli.listing import with_originals
 
     rows = with_originals(index.select(Filter(None)), index)
     statuses = [row["status"] for row in rows]

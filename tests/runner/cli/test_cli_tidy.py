@@ -153,7 +153,7 @@ def test_a_name_cannot_paint_the_terminal(command, make):
     [
         (("--sort", "sede"), "Did you mean 'seed'?"),
         (("--columns", "id,bites"), "Did you mean 'bytes'?"),
-        (("--columns", ","), "--columns: found nothing"),
+        (("--columns", ","), "columns: found nothing"),
         (("sede:3",), "Did you mean 'seed'?"),
     ],
 )

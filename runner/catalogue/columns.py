@@ -1,0 +1,76 @@
+"""Rows of the index as programs are told of them: columns by name, as plain values."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from runner.catalogue.fields import FIELDS, SETTING, field_of
+from runner.errors import RunnerError
+from runner.runs import RECORDING_FILE
+
+if TYPE_CHECKING:
+    from runner.catalogue.index import Index
+
+MADE: Final = ("same_as", "path")
+"""Columns that are no fields: the run that recorded the same content first, and the recording's path."""
+PROGRAMS: Final = (
+    *("run_id", "name", "config", "seed", "status", "tags", "note", "created"),
+    *("episodes", "episodes_to_do", "train_steps", "eval_steps", "seconds"),
+    *("finish_percent", "mean_length", "mean_penalties", "bytes", "content_digest", "same_as"),
+    *("mode", "environment", "host", "git", "archive", "path"),
+)
+"""What programs are told of a run, unless they ask for other columns."""
+_FIELD_OF: Final = {"run_id": "id", "tags": "tag", "content_digest": "digest"}
+
+
+def columns_of(text: str) -> list[str]:
+    """Return the columns that a list of names, separated by commas, asks for.
+
+    Raises:
+        RunnerError: there is no such column.
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if not names:
+        raise RunnerError("columns: found nothing, expected names such as id,name,finish_percent.")
+    return [name if name in MADE or name.startswith(SETTING) else field_of(name).name for name in names]
+
+
+def with_originals(rows: list[dict[str, Any]], index: Index) -> list[dict[str, Any]]:
+    """Return rows with `same_as`: the id of another run that recorded the same content first, or None."""
+    originals = index.originals()
+    for row in rows:
+        first = originals.get(row["digest"])
+        elsewhere = first is not None and first[:2] != (row["root"], row["entry"])
+        row["same_as"] = first[2] if first and elsewhere else None
+    return rows
+
+
+def value(row: dict[str, Any], column: str) -> Any:
+    """Return what programs are told of a run in a column."""
+    name = _FIELD_OF.get(column, column)
+    if name.startswith(SETTING):
+        return json.loads(row["settings"]).get(name.removeprefix(SETTING))
+    match name:
+        case "tag":
+            return row["tags"].split()
+        case "created":
+            return moment(row).isoformat(timespec="milliseconds")
+        case "age":
+            return round((datetime.now(UTC) - moment(row)).total_seconds())
+        case "path":
+            return str(Path(row["root"], row["entry"], RECORDING_FILE))
+    return row[FIELDS[name].column or name] if name in FIELDS else row[name]
+
+
+def as_json(row: dict[str, Any], columns: Sequence[str] = PROGRAMS) -> dict[str, Any]:
+    """Return what programs are told of a run, by column."""
+    return {column: value(row, column) for column in columns}
+
+
+def moment(row: dict[str, Any]) -> datetime:
+    """Return when a run began, in UTC."""
+    return datetime.fromtimestamp(row["created"] / 1000, UTC)

@@ -1,0 +1,86 @@
+"""`dualtaxi serve`: the runs, opened to browsers and programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.options import folders_option
+from runner.cli.output import say
+
+
+@click.command("serve")
+@folders_option
+@click.option("--host", default="127.0.0.1", show_default=True, metavar="HOST", help="Listen there.")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=8000,
+    show_default=True,
+    metavar="N",
+    help="Listen there; 0: any port that is free.",
+)
+@click.option(
+    "--allow-host",
+    "hosts",
+    multiple=True,
+    metavar="NAME",
+    help="A name by which it may be asked for, such as that of a proxy; may be given several times.",
+)
+@click.option("--proxy", "proxies", multiple=True, metavar="ADDRESS", help="Believe this proxy who asks.")
+@click.option("--require-token", is_flag=True, help="Ask for a token for reading too, on any host.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 64),
+    default=2,
+    show_default=True,
+    metavar="N",
+    help="So many jobs at the same time.",
+)
+def command(
+    recordings: tuple[Path, ...],
+    host: str,
+    port: int,
+    hosts: tuple[str, ...],
+    proxies: tuple[str, ...],
+    require_token: bool,
+    workers: int,
+) -> None:
+    """Open the runs to browsers and programs: list, replay, compare, upload, submit.
+
+    The address is printed on stdout; a log goes to stderr, as JSON lines unless that is a terminal. Ctrl+C
+    or SIGTERM stops it: what is under way comes to its end, and jobs are finished or left resumable.
+
+    Other hosts than loopback ones need a token (`dualtaxi token create NAME`), and a proxy for TLS in front:
+    docs/deploy.md tells how.
+
+    \b
+    Examples:
+      dualtaxi serve
+      dualtaxi serve --port 8080 --recordings /data/runs
+      dualtaxi serve --host 0.0.0.0 --allow-host runs.example.org --proxy 10.0.0.2
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.errors import MissingExtra
+
+    try:
+        from runner.service.app import create_app
+        from runner.service.server import bind, serve, url_of
+    except ImportError as error:
+        raise MissingExtra(error.name or "a package", "service", "the service") from error
+    from runner.service.settings import Settings
+
+    settings = Settings(
+        recordings=recordings,
+        host=host,
+        port=port,
+        hosts=tuple(name.lower() for name in hosts),
+        proxies=",".join(proxies),
+        tokens_for_all=require_token,
+        workers=workers,
+    )
+    app = create_app(settings)
+    listening = bind(settings)
+    click.echo(url_of(listening))
+    say("Ctrl+C stops it.")
+    serve(app, settings, listening)

@@ -1,0 +1,98 @@
+"""`dualtaxi token`: the tokens that a service asks for."""
+
+from __future__ import annotations
+
+import click
+
+from runner.cli.options import json_option
+from runner.cli.output import print_json, say
+
+
+@click.group("token")
+def command() -> None:
+    """Make, list and revoke the tokens that a service asks for.
+
+    They are kept hashed, in the configuration folder of the user who serves.
+
+    \b
+    Examples:
+      dualtaxi token create laptop
+      dualtaxi token ls
+      dualtaxi token revoke laptop
+    """  # noqa: D301 - Click wants the backspace itself
+
+
+@command.command("create")
+@click.argument("name")
+@click.option(
+    "--scope",
+    type=click.Choice(("read", "write")),
+    default="read",
+    show_default=True,
+    help="What it allows; who may write may read.",
+)
+@json_option
+def create(name: str, scope: str, as_json: bool) -> None:
+    """Make a token called NAME and print it, this once: only its hash is kept.
+
+    \b
+    Examples:
+      dualtaxi token create laptop
+      dualtaxi token create pusher --scope write
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.service.security import READ, WRITE, Tokens
+    from runner.service.settings import tokens_file
+
+    scopes = (READ, WRITE) if scope == WRITE else (READ,)
+    token, secret = Tokens(tokens_file()).create(name, scopes)
+    if as_json:
+        print_json(token.as_json() | {"token": secret})
+    else:
+        click.echo(secret)
+        say(f"Keep it; it is not shown again. `dualtaxi token revoke {token.id}` takes it away.")
+
+
+@command.command("ls")
+@json_option
+def ls(as_json: bool) -> None:
+    """List the tokens there are; what they are is not known, only their hashes.
+
+    \b
+    Example:
+      dualtaxi token ls
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.output import draw, table
+    from runner.service.security import Tokens
+    from runner.service.settings import tokens_file
+
+    tokens = Tokens(tokens_file()).all()
+    if as_json:
+        print_json([token.as_json() for token in tokens])
+    elif tokens:
+        headings = ("id", "name", "scopes", "created")
+        drawn = table(*headings, left=headings, shrinking=("name",))
+        for token in tokens:
+            drawn.add_row(token.id, token.name, " ".join(token.scopes), token.created)
+        draw(drawn)
+    else:
+        say("No tokens yet. `dualtaxi token create NAME` makes one.")
+
+
+@command.command("revoke")
+@click.argument("which", metavar="TOKEN")
+@json_option
+def revoke(which: str, as_json: bool) -> None:
+    """Take the token of an id or a name away; a service that runs refuses it from now on.
+
+    \b
+    Example:
+      dualtaxi token revoke laptop
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.service.security import Tokens
+    from runner.service.settings import tokens_file
+
+    token = Tokens(tokens_file()).revoke(which)
+    if as_json:
+        print_json(token.as_json())
+    else:
+        say(f"Revoked {token.id} ({token.name}).")

@@ -1,0 +1,9 @@
+"""The service: an HTTP API and pages over the same functions as the commands.
+
+    from runner.service.app import create_app
+    from runner.service.settings import Settings
+
+    app = create_app(Settings(recordings=(Path("recordings"),)))  # for any ASGI server
+
+`dualtaxi serve` runs it, with limits on slow clients and a graceful stop (`runner.service.server`).
+"""

@@ -1,0 +1,96 @@
+"""The application: what all requests pass, the routes, and what lives as long as the service."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import AsyncIterator
+from http import HTTPStatus
+from typing import Any, Final
+
+import anyio.to_thread
+from fastapi import APIRouter, FastAPI
+
+from runner import __version__
+from runner.errors import RunnerError
+from runner.service.api import runs
+from runner.service.catalogue import Catalogue
+from runner.service.guard import Guard
+from runner.service.kept import Kept
+from runner.service.problems import answer_errors, answers
+from runner.service.security import Tokens
+from runner.service.settings import Settings
+
+API: Final = "/api/v1"
+THREADS: Final = 8
+"""Requests that are worked on at the same time; the others wait."""
+LOG: Final = logging.getLogger("dualtaxi.service")
+
+
+def create_app(settings: Settings) -> FastAPI:
+    """Return the application.
+
+    Raises:
+        RunnerError: it would be reachable from other machines and there is no token.
+    """
+    if settings.needs_token and not Tokens(settings.tokens).all():
+        raise RunnerError(
+            f"host: found {settings.host}, which other machines can reach, and no token; expected one. "
+            "Make it by `dualtaxi token create NAME`, or serve on 127.0.0.1 only."
+        )
+    app = FastAPI(
+        title="dualtaxi",
+        version=__version__,
+        summary="Recorded reinforcement-learning runs: listed, read, compared, uploaded, done.",
+        openapi_url=f"{API}/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+        lifespan=_lifespan,
+    )
+    app.state.settings = settings
+    app.state.catalogue = Catalogue(settings.recordings, LOG.warning)
+    app.state.kept = Kept(settings.limits.cache_bytes)
+    app.state.stopping = asyncio.Event()
+    app.add_middleware(Guard, settings=settings)
+    answer_errors(app)
+    app.include_router(_api(), prefix=API)
+    app.include_router(_health())
+    return app
+
+
+def _api() -> APIRouter:
+    general = answers(
+        HTTPStatus.UNAUTHORIZED,
+        HTTPStatus.FORBIDDEN,
+        HTTPStatus.REQUEST_TIMEOUT,
+        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+        HTTPStatus.MISDIRECTED_REQUEST,
+        HTTPStatus.UNPROCESSABLE_ENTITY,
+        HTTPStatus.TOO_MANY_REQUESTS,
+        HTTPStatus.INSUFFICIENT_STORAGE,
+    )
+    api = APIRouter(responses=general)
+    api.include_router(runs.router)
+    return api
+
+
+def _health() -> APIRouter:
+    router = APIRouter(tags=["health"])
+
+    @router.get("/healthz", summary="Whether the service answers.")
+    async def healthz() -> dict[str, str]:
+        return {"status": "ok"}
+
+    return router
+
+
+@contextlib.asynccontextmanager
+async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
+    """Open what lives as long as the service, and close it in the opposite order."""
+    anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
+    app.state.stopping.clear()
+    async with contextlib.AsyncExitStack() as stack:
+        stack.callback(app.state.catalogue.close)
+        yield {}
+        app.state.stopping.set()

@@ -1,0 +1,112 @@
+"""The catalogue as the service asks it: the index, looked after by one thread for all who ask."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from runner.catalogue.finding import Candidate
+from runner.catalogue.index import Version, look, version
+from runner.errors import RunNotFound
+from runner.runs import Run, run_at_once, runs_in, the_one
+
+if TYPE_CHECKING:
+    from runner.catalogue.index import Index
+
+Found = TypeVar("Found")
+
+FRESH_SECONDS: Final = 1.0
+"""Folders that were looked at so recently are not looked at again; longer where that takes long."""
+SHARE: Final = 20
+"""One part in so many of the time is spent on looking."""
+NEVER: Final = float("-inf")
+
+
+class Catalogue:
+    """The index of recordings folders; what it tells is a second or so old, or of now after a change here."""
+
+    def __init__(self, roots: Sequence[Path], tell: Callable[[str], None] = lambda _: None) -> None:
+        self.roots = tuple(roots)
+        self._tell = tell
+        self._looker = ThreadPoolExecutor(1, thread_name_prefix="catalogue")
+        self._lock = threading.Lock()
+        self._look: Future[None] | None = None
+        self._asked = self._changed = self._looked = NEVER
+        self._took = 0.0
+        self._file: int | None = None
+
+    def close(self) -> None:
+        """Wait for the look that is under way, and begin none again."""
+        self._looker.shutdown(cancel_futures=True)
+
+    def version(self) -> Version | None:
+        """Return what changes with every change of what is known; None if that must be looked for first."""
+        now = version()
+        if now is None or not self._is_known(now):
+            return None
+        self._look_if_due()
+        return now
+
+    def changed(self) -> None:
+        """Say that a run is not as it was: whoever asks from now on is told of it as it is."""
+        self._changed = time.monotonic()
+
+    def read(self, work: Callable[[Index], Found]) -> Found:
+        """Return what some work finds in the index.
+
+        Raises:
+            StorageError: a recordings folder cannot be read.
+        """
+        if self.version() is None:
+            self._begin_look().result()
+        return look(self.roots, work, self._tell, as_known=self.version() is not None)
+
+    def find(self, name: str) -> Run:
+        """Return the run that an id, the beginning of one, a name or `@latest` names; no path does.
+
+        Raises:
+            RunNotFound: no run answers to the name, or several do.
+        """
+        if "/" in name or "\\" in name or name.endswith(".mcap"):
+            raise RunNotFound(f"no run {name!r}: expected an id, the beginning of one, a name or @latest.")
+        for root in self.roots:
+            known = run_at_once(name, root)
+            if known is not None:
+                return known
+        candidates = self.read(lambda index: [Candidate(*facts) for facts in index.names()])
+        found = the_one(name, candidates, self.roots[0])
+        for run in runs_in(Path(found.root, found.entry)):
+            return run
+        raise RunNotFound(f"run {found.run_id} was removed just now.")
+
+    def _is_known(self, now: Version) -> bool:
+        """Return whether a look not long ago saw to it that the index agrees with the folders."""
+        recent = time.monotonic() - self._looked < 3 * self._interval
+        return recent and self._looked > self._changed and now.file == self._file
+
+    @property
+    def _interval(self) -> float:
+        return max(FRESH_SECONDS, SHARE * self._took)
+
+    def _look_if_due(self) -> None:
+        if time.monotonic() - self._asked > self._interval:
+            self._begin_look()
+
+    def _begin_look(self) -> Future[None]:
+        """Return a look that begins now, or that is under way and began after the last change."""
+        with self._lock:
+            if self._look is None or self._look.done() or self._asked <= self._changed:
+                self._asked = time.monotonic()
+                self._look = self._looker.submit(self._do_look)
+            return self._look
+
+    def _do_look(self) -> None:
+        began = time.monotonic()
+        look(self.roots, lambda _: None, self._tell)
+        now = version()
+        self._file = now.file if now else None
+        self._looked, self._took = began, time.monotonic() - began

@@ -1,0 +1,194 @@
+"""What every request passes first and every answer last: host, token, origin, size and pace of its body."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from http import HTTPStatus
+from http.cookies import CookieError, SimpleCookie
+from typing import TYPE_CHECKING, Any, Final
+
+from starlette.datastructures import MutableHeaders
+from starlette.exceptions import HTTPException
+
+from runner.errors import RunnerError
+from runner.service.problems import Refused, refusal, status_of, trouble_of
+from runner.service.security import (
+    COOKIE,
+    READ,
+    SAFE_METHODS,
+    WRITE,
+    Failures,
+    Tokens,
+    is_allowed_host,
+    is_same_origin,
+)
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+    from runner.service.settings import Settings
+
+OPEN_PATHS: Final = ("/healthz", "/readyz", "/login", "/static/")
+"""What needs no token: these, and what is below those that end in a slash."""
+UPLOADS: Final = "/api/v1/uploads"
+"""Below it a body may be as long as a recording."""
+LEAST_RATE: Final = 1000
+"""Bytes a second of a body, on average; slower clients are cut off."""
+POLICY: Final = (
+    "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
+    "frame-ancestors 'self'"
+)
+_HEADERS: Final = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "same-origin",  # with `no-referrer` a form's own origin would be null
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "private, no-cache",
+}
+"""Of every answer that has none of its own."""
+
+
+class Guard:
+    """Refuses what may not be, before any route is looked for; so no route can forget to."""
+
+    def __init__(self, app: ASGIApp, settings: Settings) -> None:
+        self._app, self._settings = app, settings
+        self._tokens, self._failures = Tokens(settings.tokens), Failures(settings.limits)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or refuse it."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]]
+        try:
+            self._check(scope, headers)
+        except RunnerError as error:
+            said = error.headers if isinstance(error, Refused) else None
+            await refusal(status_of(error), trouble_of(error), said)(scope, receive, _with_headers(send))
+            return
+        limits = self._settings.limits
+        most = limits.upload_bytes if scope["path"].startswith(UPLOADS) else limits.body_bytes
+        body = Body(receive, most, limits.idle_seconds)
+        await self._app(scope, body.receive, _with_headers(send))
+
+    def _check(self, scope: Scope, listed: list[tuple[str, str]]) -> None:
+        headers = dict(listed)
+        hosts = [value for name, value in listed if name == "host"]
+        if len(hosts) != 1 or not is_allowed_host(hosts[0], self._settings.hosts):
+            raise Refused(
+                HTTPStatus.MISDIRECTED_REQUEST,
+                f"host: found {', '.join(hosts) or 'none'}, expected an address, localhost or a name that "
+                "was allowed by --allow-host.",
+            )
+        reads = scope["method"] in SAFE_METHODS
+        if reads and is_open(scope["path"]):
+            return
+        scopes = self._scopes(scope, headers)
+        if "authorization" in headers and scopes:
+            if (READ if reads else WRITE) not in scopes and not (reads and WRITE in scopes):
+                raise Refused(HTTPStatus.FORBIDDEN, "token: found one for reading, expected one for writing.")
+            return
+        if self._settings.needs_token and not is_open(scope["path"]):
+            if scopes is None:
+                raise _unauthorized("token: found none, expected `Authorization: Bearer TOKEN`, or a login.")
+            if not reads and WRITE not in scopes:
+                raise Refused(HTTPStatus.FORBIDDEN, "token: found one for reading, expected one for writing.")
+        if not reads and not is_same_origin(headers):
+            raise Refused(
+                HTTPStatus.FORBIDDEN,
+                "origin: found another than the service's own, or none; expected the same, or a token. "
+                "A program without one says `Origin: http://HOST:PORT`.",
+            )
+
+    def _scopes(self, scope: Scope, headers: dict[str, str]) -> tuple[str, ...] | None:
+        """Return what the request's token allows; None if it has none.
+
+        Raises:
+            Refused: it is a wrong one, or there were too many of them from this address.
+        """
+        kind, _, secret = headers.get("authorization", "").partition(" ")
+        if kind and kind.lower() != "bearer":
+            raise _unauthorized(f"authorization: found {kind[:20]!r}, expected `Bearer TOKEN`.")
+        secret = secret.strip() or _cookie(headers)
+        if not secret:
+            return None
+        address = (scope.get("client") or ("",))[0]
+        if (seconds := self._failures.wait(address)) > 0:
+            raise Refused(
+                HTTPStatus.TOO_MANY_REQUESTS,
+                f"token: too many wrong ones from {address}; try again in {seconds} s.",
+                {"retry-after": str(seconds)},
+            )
+        scopes = self._tokens.scopes_of(secret)
+        if scopes is None:
+            self._failures.add(address)
+            raise _unauthorized("token: found one that is unknown, or was revoked.")
+        return scopes
+
+
+def is_open(path: str) -> bool:
+    """Return whether a path needs no token."""
+    return any(path.startswith(part) if part.endswith("/") else path == part for part in OPEN_PATHS)
+
+
+class Body:
+    """A request's body on its way in, within limits of size and pace."""
+
+    def __init__(self, receive: Receive, most: int, idle_seconds: float) -> None:
+        self._receive, self._most, self._idle = receive, most, idle_seconds
+        self._began, self._length, self._more = time.monotonic(), 0, True
+
+    async def receive(self) -> Message:
+        """Return the next part of it; what comes behind its end is waited for as long as it takes.
+
+        Raises:
+            HTTPException: it is too long, or too slow.
+        """
+        if not self._more:
+            return await self._receive()
+        try:
+            async with asyncio.timeout(self._idle):
+                message = await self._receive()
+        except TimeoutError:
+            raise self._too_slow() from None
+        self._more = message.get("more_body", False)
+        self._length += len(message.get("body", b""))
+        if self._length > self._most:
+            raise HTTPException(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+                f"body: found more than {self._most:,} bytes, expected at most so many.",
+                {"connection": "close"},
+            )
+        if self._more and time.monotonic() - self._began > self._idle + self._length / LEAST_RATE:
+            raise self._too_slow()
+        return message
+
+    def _too_slow(self) -> HTTPException:
+        message = f"body: found {self._length:,} bytes in {time.monotonic() - self._began:.0f} s, too few."
+        return HTTPException(HTTPStatus.REQUEST_TIMEOUT, message, {"connection": "close"})
+
+
+def _unauthorized(message: str) -> Refused:
+    return Refused(HTTPStatus.UNAUTHORIZED, message, {"www-authenticate": "Bearer"})
+
+
+def _cookie(headers: dict[str, str]) -> str:
+    try:
+        found = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+    except CookieError:
+        return ""
+    return found.value if found else ""
+
+
+def _with_headers(send: Send) -> Any:
+    async def sending(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            for name, value in _HEADERS.items():
+                headers.setdefault(name, value)
+        await send(message)
+
+    return sending

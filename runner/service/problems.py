@@ -1,0 +1,151 @@
+"""What goes wrong, as an answer: one form, with a message that says what to do.
+
+{"error": {"message": "...", "problems": [{"path": "query.limit", "line": null, "message": "..."}]}}
+"""
+
+from __future__ import annotations
+
+import logging
+from http import HTTPStatus
+from typing import Any, Final
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from pydantic import BaseModel
+from starlette.exceptions import HTTPException
+
+from runner.errors import (
+    ConfigError,
+    Diverged,
+    EnvironmentNotUsable,
+    MissingExtra,
+    RecordingError,
+    RunnerError,
+    RunNotFound,
+    StorageError,
+)
+
+LOG: Final = logging.getLogger("dualtaxi.service")
+
+_STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
+    ConfigError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    Diverged: HTTPStatus.CONFLICT,
+    EnvironmentNotUsable: HTTPStatus.UNPROCESSABLE_ENTITY,
+    MissingExtra: HTTPStatus.NOT_IMPLEMENTED,
+    RecordingError: HTTPStatus.CONFLICT,
+    RunNotFound: HTTPStatus.NOT_FOUND,
+    StorageError: HTTPStatus.INSUFFICIENT_STORAGE,
+}
+
+
+class Problem(BaseModel):
+    """One thing that is wrong."""
+
+    path: str | None = None
+    """The key, parameter or field it is with."""
+    line: int | None = None
+    """The line of a configuration."""
+    message: str
+
+
+class Trouble(BaseModel):
+    """What is wrong, and what to do."""
+
+    message: str
+    problems: list[Problem] = []
+
+
+class ErrorAnswer(BaseModel):
+    """The body of every answer that is an error."""
+
+    error: Trouble
+
+
+class Refused(RunnerError):
+    """A request is refused with a status of its own."""
+
+    def __init__(self, status: HTTPStatus, message: str, headers: dict[str, str] | None = None) -> None:
+        super().__init__(message)
+        self.status, self.headers = status, headers or {}
+
+
+def answers(*statuses: HTTPStatus) -> dict[int | str, dict[str, Any]]:
+    """Return how a route's errors are documented."""
+    return {int(status): {"model": ErrorAnswer, "description": status.phrase} for status in statuses}
+
+
+def status_of(error: RunnerError) -> HTTPStatus:
+    """Return the status that an error is answered with."""
+    if isinstance(error, Refused):
+        return error.status
+    kinds = (kind for kind in type(error).__mro__ if kind in _STATUS)
+    return next((_STATUS[kind] for kind in kinds), HTTPStatus.BAD_REQUEST)
+
+
+def trouble_of(error: RunnerError) -> Trouble:
+    """Return an error's message, and the problems of a configuration each with its line and key."""
+    message = "\n".join([str(error), *getattr(error, "__notes__", [])])
+    if not isinstance(error, ConfigError):
+        return Trouble(message=message)
+    problems = [
+        Problem(path=found.path or None, line=found.line or None, message=found.message)
+        for found in error.problems
+    ]
+    return Trouble(message=message, problems=problems)
+
+
+def refusal(status: HTTPStatus, trouble: Trouble, headers: dict[str, str] | None = None) -> Response:
+    """Return the answer that is an error."""
+    return JSONResponse({"error": trouble.model_dump()}, status, headers)
+
+
+def answer_errors(app: FastAPI) -> None:
+    """Have every error of the application answered in the one form."""
+    app.add_exception_handler(RunnerError, _runner_error)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(OSError, _system_error)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+async def _runner_error(request: Request, error: Exception) -> Response:  # noqa: ARG001
+    assert isinstance(error, RunnerError)
+    headers = error.headers if isinstance(error, Refused) else None
+    return refusal(status_of(error), trouble_of(error), headers)
+
+
+async def _http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    status = HTTPStatus(error.status_code)
+    told = {
+        HTTPStatus.NOT_FOUND: f"there is nothing at {request.url.path}.",
+        HTTPStatus.METHOD_NOT_ALLOWED: f"{request.method} cannot be done at {request.url.path}.",
+    }
+    message = told.get(status, str(error.detail))
+    return refusal(status, Trouble(message=message), dict(error.headers or {}))
+
+
+async def _invalid(request: Request, error: Exception) -> Response:  # noqa: ARG001
+    assert isinstance(error, RequestValidationError)
+    problems = [
+        Problem(path=".".join(map(str, found["loc"])), message=str(found["msg"])) for found in error.errors()
+    ]
+    message = "; ".join(f"{problem.path}: {problem.message}" for problem in problems)
+    return refusal(HTTPStatus.UNPROCESSABLE_ENTITY, Trouble(message=message, problems=problems))
+
+
+async def _system_error(request: Request, error: Exception) -> Response:
+    import errno
+
+    assert isinstance(error, OSError)
+    if error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None)):
+        message = f"the disk is full ({error.strerror}); free some of it: `dualtaxi du` tells what uses it."
+        return refusal(HTTPStatus.INSUFFICIENT_STORAGE, Trouble(message=message))
+    return await _unexpected(request, error)
+
+
+async def _unexpected(request: Request, error: Exception) -> Response:
+    LOG.error("error", exc_info=error, extra={"path": request.url.path, "method": request.method})
+    message = "something unexpected went wrong; the service's log tells what."
+    return refusal(HTTPStatus.INTERNAL_SERVER_ERROR, Trouble(message=message))

@@ -1,0 +1,86 @@
+"""What the service is told when it starts."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from runner.errors import RunnerError
+
+CONFIG_VARIABLE: Final = "XDG_CONFIG_HOME"
+MB: Final = 1_000_000
+
+
+def tokens_file() -> Path:
+    """Return the file of hashed tokens, in the user's configuration folder; it need not exist."""
+    base = os.environ.get(CONFIG_VARIABLE)
+    return (Path(base) if base else Path.home() / ".config") / "dualtaxi" / "tokens.json"
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How much of anything a client may have; what is beyond is refused, and said."""
+
+    body_bytes: int = MB
+    """Of a request, but for uploads, which are streamed and have a limit of their own."""
+    upload_bytes: int = 1 << 40
+    """Of one recording or archive."""
+    connections: int = 1000
+    header_seconds: float = 10.0
+    """Until a request's head is there whole."""
+    idle_seconds: float = 30.0
+    """Without a byte of a body that is awaited, or of an answer that is not taken."""
+    keep_alive_seconds: int = 15
+    stop_seconds: int = 20
+    """Until what is under way is cut off when the service stops."""
+    failures: int = 10
+    """Wrong tokens from one address in `failure_seconds`, before it must wait so long."""
+    failure_seconds: float = 60.0
+    page_runs: int = 1000
+    """Runs in one answer."""
+    page_records: int = 100_000
+    """Records (steps, episodes, measures) in one answer."""
+    work_seconds: float = 600.0
+    """Of a comparison, a picture or an export, which are made in processes of their own."""
+    cache_bytes: int = 20 * MB
+    """Of answers that are kept for who asks the same next."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the service is told when it starts."""
+
+    recordings: tuple[Path, ...]
+    """Recordings folders; the first is written to."""
+    host: str = "127.0.0.1"
+    port: int = 8000
+    tokens: Path = field(default_factory=tokens_file)
+    hosts: tuple[str, ...] = ()
+    """Names by which it may be asked for besides `localhost` and addresses: those behind a proxy."""
+    proxies: str = ""
+    """Addresses of proxies, separated by commas, that are believed who asks through them."""
+    tokens_for_all: bool = False
+    """Whether reading needs a token too; it always does when the host is not a loopback one."""
+    workers: int = 2
+    """Processes that do jobs at the same time."""
+    limits: Limits = Limits()
+
+    def __post_init__(self) -> None:
+        if not self.recordings:
+            raise RunnerError("recordings: found none, expected at least one folder.")
+
+    @property
+    def is_loopback(self) -> bool:
+        """Whether nobody beyond this machine can reach it."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+    @property
+    def needs_token(self) -> bool:
+        """Whether reading needs a token."""
+        return self.tokens_for_all or not self.is_loopback

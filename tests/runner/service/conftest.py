@@ -1,0 +1,65 @@
+"""What the service's tests share: some runs, and a client of an application over them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from starlette.testclient import TestClient
+
+import runner
+from runner.service.app import create_app
+from runner.service.settings import Settings
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recordings folder with two small runs that differ in their seed, `first` and `second`."""
+    folder = tmp_path_factory.mktemp("recorded")
+    config = yaml.safe_load((ROOT / "configs" / "quick.yaml").read_text(encoding="utf-8"))
+    config |= {"episodes": 60, "seeds": 1}
+    for seed, name in enumerate(("first", "second")):
+        runner.run(config | {"name": name}, seed=seed, recordings=folder)
+    return folder
+
+
+@pytest.fixture
+def recordings(recorded: Path, tmp_path: Path) -> Path:
+    """Return a copy of those runs, to be changed at will."""
+    return Path(shutil.copytree(recorded, tmp_path / "recordings"))
+
+
+@pytest.fixture
+def settings(recordings: Path, tmp_path: Path) -> Settings:
+    return Settings(recordings=(recordings,), tokens=tmp_path / "tokens.json")
+
+
+@pytest.fixture
+def connect() -> Iterator[Callable[..., TestClient]]:
+    """Return what makes a client of a service with some settings; a page of its own unless told else."""
+    opened = []
+
+    def make(settings: Settings, **headers: str) -> TestClient:
+        client = TestClient(
+            create_app(settings),
+            base_url="http://localhost",
+            headers=headers or {"Origin": "http://localhost"},
+            raise_server_exceptions=False,
+        )
+        opened.append(client)
+        return client.__enter__()
+
+    yield make
+    for client in opened:
+        client.__exit__(None, None, None)
+
+
+@pytest.fixture
+def client(connect: Callable[..., TestClient], settings: Settings) -> TestClient:
+    """Return a client of a service over those runs."""
+    return connect(settings)

@@ -1,0 +1,52 @@
+"""The list of runs over HTTP is the one of `dualtaxi ls`."""
+
+from __future__ import annotations
+
+import json
+
+from click.testing import CliRunner
+
+from runner.cli import cli
+
+
+def _ls(recordings, *words):
+    result = CliRunner().invoke(cli, ["ls", *words, "--json", "--recordings", str(recordings)])
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def test_the_list_is_that_of_ls(client, recordings):
+    answer = client.get("/api/v1/runs")
+    assert answer.status_code == 200
+    assert answer.json() == {"runs": _ls(recordings), "total": 2, "offset": 0, "limit": 50}
+
+
+def test_filter_sort_columns_and_paging_are_those_of_ls(client, recordings):
+    asked = {"filter": "status:finished", "sort": "-seed", "columns": "id,seed", "limit": 1, "offset": 1}
+    page = client.get("/api/v1/runs", params=asked).json()
+    assert page["runs"] == _ls(
+        recordings,
+        "status:finished",
+        "--sort",
+        "-seed",
+        "--columns",
+        "id,seed",
+        "--limit",
+        "1",
+        "--offset",
+        "1",
+    )
+    assert page["total"] == 2
+    assert [run["seed"] for run in page["runs"]] == [0]
+
+
+def test_a_wrong_filter_is_refused_with_what_was_meant(client):
+    answer = client.get("/api/v1/runs", params={"filter": "stauts:finished"})
+    assert answer.status_code == 400
+    assert "Did you mean 'status'?" in answer.json()["error"]["message"]
+
+
+def test_a_parameter_that_cannot_be_is_named(client):
+    answer = client.get("/api/v1/runs", params={"limit": "many"})
+    assert answer.status_code == 422
+    assert answer.json()["error"]["problems"][0]["path"] == "query.limit"
