@@ -36,6 +36,8 @@ class Episode:
     number: int
     length: int
     """Steps it has, of which T are here."""
+    total: float
+    """What the rewards of all of them sum to."""
     ended: str
     """How it ended: `success`, `terminated`, `truncated`, or `cut off` with the recording."""
     states: NDArray[np.int64]
@@ -48,6 +50,10 @@ class Episode:
     """For each learner the Q-values in the first T states, [T, actions]; none where they cannot be had."""
     names: tuple[str, ...] = ()
     """Why it is shown."""
+    first: int = 0
+    """Steps before those that are here."""
+    before: tuple[float, ...] = ()
+    """What each learner's rewards in them sum to; nothing where there are none."""
 
     @property
     def steps(self) -> int:
@@ -67,27 +73,33 @@ class Episode:
 
     @property
     def description(self) -> str:
+        """Length, end and return in words, and how many of its steps are here if not all are."""
+        part = "" if self.steps == self.length else f" Shown are the first {self.steps:,} steps."
+        return self.outcome + part
+
+    @property
+    def outcome(self) -> str:
         """Length, end and return in words."""
-        shown = "" if self.steps == self.length else f"; shown are the first {self.steps:,}"
         words = {"success": "ended in success", "terminated": "ended", "truncated": "ended by the step limit"}
         ended = words.get(self.ended, "cut off with the recording")
-        total = float(self.rewards.sum())
-        return f"{self.length:,} steps, {ended}{shown}. Rewards{' so far' if shown else ''} sum to {total:g}."
+        return f"{self.length:,} steps, {ended}. Rewards sum to {self.total:g}."
 
 
-def training_episode(recording: Recording, number: int, most: int = MOST_STEPS) -> Episode:
-    """Return a training episode, counted from 0, also one that never ended.
+def training_episode(recording: Recording, number: int, most: int = MOST_STEPS, first: int = 0) -> Episode:
+    """Return a training episode, counted from 0, also one that never ended: `most` steps from `first` on.
 
     Raises:
         RecordingError: there is no such episode, or no steps.
     """
     require_steps(recording)
     title = f"training episode {number:,}"
-    return _episode(recording, "train", number, title, most)
+    return _episode(recording, "train", number, title, range(first, first + most))
 
 
-def trial(recording: Recording, after: int, number: int, most: int = MOST_STEPS) -> Episode:
+def trial(recording: Recording, after: int, number: int, most: int = MOST_STEPS, first: int = 0) -> Episode:
     """Return a trial, counted from 0, of the evaluation after so many training episodes.
+
+    It is `most` of its steps, from `first` on.
 
     Raises:
         RecordingError: there is no such evaluation or trial, or no steps.
@@ -102,7 +114,8 @@ def trial(recording: Recording, after: int, number: int, most: int = MOST_STEPS)
         )
     title = f"trial {number} of the evaluation after {after:,} episodes"
     index = first_trial(recording, evaluation) + number
-    return _episode(recording, "eval", index, title, most, int(evaluation["step"]))
+    shown = range(first, first + most)
+    return _episode(recording, "eval", index, title, shown, int(evaluation["step"]))
 
 
 def evaluation_after(recording: Recording, after: int) -> dict[str, Any]:
@@ -208,16 +221,21 @@ def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[
 
 
 def _episode(
-    recording: Recording, phase: str, number: int, title: str, most: int, table_step: int = -1
+    recording: Recording, phase: str, number: int, title: str, part: range, table_step: int = -1
 ) -> Episode:
     steps = recording.episode_steps(phase, number)
-    shown, last = steps[:most], steps[-1]
+    shown, last = steps[part.start : part.stop], steps[-1]
+    if not len(shown):
+        raise RecordingError(
+            f"{recording.path}: {title} has {len(steps):,} steps, from 0; found no step {part.start:,}."
+        )
     mdp = recording.mdp
     return Episode(
         title=title,
         phase=phase,
         number=number,
         length=len(steps),
+        total=float(steps["rewards"].sum()),
         ended=_end(recording, phase, number, last),
         states=np.append(shown["state"], shown["next_state"][-1]).astype(np.int64),
         actions=shown["action"].astype(np.int64),
@@ -225,6 +243,8 @@ def _episode(
         events=events_of(mdp, shown),
         explored=shown["explored"].astype(np.int64),
         values=_values(recording, shown, table_step),
+        first=part.start,
+        before=tuple(steps["rewards"][: part.start].sum(axis=0).tolist()) if part.start else (),
     )
 
 
