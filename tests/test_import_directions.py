@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ORDER = """
-    errors
+    amounts errors
     cache compiled documents
     config owner labels
     job toy_text scene

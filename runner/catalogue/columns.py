@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from runner.amounts import UNKNOWN, age, duration, number, size
 from runner.catalogue.fields import FIELDS, SETTING, field_of
 from runner.errors import RunnerError
 from runner.runs import RECORDING_FILE
@@ -24,6 +25,9 @@ PROGRAMS: Final = (
     *("mode", "environment", "host", "git", "archive", "path"),
 )
 """What programs are told of a run, unless they ask for other columns."""
+HEADINGS: Final = {"finish_percent": "finished %", "bytes": "size", "tag": "tags", "same_as": "same as"}
+"""What stands above a column, if that is not its name."""
+_OFTEN_EMPTY: Final = ("tag", "same_as", "note", "archive")
 _FIELD_OF: Final = {"run_id": "id", "tags": "tag", "content_digest": "digest"}
 
 
@@ -74,3 +78,28 @@ def as_json(row: dict[str, Any], columns: Sequence[str] = PROGRAMS) -> dict[str,
 def moment(row: dict[str, Any]) -> datetime:
     """Return when a run began, in UTC."""
     return datetime.fromtimestamp(row["created"] / 1000, UTC)
+
+
+def in_words(row: dict[str, Any], column: str) -> str:
+    """Return what people are shown of a run in a column."""
+    found = value(row, column)
+    if column == "episodes" and row["episodes_to_do"] not in (None, found):
+        return f"{UNKNOWN if found is None else f'{found:,}'} of {row['episodes_to_do']:,}"
+    if found is None or found == []:
+        return "" if column in _OFTEN_EMPTY else UNKNOWN
+    if column == "created":
+        return f"{moment(row):%Y-%m-%d %H:%M}"
+    if column in _IN_WORDS:
+        return _IN_WORDS[column](found)
+    plain = column in FIELDS and isinstance(found, int)
+    return f"{found:,}" if plain else str(found)
+
+
+_IN_WORDS: Final[dict[str, Callable[[Any], str]]] = {
+    **dict.fromkeys(("finish_percent", "mean_length", "mean_penalties"), number),
+    "age": age,
+    "bytes": size,
+    "seconds": duration,
+    "seed": str,
+    "tag": " ".join,
+}

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import click
 
-from runner.catalogue.columns import as_json, moment, value
+from runner.catalogue.columns import HEADINGS, as_json, in_words
 from runner.catalogue.fields import FIELDS, Kind
-from runner.cli.output import UNKNOWN, age, console, draw, duration, number, size, table
+from runner.cli.output import console, draw, table
 
-_HEADINGS: Final = {"finish_percent": "finished %", "bytes": "size", "tag": "tags", "same_as": "same as"}
 _NARROWEST: Final = 14
 """The width at which a shrinking column can still be read."""
 _MISSED: Final = ("config", "bytes", "episodes", "seed", "folder", "age")
-_OFTEN_EMPTY: Final = ("tag", "same_as", "note", "archive")
 _LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
 _SHRINKING: Final = ("name", "config", "tags", "note", "environment", "host", "archive", "folder", "path")
 
@@ -48,9 +46,9 @@ def usual_columns(rows: Sequence[dict[str, Any]], folders: int) -> list[str]:
 
 def print_table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
     """Print rows as a table; fitted to the terminal, if there is one, but ids are never cut."""
-    headings = [_HEADINGS.get(column, column) for column in columns]
+    headings = [HEADINGS.get(column, column) for column in columns]
     left = [column not in FIELDS or FIELDS[column].kind in _LEFT for column in columns]
-    cells = [[_cell(row, column) for column in columns] for row in rows]
+    cells = [[printable(in_words(row, column)) for column in columns] for row in rows]
     if not console().is_terminal:
         click.echo("\n".join(_aligned([headings, *cells], left)))
         return
@@ -65,7 +63,10 @@ def fitting(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> list[str]
     """Return the columns that fit a terminal, less those that can best be missed where it is narrow."""
     kept, drawn = list(columns), console()
     widths = {
-        column: max(len(_HEADINGS.get(column, column)), *(len(_cell(row, column)) for row in rows)) + 2
+        column: max(
+            len(HEADINGS.get(column, column)), *(len(printable(in_words(row, column))) for row in rows)
+        )
+        + 2
         for column in columns
     }
     for column in _SHRINKING:
@@ -87,31 +88,6 @@ def _aligned(lines: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:
         ).rstrip()
         for line in lines
     ]
-
-
-def _cell(row: dict[str, Any], column: str) -> str:
-    """Return what people are shown of a run in a column."""
-    found = value(row, column)
-    if column == "episodes" and row["episodes_to_do"] not in (None, found):
-        return f"{UNKNOWN if found is None else f'{found:,}'} of {row['episodes_to_do']:,}"
-    if found is None or found == []:
-        return "" if column in _OFTEN_EMPTY else UNKNOWN
-    if column == "created":
-        return f"{moment(row):%Y-%m-%d %H:%M}"
-    if column in _IN_WORDS:
-        return _IN_WORDS[column](found)
-    plain = column in FIELDS and isinstance(found, int)
-    return f"{found:,}" if plain else printable(str(found))
-
-
-_IN_WORDS: Final[dict[str, Callable[[Any], str]]] = {
-    **dict.fromkeys(("finish_percent", "mean_length", "mean_penalties"), number),
-    "age": age,
-    "bytes": size,
-    "seconds": duration,
-    "seed": str,
-    "tag": " ".join,
-}
 
 
 def printable(text: str) -> str:

@@ -9,12 +9,29 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from runner.amounts import UNKNOWN, age, amount, duration, number, size
+
 if TYPE_CHECKING:  # imported when something is drawn
     from rich.console import Console, RenderableType
     from rich.table import Table
     from rich.text import Text
 
-UNKNOWN: Final = "–"
+__all__ = [
+    "UNKNOWN",
+    "age",
+    "amount",
+    "console",
+    "draw",
+    "duration",
+    "facts",
+    "number",
+    "print_json",
+    "say",
+    "size",
+    "table",
+    "title",
+]
+
 UNBOUNDED: Final = 1000
 """The width where there is no terminal to fit."""
 
@@ -91,57 +108,6 @@ def facts(pairs: Mapping[str, str]) -> Table:
     for name, text in pairs.items():
         made.add_row(name, text)
     return made
-
-
-def size(count: float) -> str:
-    """Return a number of bytes in words: `7.6 MB`."""
-    if count < 1000:
-        return f"{count:.0f} B"
-    for unit in ("kB", "MB", "GB"):
-        count /= 1000
-        if count < 999.5:
-            return f"{_two_digits(count)} {unit}"
-    return f"{_two_digits(count / 1000)} TB"
-
-
-def amount(count: float) -> str:
-    """Return a large number in words: `9,500`, `12 thousand`, `3.4 million`."""
-    for divisor, word in ((1e9, "billion"), (1e6, "million"), (1e3, "thousand")):
-        if count >= max(divisor, 1e4):
-            return f"{_two_digits(count / divisor)} {word}"
-    return f"{count:,.0f}"
-
-
-def _two_digits(number: float) -> str:
-    return f"{number:.1f}" if number < 9.95 else f"{number:,.0f}"
-
-
-def duration(seconds: float) -> str:
-    """Return a time span in words: `0.8 s`, `2 min 5 s`, `1 h 12 min`, `3 d`."""
-    if seconds < 10:
-        return f"{max(seconds, 0):.1f} s"
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60} s"
-    if whole < 86400:
-        return f"{whole // 3600} h {whole % 3600 // 60} min"
-    return f"{whole // 86400} d"
-
-
-def age(seconds: float) -> str:
-    """Return how long ago something was, in one unit: `40 s`, `5 min`, `3 h`, `12 d`."""
-    whole = max(round(seconds), 0)
-    for bound, divisor, unit in ((60, 1, "s"), (3600, 60, "min"), (86400, 3600, "h")):
-        if whole < bound:
-            return f"{whole // divisor} {unit}"
-    return f"{whole // 86400} d"
-
-
-def number(value: float | None, digits: int = 1) -> str:
-    """Return a number with some digits after the point; what is unknown (None, NaN) as a dash."""
-    return UNKNOWN if value is None or math.isnan(value) else f"{value:,.{digits}f}"
 
 
 def _finite(value: Any) -> Any:
