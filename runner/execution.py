@@ -48,6 +48,8 @@ class Progress:
     bytes_written: int = 0
     evaluations: list[dict[str, Any]] = field(default_factory=list)
     """The metrics of every evaluation so far; under `optimality` the exact ones, if they are taken."""
+    log: list[str] = field(default_factory=list)
+    """What the run said of itself so far; of one that is gone on with, what it had not said before."""
 
 
 Report = Callable[[Progress], None]
@@ -295,9 +297,9 @@ class Session:
 
     def _log(self, text: str, level: str = "INFO") -> None:
         steps = sum(self.recorder.steps.values())
-        self.recorder.message(
-            schema.LOG_TOPIC, encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level)
-        )
+        said = encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level)
+        if self.recorder.message(schema.LOG_TOPIC, said):
+            self._progress.log.append(text)
 
     def _tell(self, now: bool = False) -> None:
         """Report the progress, not more often than is worth it."""

@@ -149,7 +149,9 @@ class Run:
         return changed
 
 
-def create_run(recordings: Path, config: ExperimentConfig, seed: int, name: str | None = None) -> Run:
+def create_run(
+    recordings: Path, config: ExperimentConfig, seed: int, name: str | None = None, run_id: str | None = None
+) -> Run:
     """Make a folder for a new run and write what it is; an id is never used twice.
 
     Args:
@@ -157,14 +159,17 @@ def create_run(recordings: Path, config: ExperimentConfig, seed: int, name: str 
         config: what is run.
         seed: the one seed that is run.
         name: what the run is called; the configuration's name unless given.
+        run_id: its id, from `new_run_id`, if that had to be known before; another if it is taken by now.
 
     Raises:
         StorageError: the recordings folder cannot be written.
     """
-    return new_run(recordings, config.to_mapping(), seed, name or config.name)
+    return new_run(recordings, config.to_mapping(), seed, name or config.name, run_id)
 
 
-def new_run(recordings: Path, config: Mapping[str, Any], seed: int, name: str) -> Run:
+def new_run(
+    recordings: Path, config: Mapping[str, Any], seed: int, name: str, run_id: str | None = None
+) -> Run:
     """Make a folder for a new run of this configuration, as `create_run` does.
 
     Raises:
@@ -173,13 +178,13 @@ def new_run(recordings: Path, config: Mapping[str, Any], seed: int, name: str) -
     try:
         recordings.mkdir(parents=True, exist_ok=True)
         while True:
-            run_id = new_run_id(recordings)
+            run_id = run_id or new_run_id(recordings)
             folder = recordings / run_id
             try:
                 folder.mkdir()
                 break
             except FileExistsError:
-                continue
+                run_id = None
         run = Run(
             folder,
             {

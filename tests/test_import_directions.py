@@ -14,7 +14,7 @@ ORDER = """
     amounts errors
     cache compiled documents
     config owner labels
-    job toy_text scene
+    job toy_text scene estimate
     mdp
     words learning planning recording observer
     provenance runs

@@ -5,7 +5,7 @@
 Everything that can be wrong is told in one `ConfigError`, a line for each problem.
 """
 
-from runner.config.loading import from_mapping, load
+from runner.config.loading import from_mapping, from_text, load
 from runner.config.model import (
     Environment,
     Evaluation,
@@ -41,6 +41,7 @@ __all__ = [
     "Snapshots",
     "UniformRange",
     "from_mapping",
+    "from_text",
     "json_schema",
     "load",
 ]

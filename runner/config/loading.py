@@ -45,11 +45,24 @@ def load(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Experim
         ConfigError: The file cannot be read, or does not describe an experiment. The message has a
             line for each problem, with file, line, column and key.
     """
-    file = FilePath(path)
-    document = read_yaml(read_text(file), str(file))
+    return from_text(read_text(FilePath(path)), os.fspath(path), overrides)
+
+
+def from_text(text: str, source: str, overrides: Sequence[str] = ()) -> ExperimentConfig:
+    """Return the experiment that the text of a file describes.
+
+    Args:
+        text: what stands in the file.
+        source: the file's name, for messages; without its ending it names the experiment, as for `load`.
+        overrides: as for `load`.
+
+    Raises:
+        ConfigError: as for `load`.
+    """
+    stem, document = FilePath(source).stem, read_yaml(text, source)
     if document.value is None and not document.problems:
-        raise ConfigError(f"{file}:1:1: the file is empty, expected at least `episodes`")
-    return experiment_in(document, overrides, file.stem, named_by=f"the file's name, {file.stem!r},")
+        raise ConfigError(f"{source}:1:1: the file is empty, expected at least `episodes`")
+    return experiment_in(document, overrides, stem, named_by=f"the file's name, {stem!r},")
 
 
 def from_mapping(

@@ -153,8 +153,11 @@ class Recorder:
         if time.monotonic() - self._last_flush > FLUSH_SECONDS:
             self.flush()
 
-    def message(self, topic: Topic, payload: bytes) -> None:
-        """Record one message of a topic of variable size, at the present logical time."""
+    def message(self, topic: Topic, payload: bytes) -> bool:
+        """Record one message of a topic of variable size, at the present logical time.
+
+        Returns whether it is new: not in the recording already.
+        """
         self._raise_failure()
         log_time = sum(self.steps.values()) * STEP_NANOSECONDS
         self.counts[topic.name] += 1
@@ -162,6 +165,7 @@ class Recorder:
         records = memoryview(schema.message_record(topic, log_time, payload))
         times = np.array([log_time], dtype=np.uint64)
         self._pipeline.send(topic, records, times, np.zeros(1, np.uint64), write=not known)
+        return not known
 
     def append(self, topic: Topic, payload: bytes, position: int) -> None:
         """Record one message of a topic of variable size, in a chunk with others.

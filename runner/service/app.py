@@ -14,13 +14,14 @@ from fastapi import APIRouter, FastAPI
 
 from runner import __version__
 from runner.errors import RunnerError
-from runner.service.api import runs
+from runner.service.api import jobs, runs
 from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
 from runner.service.kept import Kept
 from runner.service.problems import answer_errors, answers
 from runner.service.security import Tokens
 from runner.service.settings import Settings
+from runner.service.work import Jobs
 
 API: Final = "/api/v1"
 THREADS: Final = 8
@@ -72,6 +73,7 @@ def _api() -> APIRouter:
     )
     api = APIRouter(responses=general)
     api.include_router(runs.router)
+    api.include_router(jobs.router)
     return api
 
 
@@ -92,5 +94,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
     app.state.stopping.clear()
     async with contextlib.AsyncExitStack() as stack:
         stack.callback(app.state.catalogue.close)
+        settings: Settings = app.state.settings
+        app.state.jobs = stack.enter_context(
+            Jobs(settings.recordings[0], settings.workers, most_waiting=settings.limits.jobs)
+        )
         yield {}
         app.state.stopping.set()

@@ -10,6 +10,7 @@ from runner.runs import Run
 from runner.service.catalogue import Catalogue
 from runner.service.kept import Kept
 from runner.service.settings import Settings
+from runner.service.work import Jobs
 
 
 def settings_of(request: Request) -> Settings:
@@ -30,9 +31,16 @@ def kept_of(request: Request) -> Kept:
     return found
 
 
+def jobs_of(request: Request) -> Jobs:
+    """Return the jobs, done beside the service."""
+    found: Jobs = request.app.state.jobs
+    return found
+
+
 SettingsOf = Annotated[Settings, Depends(settings_of)]
 CatalogueOf = Annotated[Catalogue, Depends(catalogue_of)]
 KeptOf = Annotated[Kept, Depends(kept_of)]
+JobsOf = Annotated[Jobs, Depends(jobs_of)]
 RunName = Annotated[
     str,
     Path(

@@ -25,6 +25,7 @@ from runner.errors import (
     RunNotFound,
     StorageError,
 )
+from runner.service.queue import NoSuchJob, NotPossibleNow, QueueFull
 
 LOG: Final = logging.getLogger("dualtaxi.service")
 
@@ -33,6 +34,9 @@ _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
     Diverged: HTTPStatus.CONFLICT,
     EnvironmentNotUsable: HTTPStatus.UNPROCESSABLE_ENTITY,
     MissingExtra: HTTPStatus.NOT_IMPLEMENTED,
+    NoSuchJob: HTTPStatus.NOT_FOUND,
+    NotPossibleNow: HTTPStatus.CONFLICT,
+    QueueFull: HTTPStatus.TOO_MANY_REQUESTS,
     RecordingError: HTTPStatus.CONFLICT,
     RunNotFound: HTTPStatus.NOT_FOUND,
     StorageError: HTTPStatus.INSUFFICIENT_STORAGE,

@@ -39,6 +39,8 @@ class Limits:
     failures: int = 10
     """Wrong tokens from one address in `failure_seconds`, before it must wait so long."""
     failure_seconds: float = 60.0
+    jobs: int = 1000
+    """That are not over."""
     page_runs: int = 1000
     """Runs in one answer."""
     page_records: int = 100_000

@@ -40,6 +40,19 @@ def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
     return _sweep(document, name, file.stem, file.parent)
 
 
+def from_text(text: str, source: str) -> Sweep:
+    """Return the sweep that the text of a file describes, which cannot name another file as its base.
+
+    Args:
+        text: what stands in the file.
+        source: the file's name, for messages; without its ending it names the sweep, as for `load_sweep`.
+
+    Raises:
+        ConfigError: as for `load_sweep`.
+    """
+    return _sweep(read_yaml(text, source), None, Path(source).stem, None)
+
+
 def from_values(values: Mapping[str, Any]) -> Sweep:
     """Return the sweep that plain values describe, as `Sweep.to_mapping` gives them.
 
@@ -63,7 +76,7 @@ def _schema() -> Schema:
     return without_references(SweepFile.model_json_schema())
 
 
-def _sweep(document: Document, name: str | None, stem: str, beside: Path) -> Sweep:
+def _sweep(document: Document, name: str | None, stem: str, beside: Path | None) -> Sweep:
     if not isinstance(document.value, Mapping):
         problem = Problem(
             (), f"found {found(document.value)}, expected keys and values, such as base and trials"
@@ -87,9 +100,12 @@ def _sweep(document: Document, name: str | None, stem: str, beside: Path) -> Swe
     return Sweep(called, spelled, base)
 
 
-def _base(file: SweepFile, document: Document, name: str, beside: Path) -> ExperimentConfig:
+def _base(file: SweepFile, document: Document, name: str, beside: Path | None) -> ExperimentConfig:
     """Return the base with the sweep's name, seeds and recording put in."""
     if isinstance(file.base, str):
+        if beside is None:
+            message = f"found the path {file.base!r}, expected the configuration itself: no file is beside it"
+            raise refuse([Problem(("base",), message)], document)
         experiment = load(beside / file.base)
         within = Document(experiment.to_mapping())
     else:

@@ -153,7 +153,7 @@ def _tell_interrupted(run: Run, config: ExperimentConfig, begun: int) -> None:
 
 def _announce(config: ExperimentConfig, folder: Path) -> None:
     """Tell what is to come; ask, where someone can answer, when the disk would not hold it."""
-    from runner.cli.estimate import estimate, free_bytes, step_limit
+    from runner.estimate import estimate, free_bytes, step_limit
 
     limit, seeds = step_limit(config), len(config.seeds)
     free = free_bytes(folder)

@@ -5,9 +5,9 @@ from rich.console import Console
 
 from runner.cli import output
 from runner.cli.drawing import Drawing, signs
-from runner.cli.estimate import estimate, step_limit
 from runner.cli.evaluations import evaluation_table, some
 from runner.config import from_mapping
+from runner.estimate import estimate, step_limit
 
 
 @pytest.mark.parametrize(

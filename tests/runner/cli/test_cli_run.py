@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from runner.cli import estimate
+from runner import estimate
 from runner.cli.commands import run as run_command
 from runner.runs import list_runs
 

@@ -1,0 +1,357 @@
+"""The jobs of a recordings folder, done by worker processes beside the server.
+
+    with Jobs(recordings, workers=2) as jobs:
+        job = jobs.submit(text, "quick.yaml")
+        jobs.progress(job.number)
+
+One thread starts the workers and hears what they tell; everything else only asks or notes a wish.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import threading
+import time
+from dataclasses import dataclass, field
+from multiprocessing import connection
+from pathlib import Path
+from typing import Any, Final, Self
+
+from runner.errors import StorageError
+from runner.estimate import free_bytes
+from runner.service.checking import Checked, Checker
+from runner.service.doing import Order, Outcome, work
+from runner.service.queue import Event, Job, NotPossibleNow, Queue, now
+
+GOODBYE_SECONDS: Final = 15.0
+"""How long a worker may take to close its recording before it is ended."""
+HEAR_SECONDS: Final = 0.1
+MOST_DEATHS: Final = 2
+"""A job whose worker died so often without being asked for again has failed."""
+SOURCE: Final = "job.yaml"
+"""What a text is called that came without a name."""
+RESERVE_BYTES: Final = 256 << 20
+"""No job is begun while the disk has less."""
+
+
+@dataclass
+class _Worker:
+    """A process at work on a job."""
+
+    number: int
+    process: Any
+    pipe: Any
+    slots: int = 1
+    """How many processes it may use."""
+    taken: int = 1
+    """How many it has said to use, or to be allowed, last."""
+    outcome: Outcome | None = None
+    stopped: float | None = None
+    """When it was told to stop."""
+    progress: dict[str, Any] = field(default_factory=dict)
+
+    def tell(self, word: str, value: Any = None) -> None:
+        """Tell it something, if it lives."""
+        with contextlib.suppress(OSError):
+            self.pipe.send((word, value))
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How the queue stands."""
+
+    workers: int
+    """How many processes may learn at once."""
+    running: int
+    queued: int
+    free_bytes: int
+    """Of the disk of the recordings."""
+    waiting_for: str
+    """Why no further job is begun, though there is a worker; empty if one would be."""
+
+
+class Jobs:
+    """The jobs of a recordings folder; its methods may be called by any thread.
+
+    Args:
+        recordings: the folder; made if it is missing.
+        workers: how many processes learn at once.
+        most_waiting: how many jobs may be unfinished at once.
+        ray: the address of a cluster of Ray that does the work instead.
+
+    Raises:
+        RunnerError: another process serves the folder, or Ray is not installed.
+        StorageError: the folder cannot be written.
+    """
+
+    def __init__(
+        self, recordings: Path, workers: int, *, most_waiting: int = 1000, ray: str | None = None
+    ) -> None:
+        if ray is not None:
+            from runner.sweep.cluster import require_ray
+
+            require_ray()
+        self.recordings, self.workers, self._ray = recordings.absolute(), workers, ray
+        self.queue = Queue(self.recordings, most_waiting)
+        self._checker = Checker(self.recordings)
+        self._context = multiprocessing.get_context("spawn")
+        self.watchers = 0
+        """How many are being told of events; of the routes that tell them."""
+        self._busy: dict[int, _Worker] = {}
+        self._lock = threading.RLock()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Begin to work: what was running or interrupted when the last server ended comes first."""
+        for job in self.queue.jobs():
+            if job.state in ("running", "interrupted"):
+                self._change(job.number, state="queued")
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Have every worker close its recording; its job is gone on with at the next start."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._checker.__exit__()
+        self.queue.close()
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the server is about to end."""
+        return self._stopping.is_set()
+
+    def check(self, text: str, source: str = SOURCE) -> Checked:
+        """Return what a text means, without queueing it; arguments and errors as for `submit`."""
+        return self._checker.check(text, source)
+
+    def submit(self, text: str, source: str = SOURCE) -> Job:
+        """Check the text of a configuration or a sweep, and queue it.
+
+        Args:
+            text: YAML, as a file has it.
+            source: the file's name, for messages; it names what has no name of its own.
+
+        Raises:
+            ConfigError: it cannot be used; a line for each problem, with line, column and key.
+            QueueFull: there are too many jobs already.
+            StorageError: the disk would not hold its recordings.
+            NotPossibleNow: a sweep of this name is being done.
+        """
+        checked = self.check(text, source)
+        free = free_bytes(self.recordings)
+        if checked.bytes > free:
+            raise StorageError(
+                f"{checked.name}: its recordings need about {checked.bytes / 1e9:,.1f} GB, and "
+                f"{free / 1e9:,.1f} GB are free: free some, or record less (recording.steps, seeds)."
+            )
+        with self._lock:
+            if checked.kind == "sweep":
+                self._sweep_is_free(checked.name)
+            return self.queue.add(checked.kind, checked.name, checked.runs, text, checked.values)
+
+    def cancel(self, number: int) -> Job:
+        """Have a job not be done, or its worker close its recording; what is recorded is kept.
+
+        Raises:
+            NoSuchJob: there is none.
+            NotPossibleNow: it is over.
+        """
+        with self._lock:
+            job = self.queue.job(number)
+            if job.is_over:
+                raise NotPossibleNow(f"job {number} is {job.state} already; there is nothing to cancel.")
+            job = self._change(number, state="cancelled", ended=now())
+            if number in self._busy:
+                self._tell_to_stop(self._busy[number])
+            return job
+
+    def resume(self, number: int, accept_changes: bool = False) -> Job:
+        """Queue a job again that failed or was cancelled: it goes on where it was.
+
+        Args:
+            number: which.
+            accept_changes: go on with runs that other code began.
+
+        Raises:
+            NoSuchJob: there is none.
+            NotPossibleNow: it is finished, or not over yet.
+        """
+        with self._lock:
+            job = self.queue.job(number)
+            if job.state not in ("failed", "cancelled"):
+                hint = "there is nothing to do" if job.state == "finished" else "let it"
+                raise NotPossibleNow(f"job {number} is {job.state}; {hint}.")
+            if job.kind == "sweep":
+                self._sweep_is_free(job.name)
+            asked = {"accept_changes": accept_changes, "retry": True}
+            return self._change(number, state="queued", error="", ended="", deaths=0, **asked)
+
+    def progress(self, number: int) -> dict[str, Any] | None:
+        """Return how far a job is that is running, as its worker last said; None if it has said nothing."""
+        with self._lock:
+            worker = self._busy.get(number)
+            return worker.progress or None if worker else None
+
+    def events(self, number: int, place: int = 0) -> tuple[list[Event], int]:
+        """Return a job's events from a place on; see `Queue.events`."""
+        return self.queue.events(number, place)
+
+    def standing(self) -> Standing:
+        """Return how the queue stands."""
+        with self._lock:
+            states = [job.state for job in self.queue.jobs()]
+            return Standing(
+                self.workers,
+                states.count("running"),
+                states.count("queued"),
+                free_bytes(self.recordings),
+                self._short_of_disk(),
+            )
+
+    def _change(self, number: int, **facts: Any) -> Job:
+        """Change a job; a disk that is full does not stop the others."""
+        with contextlib.suppress(StorageError):
+            return self.queue.change(number, **facts)
+        return self.queue.job(number)
+
+    def _sweep_is_free(self, name: str) -> None:
+        for job in self.queue.jobs():
+            if job.kind == "sweep" and job.name == name and not job.is_over:
+                raise NotPossibleNow(f"job {job.number} does the sweep {name!r} already.")
+
+    def _run(self) -> None:
+        """Start workers and hear them, until the server stops."""
+        while not self._stopping.is_set():
+            with self._lock:
+                self._begin()
+                self._share()
+            self._hear()
+        with self._lock:
+            for worker in self._busy.values():
+                self._tell_to_stop(worker)
+        while self._busy:
+            self._hear()
+
+    def _begin(self) -> None:
+        """Start a worker for the first job that waits, if there is a slot."""
+        waiting = next((job for job in self.queue.jobs() if job.state == "queued"), None)
+        taken = sum(max(worker.slots, worker.taken) for worker in self._busy.values())
+        if waiting is None or taken >= self.workers or waiting.number in self._busy or self._short_of_disk():
+            return
+        order = Order(
+            waiting.number,
+            waiting.kind,
+            waiting.name,
+            self.queue.folder_of(waiting.number),
+            self.recordings,
+            waiting.accept_changes,
+            waiting.retry,
+            self._ray,
+        )
+        ours, theirs = self._context.Pipe()
+        # No daemon, as those of a sweep have workers of their own.
+        process = self._context.Process(target=work, args=(theirs, order), name=f"job-{order.number}")
+        process.start()
+        theirs.close()
+        self._busy[order.number] = _Worker(order.number, process, ours)
+        self._change(order.number, state="running", started=waiting.started or now())
+
+    def _share(self) -> None:
+        """Give the slots that nobody waits for to the first sweep, and take them back when somebody does."""
+        jobs = {job.number: job for job in self.queue.jobs()}
+        waiting = any(job.state == "queued" for job in jobs.values()) and not self._short_of_disk()
+        spare = max(0, self.workers - len(self._busy) - waiting)
+        for number in sorted(self._busy):
+            worker = self._busy[number]
+            slots = 1 + (spare if jobs[number].kind == "sweep" else 0)
+            if jobs[number].kind == "sweep":
+                spare = 0
+            if slots != worker.slots:
+                worker.slots = slots
+                worker.tell("slots", slots)
+
+    def _short_of_disk(self) -> str:
+        free = free_bytes(self.recordings)
+        if free >= RESERVE_BYTES:
+            return ""
+        return (
+            f"disk: {free / 1e6:,.0f} MB are free, and a job is begun when {RESERVE_BYTES / 1e6:,.0f} MB are"
+        )
+
+    def _hear(self) -> None:
+        """Take in what workers tell, and see to those that are gone or do not go."""
+        by_pipe = {worker.pipe: worker for worker in self._busy.values()}
+        if not by_pipe:
+            self._stopping.wait(HEAR_SECONDS)
+            return
+        for pipe in connection.wait(list(by_pipe), HEAR_SECONDS):
+            worker = by_pipe[pipe]
+            try:
+                word, value = worker.pipe.recv()
+            except (EOFError, OSError):
+                self._part(worker)
+            else:
+                with self._lock:
+                    self._take(worker, word, value)
+        for worker in by_pipe.values():
+            if worker.stopped is not None and time.monotonic() - worker.stopped > GOODBYE_SECONDS:
+                worker.process.kill()
+
+    def _take(self, worker: _Worker, word: str, value: Any) -> None:
+        if word == "over":
+            worker.outcome = value
+            self._settle(self.queue.job(worker.number), worker)
+        elif word == "progress":
+            worker.progress = value
+        elif word == "slots":
+            worker.taken = value
+        else:
+            self.queue.note(worker.number, word, value | {"time": now()})
+
+    def _part(self, worker: _Worker) -> None:
+        """Take leave of a worker whose process has ended, or is about to."""
+        worker.pipe.close()
+        worker.process.join(GOODBYE_SECONDS)
+        if worker.process.is_alive():
+            worker.process.kill()
+            worker.process.join()
+        with self._lock:
+            del self._busy[worker.number]
+            if worker.outcome is None:
+                self._count_death(self.queue.job(worker.number), worker)
+
+    def _settle(self, job: Job, worker: _Worker) -> None:
+        """Write down what came of a job; one that was cancelled, and perhaps queued again, stays so."""
+        outcome = worker.outcome
+        if outcome is None or job.state != "running":
+            return
+        if outcome.state == "interrupted":
+            self._change(job.number, state="interrupted" if self.stopping else "queued")
+        else:
+            self._change(job.number, state=outcome.state, error=outcome.error, ended=now())
+
+    def _count_death(self, job: Job, worker: _Worker) -> None:
+        """Queue a job again whose worker died over it, but not for ever."""
+        if job.state != "running":
+            return
+        code, deaths = worker.process.exitcode, job.deaths + 1
+        self.queue.note(job.number, "log", {"text": f"the worker died (exit code {code})", "time": now()})
+        if deaths < MOST_DEATHS:
+            self._change(job.number, state="queued", deaths=deaths)
+        else:
+            error = f"its worker died {deaths} times, at last with exit code {code}; was there enough memory?"
+            self._change(job.number, state="failed", deaths=deaths, error=error, ended=now())
+
+    def _tell_to_stop(self, worker: _Worker) -> None:
+        worker.stopped = worker.stopped or time.monotonic()
+        worker.tell("stop")
