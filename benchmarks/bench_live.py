@@ -19,7 +19,7 @@ def measure(quick: bool) -> list[Figure]:
         run_config("quick")  # compiles
         pairs = [
             (run_config(CONFIG, LONGER), run_config(CONFIG, LONGER, options=watched))
-            for _ in range(2 if quick else 5)
+            for _ in range(3 if quick else 5)
         ]
     return [
         figure(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import os
 import queue
 import signal
 import time
@@ -28,6 +29,9 @@ TOGETHER_SECONDS: Final = 0.5
 """What comes within this time is sent together."""
 END_SECONDS: Final = 10.0
 """How long the end of a run may wait for the viewer to take what is left."""
+
+LAST: Final = 19
+"""Niceness of the process that sends: training goes first."""
 
 
 class Piece(NamedTuple):
@@ -113,6 +117,8 @@ class LiveView:
 def _send_all(pieces: Any, said: Connection, title: str, run_id: str, url: str) -> None:
     """Send pieces until there are no more; say what went wrong: the run goes on without."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the run, and thereby this
+    if hasattr(os, "nice"):
+        os.nice(LAST)
     try:
         from runner.export.rerun.live_stream import LiveStream
 
