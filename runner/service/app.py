@@ -14,6 +14,7 @@ from fastapi import APIRouter, FastAPI
 
 from runner import __version__
 from runner.errors import RunnerError
+from runner.service import pages
 from runner.service.api import jobs, runs
 from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
@@ -55,8 +56,10 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.stopping = asyncio.Event()
     app.add_middleware(Guard, settings=settings)
     answer_errors(app)
+    pages.answer_errors(app)
     app.include_router(_api(), prefix=API)
     app.include_router(_health())
+    app.include_router(pages.router)
     return app
 
 

@@ -1,0 +1,14 @@
+"""The pages: rendered on the server, over the same functions as the API and the commands."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter
+
+from runner.service.pages import runs, static
+from runner.service.pages.problems import answer_errors
+
+__all__ = ["answer_errors", "router"]
+
+router = APIRouter(include_in_schema=False)
+for _part in (runs, static):
+    router.include_router(_part.router)

@@ -1,0 +1,36 @@
+"""Errors as pages, for whoever asked for a page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Awaitable, Callable
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request, Response
+
+from runner.service.pages.rendering import page
+
+Handler = Callable[[Request, Exception], Awaitable[Response]]
+
+
+def answer_errors(app: FastAPI) -> None:
+    """Have errors outside of the API answered by a page that says the same."""
+    for kind, handler in list(app.exception_handlers.items()):
+        app.add_exception_handler(kind, _as_page(handler))
+
+
+def _as_page(handler: Any) -> Handler:
+    async def answer(request: Request, error: Exception) -> Response:
+        response: Response = await handler(request, error)
+        if "text/html" not in request.headers.get("accept", "") or request.url.path.startswith("/api/"):
+            return response
+        status = HTTPStatus(response.status_code)
+        message = json.loads(bytes(response.body))["error"]["message"]
+        found = page(request, "problem.html", status, title=status.phrase.capitalize(), message=message)
+        found.headers.update(
+            {key: value for key, value in response.headers.items() if not key.startswith("content-")}
+        )
+        return found
+
+    return answer

@@ -1,0 +1,86 @@
+"""Templates to answers: what every page has, numbers in words, and errors as pages."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from http import HTTPStatus
+from importlib.resources import files
+from typing import Any, Final
+from urllib.parse import urlencode
+
+import jinja2
+from fastapi import Request, Response
+
+from runner import amounts
+from runner.export.report import TEMPLATES as REPORT
+from runner.service.pages import static
+
+TEMPLATES: Final = files("runner.service.pages") / "templates"
+SECTIONS: Final = (
+    ("/runs", "Runs"),
+    ("/sweeps", "Sweeps"),
+    ("/queue", "Queue"),
+    ("/submit", "Submit"),
+    ("/disk", "Disk"),
+)
+
+
+@functools.cache
+def templates() -> jinja2.Environment:
+    """Return the templates of pages; those of reports are beside them."""
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_source),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters |= {
+        "number": amounts.number,
+        "size": amounts.size,
+        "duration": amounts.duration,
+        "age": _age,
+        "count": lambda value: amounts.UNKNOWN if value is None else f"{value:,}",
+        "sentence": lambda text: f"{text[:1].upper()}{text[1:]}{'' if text[-1:] in '.:' else '.'}",
+        "query": lambda values: urlencode(list(values), doseq=True),
+    }
+    environment.globals |= {"static": static.address, "sections": SECTIONS}
+    return environment
+
+
+def page(request: Request, template: str, status: HTTPStatus = HTTPStatus.OK, **context: Any) -> Response:
+    """Return a page.
+
+    Args:
+        request: which it answers.
+        template: its name.
+        status: of the answer.
+        context: what the template asks for.
+    """
+    return Response(render(request.url.path, template, **context), status, media_type="text/html")
+
+
+def render(path: str, template: str, **context: Any) -> bytes:
+    """Return the HTML of a page at a path."""
+    return templates().get_template(template).render(path=path, **context).encode()
+
+
+def link(path: str, values: Mapping[str, Any]) -> str:
+    """Return an address with these values, without those that are empty."""
+    kept = [(key, value) for key, value in values.items() if value not in ("", None, [], ())]
+    return f"{path}?{urlencode(kept, doseq=True)}" if kept else path
+
+
+def _source(name: str) -> str | None:
+    for folder in (TEMPLATES, REPORT):
+        if (folder / name).is_file():
+            return (folder / name).read_text("utf-8")
+    return None
+
+
+def _age(moment: datetime | str) -> str:
+    """Return how long ago a moment was, in words."""
+    then = datetime.fromisoformat(moment) if isinstance(moment, str) else moment
+    return amounts.age((datetime.now(UTC) - then).total_seconds())

@@ -1,0 +1,140 @@
+"""The table of runs: searched, sorted, its columns chosen, a page at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from http import HTTPStatus
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import RedirectResponse
+
+from runner.catalogue.columns import HEADINGS, columns_of, in_words, with_originals
+from runner.catalogue.fields import FIELDS, SETTING, Kind, field_of
+from runner.catalogue.filters import Filter, parse
+from runner.catalogue.index import order_of
+from runner.errors import RunnerError
+from runner.service.dependencies import CatalogueOf, KeptOf
+from runner.service.pages.rendering import link, render
+
+if TYPE_CHECKING:
+    from runner.catalogue.index import Index
+    from runner.service.catalogue import Catalogue
+
+router = APIRouter(include_in_schema=False)
+
+USUAL: Final = (
+    "id",
+    "name",
+    "seed",
+    "status",
+    "tag",
+    "episodes",
+    "finish_percent",
+    "mean_length",
+    "bytes",
+    "age",
+)
+ROWS: Final = 50
+_LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
+_FALLING: Final = (Kind.NUMBER, Kind.SIZE, Kind.DATE)
+"""Of these the largest come first when a heading is clicked."""
+
+
+@router.get("/")
+def home() -> Response:
+    """Lead to the runs."""
+    return RedirectResponse("/runs", HTTPStatus.FOUND)
+
+
+@router.get("/runs")
+async def runs(
+    request: Request,
+    catalogue: CatalogueOf,
+    kept: KeptOf,
+    filter: Annotated[str, Query(max_length=10_000)] = "",  # noqa: A002
+    sort: Annotated[str, Query(max_length=1000)] = "",
+    columns: Annotated[list[str] | None, Query(max_length=100)] = None,
+    page: Annotated[int, Query(ge=1, lt=10**8)] = 1,
+) -> Response:
+    """Show the runs that fit a filter."""
+    status = HTTPStatus.OK
+
+    def make() -> bytes:
+        return _page(catalogue, filter, sort, ",".join(columns or ()), page)
+
+    try:
+        body = await kept.answer(("runs page", catalogue.version(), request.url.query), make)
+    except RunnerError as error:
+        status = HTTPStatus.BAD_REQUEST
+        told = _frame(filter, "", USUAL) | {"problem": str(error), "rows": [], "total": None}
+        body = render("/runs", "runs.html", **told)
+    return Response(body, status, media_type="text/html")
+
+
+def _page(catalogue: Catalogue, text: str, sort: str, columns: str, number: int) -> bytes:
+    chosen, order = parse(text), order_of(sort)
+    shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
+
+    def work(index: Index) -> tuple[list[dict[str, Any]], int, int]:
+        found = index.select(chosen, *order, limit=ROWS, offset=(number - 1) * ROWS)
+        total = index.count(chosen)
+        return with_originals(found, index), total, index.count(Filter(None)) if text else total
+
+    rows, total, everything = catalogue.read(work)
+    asked = {"filter": text, "sort": sort, "columns": [] if shown == list(USUAL) else [",".join(shown)]}
+    return render(
+        "/runs",
+        "runs.html",
+        **_frame(text, sort, shown),
+        problem="",
+        total=total,
+        everything=everything,
+        heads=[_head(column, asked) for column in shown],
+        rows=[{"id": row["id"], "cells": [_cell(row, column) for column in shown]} for row in rows],
+        page=number,
+        pages=math.ceil(total / ROWS),
+        turned=lambda to: link("/runs", asked | {"page": to if to > 1 else ""}),
+    )
+
+
+def _frame(text: str, sort: str, shown: Sequence[str]) -> dict[str, Any]:
+    """Return what stands around the rows."""
+    return {
+        "filter": text,
+        "sort": sort,
+        "columns": shown,
+        "settings": [column for column in shown if column.startswith(SETTING)],
+        "fields": [(field.name, field.meaning) for field in FIELDS.values()],
+        "headings": HEADINGS,
+    }
+
+
+def _head(column: str, asked: dict[str, Any]) -> dict[str, Any]:
+    """Return a heading: what a click on it sorts by, and whether the rows are sorted by it now."""
+    setting = column.startswith(SETTING)
+    known = setting or column in FIELDS
+    kind = Kind.NUMBER if setting or not known else field_of(column).kind
+    now = asked["sort"]
+    first = f"-{column}" if kind in _FALLING and not setting else column
+    other = column if first.startswith("-") else f"-{column}"
+    return {
+        "heading": HEADINGS.get(column, column).replace("_", " "),
+        "meaning": "" if setting or not known else field_of(column).meaning,
+        "left": not setting and kind in _LEFT,
+        "sorted": {column: "ascending", f"-{column}": "descending"}.get(now),
+        "href": link("/runs", asked | {"sort": other if now == first else first}) if known else "",
+    }
+
+
+def _cell(row: dict[str, Any], column: str) -> dict[str, Any]:
+    left = column in FIELDS and field_of(column).kind in _LEFT
+    kind = "text" if left else ""
+    href = f"/runs/{row['id']}" if column in ("id", "name") else ""
+    if column == "same_as" and row["same_as"]:
+        href = f"/runs/{row['same_as']}"
+    text = in_words(row, column)
+    if column == "digest":
+        text = text[:16]
+    return {"text": text, "kind": kind, "href": href, "status": column == "status"}

@@ -1,0 +1,34 @@
+// The table of runs: choosing some to compare, and keys to move in it.
+const form = document.querySelector("[data-rows]");
+const search = document.querySelector("[data-focus]");
+
+function chosen() { return form.querySelectorAll("input[name=run]:checked").length; }
+
+function tell() {
+  const button = form.querySelector("[data-compare]"), count = chosen();
+  button.disabled = count < 2;
+  button.textContent = count < 2 ? "Select two or more runs to compare" : `Compare ${count} runs`;
+}
+
+function step(by) {
+  const links = [...form.querySelectorAll("tbody tr")].map((row) => row.querySelector("a"));
+  const at = links.findIndex((link) => link.closest("tr").contains(document.activeElement));
+  links[Math.min(links.length - 1, Math.max(0, at + by))].focus();
+}
+
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input:not([type=checkbox]), textarea, select")) return;
+  if (event.key === "/") { event.preventDefault(); search.focus(); }
+  if (!form) return;
+  if (event.key === "j") step(1);
+  if (event.key === "k") step(-1);
+  if (event.key === "x") {
+    const box = document.activeElement.closest("tr")?.querySelector("input[name=run]");
+    if (box) { box.checked = !box.checked; tell(); }
+  }
+});
+if (form) {
+  form.addEventListener("change", tell);
+  addEventListener("pageshow", tell);
+  tell();
+}
