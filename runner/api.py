@@ -12,7 +12,7 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -73,9 +73,24 @@ def run_all(
     name: str | None = None,
     recordings: str | os.PathLike[str] | None = None,
     report: Callable[[Progress], None] = lambda _: None,
+    at_once: int = 1,
 ) -> Iterator[Run]:
-    """Yield the runs of an experiment as they finish, one a seed; arguments and errors as for `run`."""
-    return _run_jobs(experiment_of(config, overrides), name, recordings, report)
+    """Yield the runs of an experiment in the order of its seeds; arguments and errors as for `run`.
+
+    Args:
+        config: as for `run`; it may have several seeds.
+        overrides: as for `run`.
+        name: as for `run`.
+        recordings: as for `run`.
+        report: as for `run`; with several at once it is called from their threads.
+        at_once: how many runs learn side by side, each on a thread. What they record is the same.
+    """
+    if at_once < 1:
+        raise ConfigError(f"at_once: found {at_once}, expected 1 or more.")
+    experiment = experiment_of(config, overrides)
+    if at_once == 1:
+        return _run_jobs(experiment, name, recordings, report)
+    return _run_abreast(experiment, name, recordings, report, at_once)
 
 
 def experiment_of(config: Config, overrides: Sequence[str] = (), seed: int | None = None) -> ExperimentConfig:
@@ -103,6 +118,48 @@ def jobs_in(config: ExperimentConfig, recordings: Path) -> Iterator[Job]:
 
         config = settled(config, recordings)
     return jobs_of(config)
+
+
+def abreast(
+    jobs: Iterable[Job],
+    folder: Path,
+    name: str | None,
+    at_once: int,
+    stop: Callable[[], bool],
+    report: Callable[[Progress], None] = lambda _: None,
+) -> Iterator[Run]:
+    """Yield the runs of jobs in their order, several learning side by side, each on a thread of its own.
+
+    Learning releases the interpreter's lock, and a run has its own tables and draws: what it records is
+    what it would record alone. Once `stop` says True, runs under way are closed, and no other is begun.
+    """
+    from collections import deque
+    from concurrent.futures import Future, ThreadPoolExecutor
+
+    left = threading.Event()
+
+    def stopped() -> bool:
+        return left.is_set() or stop()
+
+    def do(job: Job) -> Run | None:
+        if stopped():
+            return None
+        from runner.execution import run_job
+
+        run = create_run(folder, job.config, job.seed, name)
+        with unless_empty(run):
+            return run_job(job, run, report, stopped)
+
+    under_way: deque[Future[Run | None]] = deque()
+    with ThreadPoolExecutor(at_once, thread_name_prefix="learner") as threads:
+        try:
+            for job in jobs:
+                under_way.append(threads.submit(do, job))
+                if len(under_way) == 2 * at_once and (run := under_way.popleft().result()):
+                    yield run
+            yield from (run for each in under_way if (run := each.result()))
+        finally:
+            left.set()
 
 
 def checked_name(name: str | None) -> str | None:
@@ -176,6 +233,21 @@ def _run_jobs(
     called, folder = checked_name(name), recordings_folder(recordings)
     for job in jobs_in(config, folder):
         yield _run_job(job, folder, called, report)
+
+
+def _run_abreast(
+    config: ExperimentConfig,
+    name: str | None,
+    recordings: str | os.PathLike[str] | None,
+    report: Callable[[Progress], None],
+    at_once: int,
+) -> Iterator[Run]:
+    called, folder = checked_name(name), recordings_folder(recordings)
+    with interruptible() as interrupt:
+        for run in abreast(jobs_in(config, folder), folder, called, at_once, interrupt, report):
+            if interrupt.came:
+                raise KeyboardInterrupt(f"runs were interrupted; what they recorded is in {folder}")
+            yield run
 
 
 def _run_job(job: Job, folder: Path, name: str | None, report: Callable[[Progress], None]) -> Run:

@@ -79,4 +79,5 @@ def step_limit(config: ExperimentConfig) -> int | None:
 
 def free_bytes(folder: Path) -> int:
     """Return how much the disk of a folder would still take."""
-    return shutil.disk_usage(folder).free
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    return shutil.disk_usage(there).free

@@ -48,8 +48,8 @@ class Learner:
         log = config.log
         self._tally = _tally(self.model, log.window if log else 1, log.episodes if log else 50)
         self._eval_tally = _tally(self.model, 1, 1)
-        self._cursor = np.zeros(1, kernel.CURSOR).view(np.recarray)
-        self._eval_cursor = np.zeros(1, kernel.CURSOR).view(np.recarray)
+        self._cursor = np.zeros(1, kernel.CURSOR)
+        self._eval_cursor = np.zeros(1, kernel.CURSOR)
         self._policy = np.zeros(mdp.states, np.int32)
         self._start = _trial_start(config, mdp)
         self._success = np.array([name in mdp.success_events for name in mdp.event_names], dtype=np.bool_)
@@ -57,12 +57,12 @@ class Learner:
     @property
     def step(self) -> int:
         """Training steps taken."""
-        return int(self._cursor.step[0])
+        return int(self._cursor["step"][0])
 
     @property
     def episode(self) -> int:
         """Training episodes done."""
-        return int(self._cursor.episode[0])
+        return int(self._cursor["episode"][0])
 
     def table(self, i: int) -> NDArray[np.float64]:
         """Return learner i's Q-table as it is now, [S, width]: a view.

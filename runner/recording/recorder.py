@@ -266,7 +266,7 @@ class Recorder:
         """Return a block to fill: a used one that came back, or a new one while there may be more."""
         if lane.made < BLOCKS_UNDER_WAY and lane.free.empty():
             lane.made += 1
-            return _Block(schema.blank_records(lane.topic, lane.sizes, lane.capacity).view(np.recarray))
+            return _Block(schema.blank_records(lane.topic, lane.sizes, lane.capacity))
         block = lane.free.get()
         block.filled = 0
         return block

@@ -46,6 +46,14 @@ LIVE_EPISODES: Final = 200
     metavar="URL",
     help="Of a viewer that runs already, here or elsewhere, instead of a new one.",
 )
+@click.option(
+    "--at-once",
+    type=click.IntRange(1, 1024),
+    default=1,
+    show_default=True,
+    metavar="N",
+    help="So many seeds learn side by side, on a thread each.",
+)
 @recordings_option
 @json_option
 @click.pass_context
@@ -58,13 +66,15 @@ def command(
     live: bool,
     live_every: int | None,
     live_url: str | None,
+    at_once: int,
     recordings: Path | None,
     as_json: bool,
 ) -> None:
     """Train, evaluate and record the experiment in the file CONFIG.
 
     Every step goes into a recording of its own folder. Several seeds make one run each, one after the
-    other. Ctrl-C ends a run properly: what it recorded is kept; a second Ctrl-C kills it.
+    other, or --at-once; what a run records is the same. Ctrl-C ends a run properly: what it recorded is
+    kept; a second Ctrl-C kills it.
 
     Steps and disk are estimated first. The estimate takes it that evaluation trials and the first 500
     training episodes last half the step limit, and later ones a tenth; "at most" is all of the limit.
@@ -78,6 +88,7 @@ def command(
       dualtaxi run configs/quick.yaml
       dualtaxi run configs/cooperative.yaml --seed 7 --set discount=0.9 --name patient
       dualtaxi run configs/quick.yaml --set 'seeds={count: 3}' --json
+      dualtaxi run configs/quick.yaml --set 'seeds={count: 100}' --set recording.steps=none --at-once 2
       dualtaxi run configs/cooperative.yaml --live --live-every 100
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import checked_name, experiment_of, jobs_in
@@ -85,17 +96,56 @@ def command(
 
     experiment = experiment_of(config, overrides, seed)
     called, folder = checked_name(name), recordings_folder(recordings)
+    if at_once > 1:
+        if live or live_every or live_url:
+            raise click.UsageError("--live shows one run at a time: leave out --at-once.")
+        _run_abreast(ctx, experiment, folder, called, at_once, as_json)
+        return
     watch = _watcher(experiment, live, live_every, live_url)
     for number, job in enumerate(jobs_in(experiment, folder)):
         run, interrupted = _run_one(job, folder, called, number, watch)
-        if as_json:
-            print_json(_as_json(run), indent=None)
-        else:
-            _summarise(run, blank=number > 0)
-        sys.stdout.flush()
+        _tell(run, number, as_json)
         if interrupted:
             _tell_interrupted(run, experiment, begun=number + 1)
             ctx.exit(INTERRUPTED)
+
+
+def _tell(run: Run, number: int, as_json: bool) -> None:
+    if as_json:
+        print_json(_as_json(run), indent=None)
+    else:
+        _summarise(run, blank=number > 0)
+    sys.stdout.flush()
+
+
+def _run_abreast(
+    ctx: click.Context, config: ExperimentConfig, folder: Path, name: str | None, at_once: int, as_json: bool
+) -> None:
+    """Run an experiment's seeds side by side, and tell of each run."""
+    from runner.api import abreast, interruptible, jobs_in
+    from runner.cli.progress import counting
+    from runner.learning.compilation import announced
+    from runner.mdp import load_mdp
+
+    load_mdp(config.env.id, config.env.kwargs, config.rewards)  # refused before all else
+    _announce(config, folder)
+    runs: list[Run] = []
+    with (
+        interruptible(second=signal.SIG_DFL) as interrupt,
+        announced(lambda: say("Compiling the learning kernel, this once: a few seconds.")),
+        counting("runs", len(config.seeds)) as done,
+    ):
+        for run in abreast(jobs_in(config, folder), folder, name, at_once, interrupt):
+            runs.append(run)
+            done(len(runs))
+            _tell(run, len(runs) - 1, as_json)
+    if interrupt.came:
+        for run in runs:
+            if run.status == "interrupted":
+                say(f"Interrupted: {run.recording}; `dualtaxi resume {run.run_id}` goes on from there.")
+        if left := len(config.seeds) - len(runs):
+            say(f"Not begun: {left} of {len(config.seeds)} seeds, from {config.seeds[len(runs)]} on.")
+        ctx.exit(INTERRUPTED)
 
 
 def _watcher(config: ExperimentConfig, live: bool, every: int | None, url: str | None) -> Watch | None:
@@ -222,13 +272,14 @@ def _summarise(run: Run, blank: bool) -> None:
 def _result(run: Run, evaluated: int | None) -> dict[str, str]:
     """Return what there is to say of a run at its end; `evaluated` is when it was last evaluated."""
     summary = run.summary
-    each = summary["bytes"] / max(summary["train_steps"] + summary["eval_steps"], 1)
+    steps = (summary["train_steps"] + summary["eval_steps"]) * summary["steps_recorded"]
+    each = f", {summary['bytes'] / steps:.0f} bytes a step" if steps else ""
     play = f"--eval {evaluated}:0" if evaluated is not None else "--episode 0"
     return {
         "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
         "steps": f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation, "
         f"in {duration(summary['seconds'])}",
         "digest": summary["content_digest"],
-        "file": f"{run.recording}  {size(summary['bytes'])}, {each:.0f} bytes a step",
+        "file": f"{run.recording}  {size(summary['bytes'])}{each}",
         "next": f"dualtaxi show {run.run_id}\ndualtaxi play {run.run_id} {play}",
     }

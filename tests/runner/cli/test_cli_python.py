@@ -1,12 +1,16 @@
 """The Python side of the same: `runner.run`, `runner.run_all`, and the package's names."""
 
+import os
+import signal
 import subprocess
 import sys
+import threading
 
 import pytest
 import yaml
 
 import runner
+from runner.again import rerecord
 from runner.api import experiment_of
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.runs import list_runs
@@ -78,6 +82,36 @@ def test_several_seeds_are_for_run_all(tiny, tmp_path):
     assert next(runs).seed == 1
     assert len(list_runs(tmp_path / "runs")) == 1
     assert [run.seed for run in runs] == [2]
+
+
+def test_seeds_side_by_side_record_what_each_records_alone(tiny, tmp_path):
+    several = ["seeds=[1, 2, 3, 4, 5]", "recording.steps=none"]
+    abreast = list(runner.run_all(tiny, overrides=several, recordings=tmp_path / "abreast", at_once=3))
+    alone = list(runner.run_all(tiny, overrides=several, recordings=tmp_path / "alone"))
+    digests = [run.summary["content_digest"] for run in alone]
+    assert [run.seed for run in abreast] == [1, 2, 3, 4, 5]
+    assert [run.summary["content_digest"] for run in abreast] == digests
+    assert rerecord(abreast[3]).summary["content_digest"] == digests[3]
+
+
+def test_seeds_side_by_side_that_are_interrupted_or_left_are_closed(tiny, tmp_path):
+    long = ["seeds={count: 50}", "episodes=100000", "recording.steps=none"]
+    runs = runner.run_all(tiny, overrides=long, recordings=tmp_path, at_once=2)
+    threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        next(runs)
+    short = runner.run_all(tiny, overrides=["seeds={count: 50}"], recordings=tmp_path / "left", at_once=2)
+    next(short)
+    short.close()
+    for folder in (tmp_path, tmp_path / "left"):
+        begun = list_runs(folder)
+        assert 0 < len(begun) <= 8
+        assert {run.status for run in begun} <= {"interrupted", "finished"}
+
+
+def test_at_once_is_one_or_more(tiny, tmp_path):
+    with pytest.raises(ConfigError, match="at_once: found 0"):
+        runner.run_all(tiny, recordings=tmp_path, at_once=0)
 
 
 def test_progress_is_reported(tiny, tmp_path):
