@@ -17,9 +17,9 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
-from runner.errors import MissingExtra
+from runner.errors import MissingExtra, RecordingError
 from runner.runs import Run
 
 if TYPE_CHECKING:
@@ -33,6 +33,10 @@ if TYPE_CHECKING:
     Source = Run | Recording | str | os.PathLike[str]
 
 Phase = Literal["train", "eval"]
+
+_BEFORE: Final = ("step", "episode", "t", "state", "action", "next_state", "next_observation")
+_BEHIND: Final = ("terminated", "truncated", "explored", "acted", "agents_terminated", "agents_truncated")
+"""The fields of a step in the order of its columns: those before the rewards, and those behind them."""
 
 
 def evaluations(run: Source) -> pd.DataFrame:
@@ -82,12 +86,7 @@ def episodes(
         RecordingError: the recording cannot be read.
     """
     with _opened(run) as recording:
-        records = recording.episodes(phase, start, stop)
-        columns = _plain_columns(records, ("episode", "length", "penalties", "success"))
-        columns |= _plain_columns(records, ("terminated", "truncated", "last_step"))
-        columns |= _by_name(records["returns"], [f"return.{agent}" for agent in agents_of(recording)])
-        columns |= _by_name(records["events"], event_names_of(recording))
-    return _frame(columns)
+        return _frame(episode_columns(recording, phase, start, stop))
 
 
 def steps(
@@ -107,21 +106,8 @@ def steps(
         MissingExtra: pandas is not installed.
         RecordingError: the recording cannot be read, or has no such episode.
     """
-    import numpy as np
-
-    from runner.recording import schema
-
     with _opened(run) as recording:
-        if episode is None:
-            topic = schema.TRAIN_STEP if phase == "train" else schema.EVAL_STEP
-            blocks = [block.copy() for block in recording.blocks(topic, start, stop)]
-            records = np.concatenate(blocks) if blocks else np.empty(0, recording.dtypes[topic])
-        else:
-            records = recording.episode_steps(phase, episode)
-        columns = _plain_columns(records, ("step", "episode", "t", "state", "action", "next_state"))
-        columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in agents_of(recording)])
-        columns |= _plain_columns(records, ("terminated", "truncated", "explored"))
-    return _frame(columns)
+        return _frame(step_columns(recording, phase, episode=episode, start=start, stop=stop))
 
 
 def transition_table(
@@ -161,6 +147,56 @@ def transition_columns(mdp: Mdp) -> dict[str, NDArray[Any]]:
     shared = mdp.rewards.shape[-1] == 1
     own = {} if shared else _by_name(mdp.rewards[at], [f"reward.{agent}" for agent in mdp.agents])
     return columns | own
+
+
+# --- columns ------------------------------------------------------------------------------------------
+
+
+def episode_columns(
+    recording: Recording, phase: Phase = "train", start: int = 0, stop: int | None = None
+) -> dict[str, NDArray[Any]]:
+    """Return the columns of `episodes`, an array each.
+
+    Raises:
+        RecordingError: the recording cannot be read.
+    """
+    records = recording.episodes(phase, start, stop)
+    columns = _plain_columns(records, ("episode", "length", "penalties", "success"))
+    columns |= _plain_columns(records, ("terminated", "truncated", "last_step"))
+    columns |= _by_name(records["returns"], [f"return.{agent}" for agent in agents_of(recording)])
+    return columns | _by_name(records["events"], event_names_of(recording))
+
+
+def step_columns(
+    recording: Recording,
+    phase: Phase = "train",
+    *,
+    episode: int | None = None,
+    start: int = 0,
+    stop: int | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Return the columns of `steps`, an array each.
+
+    Raises:
+        RecordingError: the recording cannot be read, or has no such episode.
+    """
+    import numpy as np
+
+    topic = recording.topic(f"/{phase}/step")
+    if topic not in recording.dtypes:
+        raise RecordingError(
+            f"{recording.path}: its observations vary in size, so its steps are no columns; "
+            "`Recording.transitions` reads them one by one."
+        )
+    if episode is None:
+        blocks = [block.copy() for block in recording.blocks(topic, start, stop)]
+        records = np.concatenate(blocks) if blocks else np.empty(0, recording.dtypes[topic])
+    else:
+        records = recording.episode_steps(phase, episode)
+    names = records.dtype.names or ()
+    columns = _plain_columns(records, [name for name in _BEFORE if name in names])
+    columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in agents_of(recording)])
+    return columns | _plain_columns(records, [name for name in _BEHIND if name in names])
 
 
 # --- plain records ------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ ORDER = """
     owning
     catalogue
     frames packing
+    description
     analysis
     archive
     origin

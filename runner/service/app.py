@@ -15,7 +15,8 @@ from fastapi import APIRouter, FastAPI
 from runner import __version__
 from runner.errors import RunnerError
 from runner.service import pages
-from runner.service.api import jobs, runs
+from runner.service.apart import Apart
+from runner.service.api import comparing, files, jobs, reading, runs
 from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
 from runner.service.kept import Kept
@@ -27,6 +28,8 @@ from runner.service.work import Jobs
 API: Final = "/api/v1"
 THREADS: Final = 8
 """Requests that are worked on at the same time; the others wait."""
+PROCESSES: Final = 2
+"""Comparisons, pictures and exports that are made at the same time, each in a process of its own."""
 LOG: Final = logging.getLogger("dualtaxi.service")
 
 
@@ -53,6 +56,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.settings = settings
     app.state.catalogue = Catalogue(settings.recordings, LOG.warning)
     app.state.kept = Kept(settings.limits.cache_bytes)
+    app.state.apart = Apart(PROCESSES, settings.limits.work_seconds)
     app.state.stopping = asyncio.Event()
     app.add_middleware(Guard, settings=settings)
     answer_errors(app)
@@ -75,8 +79,8 @@ def _api() -> APIRouter:
         HTTPStatus.INSUFFICIENT_STORAGE,
     )
     api = APIRouter(responses=general)
-    api.include_router(runs.router)
-    api.include_router(jobs.router)
+    for part in (runs, reading, comparing, files, jobs):
+        api.include_router(part.router)
     return api
 
 
@@ -101,5 +105,6 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
         app.state.jobs = stack.enter_context(
             Jobs(settings.recordings[0], settings.workers, most_waiting=settings.limits.jobs)
         )
+        app.state.apart.prepare()
         yield {}
         app.state.stopping.set()

@@ -71,17 +71,25 @@ class Catalogue:
         Raises:
             RunNotFound: no run answers to the name, or several do.
         """
-        if "/" in name or "\\" in name or name.endswith(".mcap"):
-            raise RunNotFound(f"no run {name!r}: expected an id, the beginning of one, a name or @latest.")
+        _refuse_path(name)
         for root in self.roots:
             known = run_at_once(name, root)
             if known is not None:
                 return known
-        candidates = self.read(lambda index: [Candidate(*facts) for facts in index.names()])
-        found = the_one(name, candidates, self.roots[0])
-        for run in runs_in(Path(found.root, found.entry)):
-            return run
-        raise RunNotFound(f"run {found.run_id} was removed just now.")
+        return _read(the_one(name, self._candidates(), self.roots[0]))
+
+    def find_all(self, name: str) -> list[Run]:
+        """Return all runs of a name, the oldest first; else the one that answers to it.
+
+        Raises:
+            RunNotFound: none does, or it is the beginning of several ids.
+        """
+        _refuse_path(name)
+        alike = [found for found in self._candidates() if found.name == name]
+        return [_read(found) for found in reversed(alike)] or [self.find(name)]
+
+    def _candidates(self) -> list[Candidate]:
+        return self.read(lambda index: [Candidate(*facts) for facts in index.names()])
 
     def _is_known(self, now: Version) -> bool:
         """Return whether a look not long ago saw to it that the index agrees with the folders."""
@@ -110,3 +118,14 @@ class Catalogue:
         now = version()
         self._file = now.file if now else None
         self._looked, self._took = began, time.monotonic() - began
+
+
+def _refuse_path(name: str) -> None:
+    if "/" in name or "\\" in name or "\0" in name or name.endswith(".mcap"):
+        raise RunNotFound(f"no run {name!r}: expected an id, the beginning of one, a name or @latest.")
+
+
+def _read(found: Candidate) -> Run:
+    for run in runs_in(Path(found.root, found.entry)):
+        return run
+    raise RunNotFound(f"run {found.run_id} was removed just now.")

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated
 
 from fastapi import Depends, Path, Request
 
+from runner.errors import RecordingError
+from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
+from runner.service.apart import Apart
 from runner.service.catalogue import Catalogue
 from runner.service.kept import Kept
 from runner.service.settings import Settings
@@ -37,8 +41,15 @@ def jobs_of(request: Request) -> Jobs:
     return found
 
 
+def apart_of(request: Request) -> Apart:
+    """Return what does work in processes of its own."""
+    found: Apart = request.app.state.apart
+    return found
+
+
 SettingsOf = Annotated[Settings, Depends(settings_of)]
 CatalogueOf = Annotated[Catalogue, Depends(catalogue_of)]
+ApartOf = Annotated[Apart, Depends(apart_of)]
 KeptOf = Annotated[Kept, Depends(kept_of)]
 JobsOf = Annotated[Jobs, Depends(jobs_of)]
 RunName = Annotated[
@@ -61,3 +72,37 @@ def found_run(run: RunName, catalogue: CatalogueOf) -> Run:
 
 
 FoundRun = Annotated[Run, Depends(found_run)]
+
+
+def recorded_run(run: FoundRun) -> Run:
+    """Return the run that the path names, with its recording at hand: restored if it is archived.
+
+    Raises:
+        RecordingError: it has no recording, or its archive is damaged or missing.
+    """
+    from runner.archive.places import at_hand
+
+    found = at_hand(run)
+    if not found.recording.is_file():
+        raise RecordingError(f"run {run.run_id} has no recording: it ended before there was one.")
+    return found
+
+
+def opened_recording(run: Annotated[Run, Depends(recorded_run)]) -> Iterator[Recording]:
+    """Give the recording of the run that the path names, opened.
+
+    Raises:
+        RecordingError: it cannot be read.
+    """
+    with open_recording(run.recording) as recording:
+        yield recording
+
+
+RecordedRun = Annotated[Run, Depends(recorded_run)]
+OpenRecording = Annotated[Recording, Depends(opened_recording)]
+
+
+def state_of(run: Run) -> tuple[str, int, int]:
+    """Return what tells one state of a run's recording from another: its path, size and time."""
+    facts = run.recording.stat()
+    return str(run.recording), facts.st_size, facts.st_mtime_ns

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Awaitable, Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -30,21 +30,28 @@ class Kept:
         self._under_way: dict[Hashable, asyncio.Future[bytes]] = {}
 
     async def answer(self, key: Hashable, make: Callable[[], bytes]) -> bytes:
-        """Return the answer of a key: as kept, as another request is having it made, or made in a thread.
+        """Return the answer of a key, made in a thread if it must be; see `awaited`."""
+        return await self.awaited(key, lambda: run_in_threadpool(make))
+
+    async def awaited(
+        self, key: Hashable, make: Callable[[], Awaitable[bytes]], seconds: float = SECONDS
+    ) -> bytes:
+        """Return the answer of a key: as it is kept, as it is being made for another request, or made now.
 
         Args:
-            key: all that it depends on, with the version of the catalogue.
-            make: does the work.
+            key: all that it depends on, as far as that is known.
+            make: begins the work.
+            seconds: it may be as old as this.
         """
         kept = self._answers.get(key)
-        if kept is not None and time.monotonic() - kept.made < SECONDS:
+        if kept is not None and time.monotonic() - kept.made < seconds:
             self._answers.move_to_end(key)
             return kept.body
-        if key in self._under_way:
-            return await asyncio.shield(self._under_way[key])
-        self._under_way[key] = task = asyncio.ensure_future(run_in_threadpool(make))
-        task.add_done_callback(lambda done: self._done(key, done))
-        return await asyncio.shield(task)
+        if key not in self._under_way:
+            task = asyncio.ensure_future(make())
+            self._under_way[key] = task
+            task.add_done_callback(lambda done: self._done(key, done))
+        return await asyncio.shield(self._under_way[key])
 
     def _done(self, key: Hashable, done: asyncio.Future[Any]) -> None:
         del self._under_way[key]

@@ -79,6 +79,11 @@ def answers(*statuses: HTTPStatus) -> dict[int | str, dict[str, Any]]:
     return {int(status): {"model": ErrorAnswer, "description": status.phrase} for status in statuses}
 
 
+def content(*media: str) -> dict[int | str, dict[str, Any]]:
+    """Return how the media types of a route's answer are documented."""
+    return {200: {"content": {kind: {} for kind in media}}}
+
+
 def status_of(error: RunnerError) -> HTTPStatus:
     """Return the status that an error is answered with."""
     if isinstance(error, Refused):

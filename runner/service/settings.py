@@ -43,8 +43,10 @@ class Limits:
     """That are not over."""
     page_runs: int = 1000
     """Runs in one answer."""
-    page_records: int = 100_000
-    """Records (steps, episodes, measures) in one answer."""
+    page_records: int = 20_000
+    """Steps or episodes in one answer of JSON."""
+    page_arrow: int = 1_000_000
+    """And in one of Arrow."""
     work_seconds: float = 600.0
     """Of a comparison, a picture or an export, which are made in processes of their own."""
     cache_bytes: int = 20 * MB

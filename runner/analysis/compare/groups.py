@@ -49,6 +49,16 @@ def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Gr
     return [Group(label, tuple(runs)) for label, runs in zip(labels, firsts, strict=True)], notes
 
 
+def require_two(groups: Sequence[Group], by: str | None = None) -> None:
+    """Refuse what is nothing to compare.
+
+    Raises:
+        RunnerError: there are not two groups.
+    """
+    if len(groups) < 2:
+        raise RunnerError(_only_one(groups, by))
+
+
 def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tuple[str, str]]:
     """Return the (metric, line) pairs of these names; those of evaluation unless some are chosen.
 
@@ -121,3 +131,15 @@ def _mixed(group: Group) -> list[str]:
     if len(configurations) == 1:
         return []
     return [f"{group.label} has runs of {len(configurations)} configurations"]
+
+
+def _only_one(groups: Sequence[Group], by: str | None) -> str:
+    (group,) = groups
+    if len(group.runs) == 1:
+        return f"found one run, {group.runs[0].run_id}, expected at least two to compare."
+    if by is not None:
+        return f"found {len(group.runs)} runs, all with {group.label}, expected two values at least."
+    return (
+        f"found {len(group.runs)} runs of one configuration, {group.label}, expected two configurations at "
+        "least; `dualtaxi plot` draws their median, `dualtaxi ls` lists what there is."
+    )

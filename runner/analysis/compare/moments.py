@@ -11,6 +11,7 @@ import numpy as np
 
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.series import Group, RunSeries, points_of
+from runner.errors import RunnerError
 
 HIGHER_IS_BETTER: Final = {
     "finish_percent": True,
@@ -48,6 +49,33 @@ class Moment:
             if self.level is not None
             else "",
         }[self.kind]
+
+
+def moment_of(at: str, target: str | None, chosen: Sequence[str]) -> tuple[Moment, Sequence[str]]:
+    """Return the moment asked for, and the metrics: a target names its own.
+
+    Args:
+        at: `last`, `best`, `area`, or a number of training episodes.
+        target: METRIC=LEVEL, instead; or None.
+        chosen: metrics.
+
+    Raises:
+        RunnerError: it is none of these, or both are given.
+    """
+    if target is not None:
+        if at != "last" or chosen:
+            raise RunnerError("target: found at or a metric as well, expected it alone.")
+        metric, _, level = target.partition("=")
+        try:
+            return Moment("crossing", level=float(level)), (metric,)
+        except ValueError:
+            message = f"target: found {target!r}, expected METRIC=LEVEL such as finish_percent=80."
+            raise RunnerError(message) from None
+    if at.isascii() and at.isdecimal():
+        return Moment("episode", number=int(at)), chosen
+    if at not in ("last", "best", "area"):
+        raise RunnerError(f"at: found {at!r}, expected last, best, area, or a number of training episodes.")
+    return Moment(at), chosen
 
 
 def value_of(

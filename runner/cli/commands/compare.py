@@ -11,11 +11,9 @@ import click
 from runner.cli.options import RunName, json_option, recorded, recordings_option
 from runner.cli.output import print_json, say
 from runner.cli.sections import print_sections, require_page
-from runner.errors import RunnerError
 
 if TYPE_CHECKING:
     from runner.analysis.compare import Comparison
-    from runner.analysis.compare.moments import Moment
     from runner.analysis.series import Group, RunSeries
 
 
@@ -77,44 +75,24 @@ def command(
       dualtaxi compare cooperative competitive --html comparison.html
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.compare import compare
-    from runner.analysis.compare.groups import grouped, metrics_of
+    from runner.analysis.compare.groups import grouped, metrics_of, require_two
+    from runner.analysis.compare.moments import moment_of
     from runner.analysis.compare.sections import sections
     from runner.analysis.compare.statistics import require_scipy
 
     require_scipy()
     if html is not None:
         require_page(html, force)
-    moment, chosen = _moment(at, target, chosen)
+    moment, metrics = moment_of(at, target, chosen)
     groups, notes = grouped(_read(run_names, recordings), by)
-    if len(groups) < 2:
-        raise RunnerError(_only_one(groups, by))
-    comparison = compare(groups, metrics_of(groups, chosen), moment, notes)
+    require_two(groups, by)
+    comparison = compare(groups, metrics_of(groups, metrics), moment, notes)
     if html is not None:
         _write_page(html, force, comparison, groups)
     elif as_json:
         print_json(dataclasses.asdict(comparison))
     else:
         print_sections(sections(comparison), as_markdown)
-
-
-def _moment(at: str, target: str | None, chosen: tuple[str, ...]) -> tuple[Moment, tuple[str, ...]]:
-    """Return the moment asked for, and the metrics: a target names its own."""
-    from runner.analysis.compare.moments import Moment
-
-    if target is not None:
-        if at != "last" or chosen:
-            raise RunnerError("--target: found --at or --metric as well, expected it alone.")
-        metric, _, level = target.partition("=")
-        try:
-            return Moment("crossing", level=float(level)), (metric,)
-        except ValueError:
-            message = f"--target: found {target!r}, expected METRIC=LEVEL such as finish_percent=80."
-            raise RunnerError(message) from None
-    if at.isascii() and at.isdecimal():
-        return Moment("episode", number=int(at)), chosen
-    if at not in ("last", "best", "area"):
-        raise RunnerError(f"--at: found {at!r}, expected last, best, area, or a number of training episodes.")
-    return Moment(at), chosen
 
 
 def _read(names: tuple[str, ...], recordings: Path | None) -> list[RunSeries]:
@@ -129,18 +107,6 @@ def _read(names: tuple[str, ...], recordings: Path | None) -> list[RunSeries]:
         with open_recording(run.recording) as recording:
             found.append(read_series(recording))
     return found
-
-
-def _only_one(groups: list[Group], by: str | None) -> str:
-    (group,) = groups
-    if len(group.runs) == 1:
-        return f"found one run, {group.runs[0].run_id}, expected at least two to compare."
-    if by is not None:
-        return f"found {len(group.runs)} runs, all with {group.label}, expected two values at least."
-    return (
-        f"found {len(group.runs)} runs of one configuration, {group.label}, expected two configurations at "
-        "least; `dualtaxi plot` draws their median, `dualtaxi ls` lists what there is."
-    )
 
 
 def _write_page(path: Path, force: bool, comparison: Comparison, groups: list[Group]) -> None:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-import fnmatch
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from runner.cli.options import RunName, find_recorded, json_option, recordings_option
 from runner.cli.output import print_json, size
 from runner.cli.sections import print_sections, require_page
-from runner.errors import RunnerError
 
 if TYPE_CHECKING:
-    from runner.analysis.diff import Change, RunDiff
+    from runner.analysis.diff import RunDiff
     from runner.recording.reader import Recording
 
 
@@ -63,18 +60,20 @@ def command(
       dualtaxi diff first second --html difference.html
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.diff import diff
+    from runner.analysis.diff.asked import as_json as told
+    from runner.analysis.diff.asked import level_of, without
     from runner.recording.reader import open_recording
 
-    levels = dict(_level(target) for target in targets)
+    levels = dict(level_of(target) for target in targets)
     if html is not None:
         require_page(html, force)
     left, right = find_recorded(a, recordings), find_recorded(b, recordings)
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
-        difference = _without(diff(recording_a, recording_b, levels, first), ignore)
+        difference = without(diff(recording_a, recording_b, levels, first), ignore)
         if html is not None:
             _write_page(html, force, difference, recording_a, recording_b)
     if as_json:
-        print_json(_as_json(difference))
+        print_json(told(difference))
     elif html is None:
         _print(difference, everything, as_markdown)
     ctx.exit(0 if difference.same_content else 1)
@@ -86,39 +85,6 @@ def _write_page(path: Path, force: bool, difference: RunDiff, a: Recording, b: R
 
     write_text_new(path, force, render_diff(difference, a, b))
     click.echo(f"{path}: {size(path.stat().st_size)}")
-
-
-def _level(text: str) -> tuple[str, float]:
-    metric, _, level = text.partition("=")
-    try:
-        return metric, float(level)
-    except ValueError:
-        raise RunnerError(
-            f"--target: found {text!r}, expected METRIC=LEVEL such as finish_percent=80."
-        ) from None
-
-
-def _without(difference: RunDiff, ignore: tuple[str, ...]) -> RunDiff:
-    """Return the difference without the paths that are to be ignored."""
-
-    def kept(changes: list[Change]) -> list[Change]:
-        return [c for c in changes if not any(fnmatch.fnmatchcase(c.path, glob) for glob in ignore)]
-
-    return dataclasses.replace(
-        difference,
-        config=kept(difference.config),
-        provenance=kept(difference.provenance),
-        costs=kept(difference.costs),
-    )
-
-
-def _as_json(difference: RunDiff) -> dict[str, Any]:
-    """Return the difference as JSON can hold it; whole step records are left out."""
-    told = dataclasses.asdict(difference)
-    for parting in (told["parting"], *(pair[0] for pair in told["evaluations"])):
-        if parting is not None:
-            del parting["a_step"], parting["b_step"]
-    return told
 
 
 def _print(difference: RunDiff, everything: bool, as_markdown: bool) -> None:

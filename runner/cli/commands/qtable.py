@@ -9,12 +9,10 @@ import click
 
 from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
 from runner.cli.output import UNKNOWN, draw, facts, number, print_json, say, table, title
-from runner.errors import RunnerError, StorageError
+from runner.errors import StorageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from runner.recording.reader import Recording
 
 
 @click.command("qtable")
@@ -57,18 +55,13 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     if step is not None and episode is not None:
         raise click.UsageError("--step and --episode exclude each other: choose one.")
-    from runner.analysis.tables import TableReplay, last_step, step_of_episode
+    from runner.analysis.qtable import at_moment, told_of
     from runner.recording.reader import open_recording
 
     with open_recording(find_recorded(run_name, recordings).recording) as recording:
-        if episode is not None:
-            step = step_of_episode(recording, episode)
-        replay = TableReplay(recording, last_step(recording) if step is None else step)
-        agents, tables = replay.agents, replay.tables
-        told: dict[str, Any] = {"run": recording.run["run_id"], "step": replay.step}
-        told["tables"] = [_summary(agent, values) for agent, values in zip(agents, tables, strict=True)]
-        if state is not None:
-            told |= _state(recording, replay, state)
+        replay = at_moment(recording, step, episode)
+        told = told_of(recording, replay, state)
+        tables = replay.tables
     if out is not None:
         _write(out, tables)
         told["out"] = str(out.absolute())
@@ -78,63 +71,14 @@ def command(
         _draw(told)
 
 
-def _summary(agent: str, values: NDArray[Any]) -> dict[str, Any]:
-    zeros = int(values.size - (values != 0).sum())
-    return {
-        "agent": agent,
-        "states": values.shape[0],
-        "actions": values.shape[1],
-        "zero_cells": zeros,
-        "percent_filled": 100.0 * (values.size - zeros) / values.size,
-        "lowest": float(values.min()),
-        "highest": float(values.max()),
-    }
-
-
-def _state(recording: Recording, replay: Any, state: int) -> dict[str, Any]:
-    """Return the values of a state, their history, and its words."""
-    from runner.analysis.tables import history_of
-    from runner.words import action_names, actions_in_words, states_in_words
-
-    mdp = recording.mdp
-    if state >= mdp.states:
-        raise RunnerError(f"--state: found {state}, expected one of 0 to {mdp.states - 1}.")
-    history = history_of(recording, state, replay.step)
-    joint, own = actions_in_words(mdp), action_names(mdp)
-    values = []
-    for i, (agent, held) in enumerate(zip(replay.agents, replay.held, strict=True)):
-        q = held["q"]
-        names = joint if q.shape[1] == mdp.joint_actions else own[i] if own else range(q.shape[1])
-        for action, name in enumerate(names):
-            changed = int(history.changed_step[i, action])
-            values.append(
-                {
-                    "agent": agent,
-                    "action": action,
-                    "action_in_words": str(name),
-                    "value": float(q[state, action]),
-                    **({"policy": float(held["policy"][state, action])} if "policy" in held else {}),
-                    "greedy": bool(replay.greedy[i, state] == action),
-                    "visits": int(history.visits[i, action]),
-                    "changed_step": None if changed < 0 else changed,
-                    "changed_episode": None if changed < 0 else int(history.changed_episode[i, action]),
-                }
-            )
-    words = str(states_in_words(mdp)[state])
-    return {"state": state, "state_in_words": words, "visits": int(history.visits[0].sum()), "values": values}
-
-
 def _write(path: Path, tables: list[NDArray[Any]]) -> None:
-    """Write the tables as one array; where agents differ in actions, the places left over are nan."""
     import numpy as np
 
-    shape = (len(tables), len(tables[0]), max(values.shape[1] for values in tables))
-    whole = np.full(shape, np.nan)
-    for i, values in enumerate(tables):
-        whole[i, :, : values.shape[1]] = values
+    from runner.analysis.qtable import one_array
+
     try:
         with path.open("wb") as stream:
-            np.save(stream, whole[0] if len(tables) == 1 else whole)
+            np.save(stream, one_array(tables))
     except OSError as error:
         raise StorageError(f"{path}: cannot be written ({error.strerror}).") from error
 

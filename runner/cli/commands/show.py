@@ -14,7 +14,6 @@ from runner.cli.output import UNKNOWN, age, console, draw, duration, facts, prin
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from runner.recording.reader import Recording
     from runner.runs import Run
 
 MOST_CYCLES: Final = 8
@@ -38,93 +37,13 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
       dualtaxi show k3v9m2xq --json
     """  # noqa: D301 - Click wants the backspace itself
     run = find_recorded(run_name, recordings)
-    told = _told(run)
+    from runner.description import described
+
+    told = described(run, say)
     if as_json:
         print_json(told)
     else:
         _draw(run, told)
-
-
-def _told(run: Run) -> dict[str, Any]:
-    """Return all about a run; what `run.json` says where its recording is missing or cannot be read."""
-    from runner.errors import RecordingError
-    from runner.recording.reader import open_recording
-
-    if run.recording.is_file():
-        try:
-            with open_recording(run.recording) as recording:
-                return describe(run, recording)
-        except RecordingError as error:
-            say(f"Only what run.json says: {error}")
-    return _without_recording(run)
-
-
-def describe(run: Run, recording: Recording) -> dict[str, Any]:
-    """Return all about a run as JSON can hold it."""
-    from runner.frames import environment_of, evaluation_records, training_records
-    from runner.recording.schema import EVAL_STEP, TRAIN_EPISODE, TRAIN_STEP
-
-    summary = run.summary
-    return {
-        **_identity(run),
-        "bytes": recording.size,
-        "content_digest": summary.get("content_digest"),
-        "topic_digests": summary.get("topic_digests"),
-        "episodes": summary.get("episodes", recording.count(TRAIN_EPISODE)),
-        "train_steps": summary.get("train_steps", recording.count(TRAIN_STEP)),
-        "eval_steps": summary.get("eval_steps", recording.count(EVAL_STEP)),
-        "seconds": summary.get("seconds"),
-        "config": _config(run, recording),
-        "provenance": recording.provenance,
-        "success_events": environment_of(recording)["success_events"],
-        "tables": _tables(recording),
-        "eval": evaluation_records(recording),
-        "optimality": [_without_times(measures) for measures in recording.optimality()],
-        "train": training_records(recording),
-    }
-
-
-def _config(run: Run, recording: Recording) -> dict[str, Any]:
-    """Return the recording's configuration, in the order of keys in which people read it."""
-    readable: dict[str, Any] = run.facts.get("config", {})
-    return readable if readable == recording.config else recording.config
-
-
-def _identity(run: Run) -> dict[str, Any]:
-    return {
-        "run_id": run.run_id,
-        "name": run.name,
-        "seed": run.seed,
-        "status": run.status,
-        "created": run.facts["created"],
-        "path": str(run.recording.absolute()),
-    }
-
-
-def _without_recording(run: Run) -> dict[str, Any]:
-    """Return what `run.json` alone tells: the run never came to record anything, or its file is gone."""
-    unknown = dict.fromkeys(("content_digest", "train_steps", "eval_steps", "episodes", "seconds"))
-    nothing: dict[str, Any] = {"bytes": 0, "provenance": {}}
-    nothing |= {part: [] for part in ("tables", "eval", "optimality", "train")}
-    told = {key: run.summary.get(key) for key in unknown}
-    return {**_identity(run), **told, **nothing, "config": run.facts.get("config", {})}
-
-
-def _tables(recording: Recording) -> list[dict[str, Any]]:
-    """Return size and fill of each table, as last reported."""
-    from runner.frames import agents_of
-
-    if recording.kind != "job":
-        return []  # what a loop learned is its own
-    reports = [*recording.metrics("train"), *recording.metrics("eval")]
-    last = max(reports, key=lambda report: report["step"], default=None)
-    agents = agents_of(recording)
-    if last is None:
-        return [{"agent": agent} for agent in agents]
-    return [
-        {"agent": agent, "step": last["step"], "zero_cells": zero, "percent_filled": filled}
-        for agent, zero, filled in zip(agents, last["zero_cells"], last["percent_filled"], strict=True)
-    ]
 
 
 def _draw(run: Run, told: dict[str, Any]) -> None:
@@ -162,10 +81,6 @@ def _head(run: Run, told: dict[str, Any]) -> dict[str, str]:
         "digest": told["content_digest"] or f"{UNKNOWN} (told when a run ends properly)",
         "file": f"{run.recording}  {size(told['bytes'])}" if told["bytes"] else "no recording",
     }
-
-
-def _without_times(measures: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in measures.items() if key != "log_time"}
 
 
 def _exactly(run: Run, measures: dict[str, Any]) -> dict[str, str]:

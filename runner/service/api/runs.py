@@ -7,12 +7,19 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
-from runner.catalogue.columns import PROGRAMS, as_json, columns_of, with_originals
+from runner.api import checked_name
+from runner.catalogue.columns import PROGRAMS, columns_of, with_originals
+from runner.catalogue.columns import as_json as row_as_json
 from runner.catalogue.filters import parse
 from runner.catalogue.index import order_of
-from runner.service.dependencies import CatalogueOf, KeptOf, SettingsOf
+from runner.description import described
+from runner.labels import Labels as Said
+from runner.runs import Run, relabel
+from runner.service.catalogue import Catalogue
+from runner.service.computed import as_json
+from runner.service.dependencies import CatalogueOf, FoundRun, KeptOf, SettingsOf
 from runner.service.problems import Refused, answers
 
 if TYPE_CHECKING:
@@ -62,10 +69,105 @@ async def list_runs(
 
         def work(index: Index) -> dict[str, Any]:
             rows = with_originals(index.select(chosen, *order, limit=limit, offset=offset), index)
-            runs = [as_json(row, shown) for row in rows]
+            runs = [row_as_json(row, shown) for row in rows]
             return {"runs": runs, "total": index.count(chosen), "offset": offset, "limit": limit}
 
         return json.dumps(catalogue.read(work), ensure_ascii=False).encode()
 
     key = ("runs", catalogue.version(), request.url.query)
     return Response(await kept.answer(key, make), media_type="application/json")
+
+
+class Labels(BaseModel):
+    """What is to be changed in what people say of a run; what is left out stays."""
+
+    name: Annotated[
+        str | None, Field(max_length=100, description="What it is called; empty: as at first.")
+    ] = None
+    add_tags: Annotated[list[str], Field(max_length=100)] = []
+    remove_tags: Annotated[list[str], Field(max_length=100)] = []
+    note: Annotated[str | None, Field(max_length=10_000, description="Empty: none.")] = None
+
+
+class Labelled(BaseModel):
+    """What people say of a run."""
+
+    run_id: str
+    name: str
+    tags: list[str]
+    note: str
+
+
+class Described(BaseModel, extra="allow"):
+    """All about a run but its series, which have addresses of their own."""
+
+    run_id: str
+    name: str
+    seed: int
+    status: str
+    created: str
+    tags: list[str]
+    note: str
+    config: dict[str, Any]
+    provenance: dict[str, Any]
+    last_evaluation: dict[str, Any] | None
+
+
+@router.get(
+    "/runs/{run}",
+    response_model=Described,
+    responses=answers(HTTPStatus.NOT_FOUND),
+    summary="All about a run.",
+)
+def one_run(run: FoundRun) -> Response:
+    """Return what `dualtaxi show --json` tells, with the last evaluation instead of all series."""
+    return Response(as_json(summary_of(run)), media_type="application/json")
+
+
+def summary_of(run: Run) -> dict[str, Any]:
+    """Return all about a run but its series; what `run.json` says if its recording cannot be read."""
+    problems: list[str] = []
+    told = described(run, problems.append)
+    series = {name: told.pop(name) for name in ("eval", "train", "optimality")}
+    del told["path"]
+    return told | {
+        "tags": list(run.tags),
+        "note": run.note,
+        "last_evaluation": (series["eval"] or [None])[-1],
+        "last_optimality": (series["optimality"] or [None])[-1],
+        "error": run.summary.get("error"),
+        "problems": problems,
+    }
+
+
+@router.patch(
+    "/runs/{run}",
+    response_model=Labelled,
+    responses=answers(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
+    summary="Rename, tag, and note.",
+)
+def label_run(run: FoundRun, labels: Labels, catalogue: CatalogueOf) -> dict[str, Any]:
+    """Change what people say of a run, as `dualtaxi rename`, `tag` and `note` do; return what they say."""
+    return relabelled(run, labels, catalogue)
+
+
+def relabelled(run: Run, labels: Labels, catalogue: Catalogue) -> dict[str, Any]:
+    """Change what people say of a run, and return it.
+
+    Raises:
+        ConfigError: the name cannot be one.
+        RunnerError: a tag cannot be one, or there are too many.
+        StorageError: the run's folder cannot be written.
+    """
+    first = str(run.facts["name"])
+    name = checked_name(labels.name) if labels.name else labels.name
+
+    def change(was: Said) -> Said:
+        called = was.name if name is None else "" if name == first else name
+        tags = (set(was.tags) | set(labels.add_tags)) - set(labels.remove_tags)
+        note = was.note if labels.note is None else labels.note.strip()
+        return Said(called, tuple(sorted(tags)), note)
+
+    said = relabel(run, change)
+    catalogue.changed()
+    return {"run_id": run.run_id, "name": said.name or first, "tags": list(said.tags), "note": said.note}

@@ -24,7 +24,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = yaml.safe_load((ROOT / "configs" / "quick.yaml").read_text(encoding="utf-8"))
     config |= {"episodes": 60, "seeds": 1}
     for seed, name in enumerate(("first", "second")):
-        runner.run(config | {"name": name}, seed=seed, recordings=folder)
+        runner.run(config | {"name": name}, seed=seed, overrides=["evaluation.every=10"], recordings=folder)
     return folder
 
 

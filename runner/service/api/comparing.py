@@ -1,0 +1,92 @@
+"""Runs against each other: what differs between two, and groups of them with statistics."""
+
+from __future__ import annotations
+
+from http import HTTPStatus
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+
+from runner.runs import Run
+from runner.service import computed
+from runner.service.catalogue import Catalogue
+from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, recorded_run, state_of
+from runner.service.problems import answers
+
+router = APIRouter(
+    tags=["comparing"],
+    responses=answers(
+        HTTPStatus.BAD_REQUEST,
+        HTTPStatus.NOT_FOUND,
+        HTTPStatus.CONFLICT,
+        HTTPStatus.SERVICE_UNAVAILABLE,
+        HTTPStatus.NOT_IMPLEMENTED,
+    ),
+)
+MOST_RUNS = 1000
+Name = Annotated[str, Query(max_length=200, description="A run, named as anywhere.")]
+
+
+@router.get("/diff", summary="What differs between two runs, down to the first step at which they part.")
+async def diff(
+    request: Request,
+    catalogue: CatalogueOf,
+    kept: KeptOf,
+    apart: ApartOf,
+    a: Name,
+    b: Name,
+    ignore: Annotated[list[str] | None, Query(max_length=100, description="Paths, with * and ?.")] = None,
+    target: Annotated[list[str] | None, Query(max_length=20, description="METRIC=LEVEL.")] = None,
+    first: Annotated[bool, Query(description="Only settings, and the first step that differs.")] = False,
+) -> dict[str, Any]:
+    """Return what `dualtaxi diff --json` prints."""
+    left, right = await found_runs(catalogue, [a, b])
+    key = ("diff", state_of(left), state_of(right), request.url.query)
+    asked = (left.recording, right.recording, ignore or [], first, target or [])
+    body = await kept.awaited(key, lambda: apart(computed.difference, *asked))
+    return Response(body, media_type="application/json")  # type: ignore[return-value]
+
+
+@router.get("/compare", summary="Groups of runs against each other, with statistics over seeds.")
+async def compare(
+    request: Request,
+    catalogue: CatalogueOf,
+    kept: KeptOf,
+    apart: ApartOf,
+    run: Annotated[
+        list[str], Query(min_length=1, max_length=MOST_RUNS, description="Which; again for each.")
+    ],
+    by: Annotated[str | None, Query(max_length=200, description="Group by this setting.")] = None,
+    metric: Annotated[list[str] | None, Query(max_length=100)] = None,
+    at: Annotated[str, Query(max_length=20, description="`last`, `best`, `area`, or episodes.")] = "last",
+    target: Annotated[str | None, Query(max_length=200, description="METRIC=LEVEL, instead.")] = None,
+) -> dict[str, Any]:
+    """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
+    runs = await found_runs(catalogue, run, several=True)
+    key = ("compare", *map(state_of, runs), request.url.query)
+    asked = ([found.recording for found in runs], by, metric or [], at, target)
+    body = await kept.awaited(key, lambda: apart(computed.comparison, *asked))
+    return Response(body, media_type="application/json")  # type: ignore[return-value]
+
+
+async def found_runs(catalogue: Catalogue, names: list[str], several: bool = False) -> list[Run]:
+    """Return the runs of some names, with their recordings at hand.
+
+    Args:
+        catalogue: knows them.
+        names: of runs.
+        several: whether a name stands for all runs of that name, each once.
+
+    Raises:
+        RunNotFound: one answers to no run, or to several and may not.
+        RecordingError: a run has no recording.
+    """
+    from starlette.concurrency import run_in_threadpool
+
+    def find() -> list[Run]:
+        if several:
+            found = {run.folder: run for name in names for run in catalogue.find_all(name)}
+            return [recorded_run(run) for run in found.values()]
+        return [recorded_run(catalogue.find(name)) for name in names]
+
+    return await run_in_threadpool(find)

@@ -1,0 +1,127 @@
+"""A run's recording itself, and its replay for the Rerun viewer."""
+
+from __future__ import annotations
+
+import re
+from http import HTTPStatus
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Header, Query, Response
+from fastapi.responses import FileResponse
+
+from runner.runs import Run
+from runner.service import computed
+from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
+from runner.service.problems import Refused, answers
+
+router = APIRouter(
+    prefix="/runs/{run}",
+    tags=["files"],
+    responses=answers(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
+)
+MEDIA: Final = "application/octet-stream"
+BLOCK: Final = 1 << 20
+"""Bytes of a file that are read at once."""
+FILE: Final[dict[int | str, dict[str, Any]]] = {
+    200: {"description": "All of it.", "content": {MEDIA: {}}},
+    206: {"description": "The ranges that were asked for.", "content": {MEDIA: {}}},
+    304: {"description": "It is as the client has it."},
+    416: {"description": "There is no such range.", "content": {"text/plain": {}}},
+}
+_RANGES: Final = re.compile(r"\d+:\d*|:\d+|\d+")
+
+IfNoneMatch = Annotated[str | None, Header(max_length=1000)]
+
+
+class _File(FileResponse):
+    chunk_size = BLOCK
+
+
+@router.get("/recording", response_class=Response, responses=FILE, summary="The recording; ranges of it too.")
+@router.head("/recording", response_class=Response, responses=FILE, include_in_schema=False)
+def recording(run: RecordedRun, if_none_match: IfNoneMatch = None) -> Response:
+    """Return the MCAP file. Its ETag holds the content digest, and changes with every byte of the file."""
+    return _file(run.recording, f"{run.name}-{run.run_id}.mcap", tag_of(run), if_none_match)
+
+
+@router.get(
+    "/replay.rrd",
+    response_class=Response,
+    responses=FILE | answers(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED),
+    summary="The run for the Rerun viewer, made on demand.",
+)
+async def replay(
+    run: RecordedRun,
+    kept: KeptOf,
+    apart: ApartOf,
+    episodes: Annotated[
+        str, Query(max_length=1000, description="Training episodes, such as `0:20,49980:`.")
+    ] = "",
+    evaluations: Annotated[
+        list[int] | None,
+        Query(max_length=100, description="The trials of the evaluation after so many training episodes."),
+    ] = None,
+    every: Annotated[int, Query(ge=0, lt=2**31, description="Each so many training episodes.")] = 0,
+    if_none_match: IfNoneMatch = None,
+) -> Response:
+    """Return what `dualtaxi export rerun` writes; kept, so that a second look is there at once.
+
+    Of the steps, unless told otherwise, those of 20 training episodes and of the last evaluation are in it.
+    """
+    path = await replay_of([run], kept, apart, episodes, tuple(evaluations or ()), every)
+    return _file(path, f"{run.name}-{run.run_id}.rrd", path.stem, if_none_match)
+
+
+async def replay_of(
+    runs: list[Run],
+    kept: KeptOf,
+    apart: ApartOf,
+    episodes: str = "",
+    evaluations: tuple[int, ...] = (),
+    every: int = 0,
+) -> Path:
+    """Return the export of some runs; made in a process of its own, once for all who ask meanwhile.
+
+    Raises:
+        Refused: the ranges of episodes are none.
+        RecordingError: a recording has not what is asked for.
+    """
+    from runner.export.rerun.selection import Request
+
+    request = Request(_ranges(episodes), evaluations, every)
+    key = ("replay", *map(state_of, runs), request)
+    return Path((await kept.awaited(key, lambda: _made(apart, runs, request), seconds=0)).decode())
+
+
+async def _made(apart: ApartOf, runs: list[Run], request: Any) -> bytes:
+    return bytes(await apart(computed.replay, runs, request))
+
+
+def tag_of(run: Run) -> str:
+    """Return what tells one state of a recording from any other."""
+    _, size, changed = state_of(run)
+    return f"{run.summary.get('content_digest') or 'unfinished'}-{size:x}-{changed:x}"
+
+
+def _file(path: Path, name: str, tag: str, if_none_match: str | None) -> Response:
+    headers = {"etag": f'"{tag}"', "accept-ranges": "bytes"}
+    known = [part.strip().removeprefix("W/") for part in (if_none_match or "").split(",")]
+    if f'"{tag}"' in known or "*" in known:
+        return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
+    return _File(path, media_type=MEDIA, filename=name, headers=headers)
+
+
+def _ranges(text: str) -> tuple[tuple[int, int | None], ...]:
+    """Return (start, stop) of each range of episodes; a single number is that one, an open end None."""
+    found: list[tuple[int, int | None]] = []
+    for part in filter(None, text.split(",")):
+        if not _RANGES.fullmatch(part) or len(part) > 40:
+            raise Refused(
+                HTTPStatus.UNPROCESSABLE_ENTITY,
+                f"query.episodes: found {part!r}, expected START:STOP or N, such as 0:20,49980:",
+            )
+        start, colon, stop = part.partition(":")
+        first = int(start or 0)
+        found.append((first, (int(stop) if stop else None) if colon else first + 1))
+    return tuple(found)

@@ -1,0 +1,165 @@
+"""What the service tells of a run is what the recording holds and the commands print."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from click.testing import CliRunner
+
+from runner.analysis.qtable import one_array
+from runner.analysis.tables import tables_at
+from runner.cli import cli
+from runner.recording.reader import open_recording
+from runner.runs import find_run
+
+RUN = "/api/v1/runs/first"
+
+
+def _printed(*words, code=0):
+    result = CliRunner().invoke(cli, [*words])
+    assert result.exit_code == code, result.output
+    return json.loads(result.stdout)
+
+
+@pytest.fixture
+def recording(recordings):
+    with open_recording(find_run("first", recordings).recording) as opened:
+        yield opened
+
+
+def test_one_run_is_told_as_show_does(client, recordings):
+    told = client.get(RUN).json()
+    shown = _printed("show", "first", "--json", "--recordings", str(recordings))
+    same = set(shown) - {"eval", "train", "optimality", "path"}
+    assert {key: told[key] for key in same} == {key: shown[key] for key in same}
+    assert told["last_evaluation"] == shown["eval"][-1]
+    assert "path" not in told
+    for part, name in (("eval", "evaluations"), ("train", "training"), ("optimality", "optimality")):
+        answer = client.get(f"{RUN}/{name}").json()
+        assert answer["records"] == shown[part]
+        assert answer["total"] == len(shown[part])
+
+
+@pytest.mark.parametrize("phase", ["train", "eval"])
+def test_steps_and_episodes_are_those_recorded(client, recording, phase):
+    steps = client.get(f"{RUN}/steps/{phase}", params={"start": 10, "stop": 40}).json()
+    (block,) = recording.blocks(recording.topic(f"/{phase}/step"), 10, 40)
+    assert steps["total"] == recording.count(recording.topic(f"/{phase}/step"))
+    assert steps["columns"]["state"] == block["state"].tolist()
+    assert steps["columns"]["reward.agency"] == block["rewards"][:, 0].tolist()
+    one = client.get(f"{RUN}/steps/{phase}", params={"episode": 2}).json()
+    assert one["columns"]["t"] == list(range(len(recording.episode_steps(phase, 2))))
+    episodes = client.get(f"{RUN}/episodes/{phase}", params={"start": 1, "stop": 3}).json()
+    assert episodes["columns"]["length"] == recording.episodes(phase, 1, 3)["length"].tolist()
+
+
+def test_arrow_holds_the_same_columns(client):
+    for table in ("steps", "episodes"):
+        asked = {"start": 5, "stop": 30}
+        listed = client.get(f"{RUN}/{table}/train", params=asked).json()["columns"]
+        body = client.get(f"{RUN}/{table}/train.arrow", params=asked).content
+        assert pa.ipc.open_stream(body).read_all().to_pydict() == listed
+
+
+def test_the_q_table_at_a_step_is_the_exact_one(client, recording, recordings):
+    body = client.get(f"{RUN}/qtable.npy", params={"step": 777}).content
+    np.testing.assert_array_equal(
+        np.load(io.BytesIO(body), allow_pickle=False), one_array(tables_at(recording, 777))
+    )
+    asked = {"step": 777, "state": 17}
+    told = client.get(f"{RUN}/qtable", params=asked).json()
+    words = ("--step", "777", "--state", "17", "--json", "--recordings", str(recordings))
+    assert told == _printed("qtable", "first", *words)
+
+
+def test_a_moment_that_was_not_is_refused(client):
+    assert client.get(f"{RUN}/qtable", params={"step": 10**9}).status_code == 409
+    assert client.get(f"{RUN}/qtable", params={"step": 1, "episode": 1}).status_code == 422
+    assert client.get(f"{RUN}/qtable", params={"step": 1, "state": 10**6}).status_code == 400
+    assert client.get(f"{RUN}/steps/train", params={"episode": 10**6}).status_code == 409
+    assert client.get(f"{RUN}/steps/test").status_code == 422
+
+
+def test_a_range_beyond_the_end_is_empty_and_one_too_long_refused(client):
+    answer = client.get(f"{RUN}/steps/train", params={"start": 10**9, "stop": 10**9 + 5})
+    assert answer.status_code == 200
+    assert answer.json()["columns"]["step"] == []
+    long = client.get(f"{RUN}/steps/train.arrow", params={"start": 0, "stop": 10**9})
+    assert long.status_code == 422
+    assert "in parts" in long.json()["error"]["message"]
+
+
+def test_metrics_are_whole_or_say_that_they_are_thinned(client, recording):
+    curves = client.get(f"{RUN}/metrics").json()["curves"]
+    finish = next(curve for curve in curves if curve["metric"] == "finish_percent")
+    recorded = [record["finish_percent"] for record in recording.metrics("eval")]
+    assert finish["values"] == recorded
+    assert not finish["thinned"]
+    asked = {"points": 2, "metric": "finish_percent"}
+    (thin,) = client.get(f"{RUN}/metrics", params=asked).json()["curves"]
+    assert thin["thinned"]
+    assert thin["of"] == len(recorded)
+    assert {min(recorded), max(recorded)} <= set(thin["values"])
+    (part,) = client.get(
+        f"{RUN}/metrics", params=asked | {"points": 0, "start": finish["episodes"][1]}
+    ).json()["curves"]
+    assert part["values"] == recorded[1:]
+
+
+def test_plots_are_pictures(client):
+    assert client.get(f"{RUN}/plot.svg").content.startswith(b"<?xml")
+    assert client.get(f"{RUN}/plot.png").content.startswith(b"\x89PNG")
+    assert client.get(f"{RUN}/plot.gif").status_code == 422
+
+
+def test_diff_and_compare_are_those_of_the_commands(client, recordings):
+    place = ("--json", "--recordings", str(recordings))
+    diff = client.get("/api/v1/diff", params={"a": "first", "b": "second", "target": "finish_percent=1"})
+    assert diff.json() == _printed("diff", "first", "second", "--target", "finish_percent=1", *place, code=1)
+    asked = {"run": ["first", "second"], "by": "name"}
+    compared = client.get("/api/v1/compare", params=asked).json()
+    assert compared == _printed("compare", "first", "second", "--by", "name", *place)
+    alone = client.get("/api/v1/compare", params={"run": "first"})
+    assert alone.status_code == 400
+    assert "expected at least two" in alone.json()["error"]["message"]
+
+
+def test_the_recording_comes_whole_and_in_ranges(client, recordings):
+    run = find_run("first", recordings)
+    whole = run.recording.read_bytes()
+    answer = client.get(f"{RUN}/recording")
+    assert answer.content == whole
+    assert run.summary["content_digest"] in answer.headers["etag"]
+    part = client.get(f"{RUN}/recording", headers={"Range": "bytes=100-299"})
+    assert (part.status_code, part.content) == (206, whole[100:300])
+    assert part.headers["content-range"] == f"bytes 100-299/{len(whole)}"
+    again = client.get(f"{RUN}/recording", headers={"If-None-Match": answer.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    stale = client.get(f"{RUN}/recording", headers={"Range": "bytes=100-299", "If-Range": '"other"'})
+    assert (stale.status_code, len(stale.content)) == (200, len(whole))
+    head = client.head(f"{RUN}/recording")
+    assert int(head.headers["content-length"]) == len(whole)
+
+
+def test_the_replay_is_made_once_and_kept(client, recordings):
+    first = client.get(f"{RUN}/replay.rrd", params={"episodes": "0:2"})
+    assert first.content.startswith(b"RRF2")
+    again = client.get(f"{RUN}/replay.rrd", params={"episodes": "0:2"})
+    assert again.content == first.content
+    assert client.get(f"{RUN}/replay.rrd", params={"episodes": "x"}).status_code == 422
+
+
+def test_a_damaged_recording_is_told_not_thrown(client, recordings):
+    run = find_run("first", recordings)
+    run.recording.write_bytes(run.recording.read_bytes()[:1000])
+    assert client.get(f"{RUN}/metrics").status_code == 409
+    told = client.get(RUN).json()
+    assert told["problems"]
+    assert told["status"] == "finished"
+    run.recording.unlink()
+    assert client.get(f"{RUN}/steps/train").status_code == 409
+    assert client.get(f"{RUN}/recording").status_code == 409
