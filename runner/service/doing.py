@@ -277,7 +277,7 @@ def _do_sweep(order: Order, line: Line) -> Outcome:
     from runner.sweep.trials import INTERRUPTED, run_sweep
 
     sweep = from_values(_described(order))
-    with state.held(order.name, order.recordings):
+    with _held(order, line.stop):
         there = order.name in state.sweeps_in(order.recordings)
         state.begin(sweep, order.recordings, resume=there, accept_changes=False)
         if order.retry:
@@ -305,6 +305,28 @@ def _do_sweep(order: Order, line: Line) -> Outcome:
     if standing.failed:
         return Outcome("failed", f"{standing.failed:,} of {standing.runs:,} runs failed; the sweep says why.")
     return Outcome("finished")
+
+
+@contextlib.contextmanager
+def _held(order: Order, stop: Callable[[], bool]) -> Iterator[None]:
+    """Keep every other process from doing the sweep; wait for one that is about to stop.
+
+    Raises:
+        RunnerError: one still does it after a minute.
+    """
+    from runner.sweep import state
+
+    deadline = time.monotonic() + OTHERS_SECONDS
+    with contextlib.ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(state.held(order.name, order.recordings))
+                break
+            except state.SweepBusy:
+                if time.monotonic() > deadline or stop():
+                    raise
+                time.sleep(TELL_SECONDS)
+        yield
 
 
 @contextlib.contextmanager

@@ -274,6 +274,16 @@ class Queue:
             _remove(self.folder_of(number))
 
 
+def require_free(recordings: Path) -> None:
+    """Refuse a folder that another process serves.
+
+    Raises:
+        RunnerError: one does.
+        StorageError: the folder cannot be written.
+    """
+    _hold(recordings / FOLDER).release()
+
+
 def runs_in(folder: Path) -> dict[int, str]:
     """Return the ids of a job's runs by seed, as its folder says."""
     try:

@@ -17,7 +17,7 @@ from runner.config.loading import experiment_in, read_text
 from runner.config.overrides import put
 from runner.config.problems import found, problems_in, refuse
 from runner.config.schema import Schema, without_references
-from runner.errors import EnvironmentNotUsable
+from runner.errors import EnvironmentNotUsable, Located
 from runner.sweep.model import Range, Sweep, SweepFile
 
 MAX_NAME = 50
@@ -133,6 +133,7 @@ def _check_parameters(file: SweepFile, base: ExperimentConfig, document: Documen
     """Try every end and choice of each parameter, the others at their first."""
     first = {path: next(_samples(parameter)) for path, parameter in file.parameters.items()}
     lines: dict[str, None] = {}
+    located: dict[Located, None] = {}
     for path, parameter in file.parameters.items():
         for number, sample in enumerate(_samples(parameter)):
             try:
@@ -141,8 +142,9 @@ def _check_parameters(file: SweepFile, base: ExperimentConfig, document: Documen
                     _check_environment(experiment, path, document)
             except ConfigError as error:
                 lines |= dict.fromkeys(str(error).split("\n"))
+                located |= dict.fromkeys(error.problems)
     if lines:
-        raise ConfigError("\n".join(lines))
+        raise ConfigError("\n".join(lines), tuple(located))
 
 
 def _samples(parameter: Range | list[Any]) -> Iterator[Any]:

@@ -31,6 +31,10 @@ FREE: Final = ("limits",)
 """What may change when a sweep is gone on with: what is done follows from the rest."""
 
 
+class SweepBusy(RunnerError):
+    """Another process is doing the sweep."""
+
+
 def tag_of(name: str) -> str:
     """Return the tag of a sweep's runs."""
     return f"sweep={name}"
@@ -110,7 +114,7 @@ def held(name: str, recordings: Path) -> Iterator[None]:
     """Keep every other process from doing this sweep meanwhile.
 
     Raises:
-        RunnerError: one does.
+        SweepBusy: one does.
         StorageError: the folder cannot be written.
     """
     from filelock import FileLock, Timeout
@@ -121,7 +125,7 @@ def held(name: str, recordings: Path) -> Iterator[None]:
         lock = FileLock(folder / LOCK)
         lock.acquire(blocking=False)
     except Timeout as error:
-        raise RunnerError(f"the sweep {name!r} is being done by another process; let it.") from error
+        raise SweepBusy(f"the sweep {name!r} is being done by another process; let it.") from error
     except OSError as error:
         raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
     try:

@@ -65,6 +65,7 @@ def command(
 
     try:
         from runner.service.app import create_app
+        from runner.service.queue import require_free
         from runner.service.server import bind, serve, url_of
     except ImportError as error:
         raise MissingExtra(error.name or "a package", "service", "the service") from error
@@ -79,6 +80,7 @@ def command(
         tokens_for_all=require_token,
         workers=workers,
     )
+    require_free(settings.recordings[0])  # refused before anybody can ask for anything
     app = create_app(settings)
     listening = bind(settings)
     click.echo(url_of(listening))

@@ -1,0 +1,111 @@
+"""What is submitted is checked as a file is, with a few things more that a server must not do."""
+
+from __future__ import annotations
+
+import pytest
+
+from runner.config import load
+from runner.errors import ConfigError
+from runner.service import checking
+from runner.service.checking import Checker, check
+from runner.sweep import state
+from runner.sweep.loading import from_values
+
+TINY = "env: {id: FrozenLake-v1}\nepisodes: 3\nseeds: [0, 1]\n"
+SWEEP = """\
+name: small
+base: {env: {id: FrozenLake-v1}, episodes: 10, evaluation: {every: 5, trials: 2}}
+strategy: grid
+parameters: {step_size: [0.1, 0.5, 1.0]}
+seeds: [0, 1]
+objective: {metric: training.mean_reward}
+"""
+
+
+def refused(text, tmp_path):
+    with pytest.raises(ConfigError) as caught:
+        check(text, "job.yaml", tmp_path)
+    return caught.value
+
+
+def test_a_text_means_what_the_file_means(tmp_path):
+    file = tmp_path / "tiny.yaml"
+    file.write_text(TINY)
+    found = check(TINY, "tiny.yaml", tmp_path)
+    assert found.values == load(file).to_mapping()
+    assert (found.kind, found.name, found.runs) == ("config", "tiny", 2)
+    assert found.bytes > 0
+
+
+def test_a_sweep_is_told_by_its_keys(tmp_path):
+    found = check(SWEEP, "job.yaml", tmp_path)
+    assert (found.kind, found.name, found.runs) == ("sweep", "small", 6)
+    assert from_values(found.values).to_mapping() == found.values
+
+
+def test_mistakes_are_those_of_the_file_at_their_lines(tmp_path):
+    text = "episodes: many\nepsilom: 0.1\n"
+    file = tmp_path / "job.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError) as of_file:
+        load(file)
+    of_text = refused(text, tmp_path)
+    assert str(of_text) == str(of_file.value).replace(str(file), "job.yaml")
+    assert [(found.path, found.line) for found in of_text.problems] == [("episodes", 1), ("epsilom", 2)]
+    assert refused(SWEEP.replace("0.5,", "7.0,"), tmp_path).problems[0].line == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "message"),
+    [
+        ("episodes: 3\nenv: {id: FrozenLake-v999}\n", 2, "FrozenLake-v1"),
+        ("episodes: 3\n\ninitial_q: {run: nobody}\n", 3, "no run 'nobody'"),
+        ("episodes: 3\ninitial_q: {run: /etc/passwd}\n", 2, "found the path '/etc/passwd'"),
+        ("episodes: 3\ninitial_q: {run: ../x.mcap}\n", 2, "found the path"),
+        (SWEEP.replace("{env", "{initial_q: {run: a/b}, env"), 2, "found the path 'a/b'"),
+        (SWEEP.replace("{step_size: [0.1,", "{initial_q: [{run: x.mcap},"), 4, "found the path 'x.mcap'"),
+        (SWEEP.replace("{step_size: [0.1, 0.5, 1.0]", "{initial_q.run: [/x]"), 4, "found the path '/x'"),
+        ("base: cooperative.yaml\nstrategy: grid\nparameters: {discount: [0.1]}\n", 1, "found the path"),
+    ],
+)
+def test_what_only_a_server_refuses_has_its_line_too(text, line, message, tmp_path):
+    error = refused(text, tmp_path)
+    assert error.problems[0].line == line, error
+    assert message in str(error)
+
+
+def test_a_sweep_of_the_same_name_goes_on_but_for_another_it_is_refused(tmp_path):
+    state.begin(from_values(check(SWEEP, "job.yaml", tmp_path).values), tmp_path, False, False)
+    assert check(SWEEP, "job.yaml", tmp_path).name == "small"
+    error = refused(SWEEP.replace("0.5", "0.6"), tmp_path)
+    assert "a sweep 'small' is here already, and differs in parameters.step_size" in str(error)
+    assert error.problems[0].line == 1
+
+
+def test_more_runs_than_a_job_may_make_are_refused(tmp_path):
+    assert "makes 10,001 runs" in str(refused("episodes: 1\nseeds: {count: 10001}\n", tmp_path))
+
+
+def test_the_process_answers_as_the_function_does(tmp_path):
+    with Checker(tmp_path) as checker:
+        assert checker.check(TINY, "tiny.yaml") == check(TINY, "tiny.yaml", tmp_path)
+        with pytest.raises(ConfigError) as caught:
+            checker.check("episodes: many", "job.yaml")
+        assert caught.value.problems == refused("episodes: many", tmp_path).problems
+        with pytest.raises(ConfigError, match="larger than 1 MiB"):
+            checker.check("x" * (1 << 20) + "x", "job.yaml")
+
+
+def test_an_environment_that_hangs_or_kills_costs_only_its_own_process(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "hanging.py").write_text("import time\ntime.sleep(600)\n")
+    (tmp_path / "killing.py").write_text("import os\nos._exit(3)\n")
+    with Checker(tmp_path) as checker:
+        with pytest.raises(ConfigError, match="ended the process that was checking it"):
+            checker.check("episodes: 1\nenv: {id: 'killing:X-v0'}\n", "job.yaml")
+        assert checker.check(TINY, "tiny.yaml").runs == 2
+        monkeypatch.setattr(checking, "CHECK_SECONDS", 0.5)
+        with pytest.raises(ConfigError, match="took longer than"):
+            checker.check("episodes: 1\nenv: {id: 'hanging:X-v0'}\n", "job.yaml")
+        monkeypatch.setattr(checking, "CHECK_SECONDS", 30.0)
+        assert checker.check(TINY, "tiny.yaml").runs == 2

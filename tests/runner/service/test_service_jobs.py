@@ -1,0 +1,246 @@
+"""Jobs over HTTP: submitted, watched, cancelled, resumed."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+import runner
+from runner.config import from_mapping
+from runner.runs import list_runs
+from runner.service import work
+from runner.service.work import Jobs
+
+CONFIG = {
+    "name": "icy",
+    "env": {"id": "FrozenLake-v1"},
+    "episodes": 200,
+    "evaluation": {"every": 100, "trials": 5},
+    "seeds": [0, 1],
+}
+ENDLESS = CONFIG | {"name": "endless", "episodes": 10**9, "seeds": [0], "recording": {"steps": "none"}}
+SWEEP = {
+    "name": "small",
+    "base": {"env": {"id": "FrozenLake-v1"}, "episodes": 60, "evaluation": {"every": 20, "trials": 5}},
+    "strategy": "grid",
+    "parameters": {"step_size": [0.1, 0.5, 1.0]},
+    "seeds": [0, 1],
+    "objective": {"metric": "training.mean_reward"},
+}
+
+
+@pytest.fixture
+def submit(client):
+    def send(values, source="job.yaml"):
+        answer = client.post("/api/v1/jobs", params={"source": source}, content=json.dumps(values))
+        assert answer.status_code == 201, answer.text
+        assert answer.headers["location"] == f"/api/v1/jobs/{answer.json()['number']}"
+        return answer.json()["number"]
+
+    return send
+
+
+def job(client, number):
+    return client.get(f"/api/v1/jobs/{number}").json()
+
+
+def until(client, number, is_so, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not is_so(found := job(client, number)):
+        assert time.monotonic() < deadline, found
+        time.sleep(0.05)
+    return found
+
+
+def watched(client, number, last=None):
+    """Return all that a watcher sees until the stream ends: (id, event, data)."""
+    headers = {} if last is None else {"Last-Event-ID": str(last)}
+    answer = client.get(f"/api/v1/jobs/{number}/events", headers=headers)
+    assert answer.headers["content-type"].startswith("text/event-stream")
+    seen = []
+    for block in answer.text.split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in block.splitlines())
+        if "event" in fields:
+            seen.append((fields.get("id"), fields["event"], json.loads(fields["data"])))
+    return seen
+
+
+def test_a_configuration_is_done_seed_by_seed_as_from_the_command_line(client, submit, recordings, tmp_path):
+    number = submit(CONFIG)
+    seen = watched(client, number)
+    done = job(client, number)
+    assert (done["state"], done["error"], done["runs"]) == ("finished", "", 2)
+    runs = {run.run_id: run for run in list_runs(recordings)}
+    here = [runs[begun["run_id"]] for begun in done["begun"]]
+    elsewhere = runner.run_all(CONFIG, recordings=tmp_path / "elsewhere")
+    for run, alone in zip(here, elsewhere, strict=True):
+        assert (run.status, run.name, run.seed) == ("finished", "icy", alone.seed)
+        assert run.summary["content_digest"] == alone.summary["content_digest"]
+
+    states = [data["state"] for _, event, data in seen if event == "state"]
+    assert states == ["queued", "running", "finished"]
+    assert [data["run_id"] for _, event, data in seen if event == "run"] == [run.run_id for run in here]
+    log = [data["text"] for _, event, data in seen if event == "log" and data.get("seed") == 1]
+    assert log[0] == "training 200 episodes with q_learning"
+    assert log[-1] == "finished"
+    progress = [data for _, event, data in seen if event == "progress"]
+    assert progress[-1]["episode"] == progress[-1]["episodes"] == 200
+    assert (progress[-1]["run"], progress[-1]["runs"]) == (2, 2)
+    assert progress[-1]["last_evaluation"]["episode"] == 200
+
+
+def test_a_watcher_comes_back_to_where_it_was(client, submit):
+    number = submit(CONFIG | {"seeds": [0]})
+    seen = [event for event in watched(client, number) if event[0]]
+    assert [event for event in watched(client, number) if event[0]] == seen
+    assert [event for event in watched(client, number, last=seen[2][0]) if event[0]] == seen[3:]
+    assert [event for event in watched(client, number, last="nonsense") if event[0]] == seen
+    end = client.get(f"/api/v1/jobs/{number}/events", headers={"Last-Event-ID": seen[-1][0]})
+    assert end.status_code == 204
+
+
+def test_a_running_job_is_cancelled_and_goes_on_when_it_is_resumed(client, submit, recordings):
+    config = {"episodes": 1500, "mode": "cooperative", "evaluation": {"every": 100, "trials": 200}}
+    number = submit(config)
+    until(client, number, lambda job: (job["progress"] or {}).get("episode", 0) > 0)
+    begun = job(client, number)["begun"][0]["run_id"]
+    listed = client.get("/api/v1/runs").json()["runs"]
+    assert {run["run_id"]: run["status"] for run in listed}[begun] == "running"
+    cancelled = client.post(f"/api/v1/jobs/{number}/cancel").json()
+    assert cancelled["state"] == "cancelled"
+    again = client.post(f"/api/v1/jobs/{number}/cancel")
+    assert again.status_code == 409
+    assert "is cancelled already" in again.json()["error"]["message"]
+
+    assert client.post(f"/api/v1/jobs/{number}/resume").json()["state"] == "queued"
+    done = until(client, number, lambda job: job["state"] == "finished")
+    assert [run["run_id"] for run in done["begun"]] == [begun]
+    run = next(run for run in list_runs(recordings) if run.run_id == begun)
+    assert run.status == "finished"
+    alone = runner.run(config, recordings=recordings)
+    assert run.summary["content_digest"] == alone.summary["content_digest"]
+    log = [data["text"] for _, event, data in watched(client, number) if event == "log"]
+    said = [text for text in log if text.startswith("evaluation")]
+    assert len(said) == len(set(said)) == 16, "no line is said again by a run that goes on"
+    assert client.post(f"/api/v1/jobs/{number}/resume").status_code == 409
+
+
+def test_no_more_jobs_run_than_there_are_workers_and_those_that_wait_can_be_cancelled(
+    connect, settings, client
+):
+    numbers = [client.post("/api/v1/jobs", content=json.dumps(ENDLESS)).json()["number"] for _ in range(4)]
+    until(client, numbers[1], lambda job: job["progress"] is not None)
+    page = client.get("/api/v1/jobs").json()
+    assert [job["state"] for job in page["jobs"]] == ["queued", "queued", "running", "running"]
+    assert (page["queue"]["workers"], page["queue"]["running"], page["queue"]["queued"]) == (2, 2, 2)
+    only = client.get("/api/v1/jobs", params={"state": "queued", "limit": 1}).json()
+    assert (only["total"], [job["number"] for job in only["jobs"]]) == (2, [numbers[3]])
+    assert client.post(f"/api/v1/jobs/{numbers[2]}/cancel").json()["state"] == "cancelled"
+    client.post(f"/api/v1/jobs/{numbers[0]}/cancel")
+    until(client, numbers[3], lambda job: job["state"] == "running")
+
+
+def test_a_sweep_is_done_and_may_use_the_workers_that_nobody_waits_for(client, submit, recordings, tmp_path):
+    number = submit(SWEEP)
+    busy = client.post("/api/v1/jobs", content=json.dumps(SWEEP))
+    assert busy.status_code == 409
+    assert "does the sweep 'small' already" in busy.json()["error"]["message"]
+    seen = watched(client, number)
+    assert job(client, number)["state"] == "finished"
+    progress = [data for _, event, data in seen if event == "progress"]
+    assert (progress[-1]["done"], progress[-1]["runs"], progress[-1]["failed"]) == (6, 6, 0)
+    assert max(data["running"] for data in progress) == 2
+    runs = [run for run in list_runs(recordings) if "sweep=small" in run.tags]
+    assert len(runs) == 6
+    best = progress[-1]["best"]
+    assert any(f"trial {best['trial']} is the best so far" in data.get("text", "") for _, _, data in seen)
+
+
+def test_a_job_whose_worker_dies_is_tried_again_and_then_fails(client, submit):
+    import psutil
+
+    number = submit(ENDLESS)
+    for _ in range(2):
+        until(client, number, lambda job: job["progress"] is not None)
+        for process in psutil.Process().children():
+            if "spawn_main" in " ".join(process.cmdline()) and process.nice() == 5:
+                process.kill()
+        until(client, number, lambda job: job["progress"] is None)
+    failed = until(client, number, lambda job: job["state"] == "failed")
+    assert failed["error"].startswith("its worker died 2 times, at last with exit code -9")
+
+
+def test_a_job_that_cannot_be_done_says_why_and_is_tried_again_when_asked(client, submit):
+    number = submit(SWEEP | {"objective": {"metric": "training.mean_rewards"}})
+    failed = until(client, number, lambda job: job["state"] == "failed")
+    assert "Did you mean 'training.mean_reward'?" in failed["error"]
+    told = watched(client, number)[-1][2]
+    assert (told["state"], told["error"]) == ("failed", failed["error"])
+    again = client.post(f"/api/v1/jobs/{number}/resume").json()
+    assert (again["state"], again["error"]) == ("queued", "")
+    assert until(client, number, lambda job: job["state"] == "failed")["error"] == failed["error"]
+
+
+def test_mistakes_are_told_with_line_and_key(client, recordings):
+    answer = client.post("/api/v1/jobs", params={"source": "my.yaml"}, content="episodes: 3\nepsilom: 1\n")
+    assert answer.status_code == 422
+    error = answer.json()["error"]
+    assert error["message"] == "my.yaml:2:1: epsilom: unknown key. Did you mean 'epsilon'?"
+    assert error["problems"][0] | {"message": ""} == {"path": "epsilom", "line": 2, "message": ""}
+    assert client.get("/api/v1/jobs").json()["total"] == 0
+    assert client.post("/api/v1/jobs", content=b"episodes: \xff").status_code == 422
+    assert client.post("/api/v1/jobs", content="").status_code == 422
+    assert client.post("/api/v1/jobs", params={"source": "../x"}, content="episodes: 3").status_code == 422
+
+
+def test_a_text_can_be_checked_without_being_queued(client):
+    checked = client.post("/api/v1/jobs/check", content=json.dumps(CONFIG)).json()
+    assert (checked["kind"], checked["name"], checked["runs"]) == ("config", "icy", 2)
+    assert checked["bytes"] > 0
+    assert client.get("/api/v1/jobs").json()["total"] == 0
+
+
+def test_what_the_disk_would_not_hold_is_refused_and_a_full_one_is_waited_for(client, submit, monkeypatch):
+    monkeypatch.setattr(work, "free_bytes", lambda _: 1000)
+    refused = client.post("/api/v1/jobs", content=json.dumps(CONFIG))
+    assert refused.status_code == 507
+    assert "its recordings need about" in refused.json()["error"]["message"]
+    monkeypatch.setattr(work, "free_bytes", lambda _: work.RESERVE_BYTES - 1)
+    number = submit(CONFIG | {"seeds": [0]})
+    time.sleep(0.5)
+    assert job(client, number)["state"] == "queued"
+    assert client.get("/api/v1/jobs").json()["queue"]["waiting_for"].startswith("disk: 268 MB are free")
+    monkeypatch.undo()
+    until(client, number, lambda job: job["state"] == "finished")
+
+
+def test_unknown_jobs_are_told(client):
+    for path in ("", "/events", "/submitted"):
+        assert client.get(f"/api/v1/jobs/7{path}").status_code == 404
+    for verb in ("cancel", "resume"):
+        assert client.post(f"/api/v1/jobs/7/{verb}").status_code == 404
+    assert client.get("/api/v1/jobs/0").status_code == 422
+
+
+def test_what_was_submitted_is_given_back(client, submit):
+    number = submit(ENDLESS)
+    assert json.loads(client.get(f"/api/v1/jobs/{number}/submitted").text) == ENDLESS
+
+
+def test_a_run_that_was_promised_but_never_made_is_made(tmp_path):
+    """The worker wrote the run's id down, or made its folder, and was killed."""
+    for made in (False, True):
+        with Jobs(tmp_path / str(made), 1) as jobs:
+            queued = jobs.queue.add(
+                "config", "icy", 1, "", from_mapping(CONFIG | {"seeds": [3]}).to_mapping()
+            )
+            (jobs.queue.folder_of(queued.number) / "runs.json").write_text('{"3": "abcdefgh"}')
+            if made:
+                (jobs.recordings / "abcdefgh").mkdir()
+            while not jobs.queue.job(queued.number).is_over:
+                time.sleep(0.05)
+            assert jobs.queue.job(queued.number).state == "finished"
+            runs = list_runs(jobs.recordings)
+            assert [run.run_id for run in runs] == [jobs.queue.runs_of(queued.number)[3]]

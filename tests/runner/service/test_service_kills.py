@@ -1,0 +1,164 @@
+"""A server that is killed in the middle of its jobs, and started again."""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+
+import httpx2
+import psutil
+import pytest
+from served import served
+
+import runner
+from runner.runs import list_runs
+from runner.sweep import state
+from runner.sweep.trials import Trials, recorded
+
+CONFIG = {
+    "name": "quick",
+    "episodes": 1200,
+    "mode": "cooperative",
+    "epsilon": {"schedule": "linear", "start": 1.0, "end": 0.1, "over": 1200},
+    "evaluation": {"every": 200, "trials": 200},
+}
+SWEEP = {
+    "name": "small",
+    "base": CONFIG | {"episodes": 300, "name": "base"},
+    "strategy": "tpe",
+    "trials": 4,
+    "batch": 2,
+    "parameters": {"step_size": {"low": 0.1, "high": 1.0}},
+    "seeds": [0],
+}
+
+
+def is_under_way(jobs):
+    """Return whether a job is in its middle, and others before it."""
+    return any(
+        job["state"] == "running" and (job["progress"] or {}).get("episode", 0) > 0 for job in jobs.values()
+    )
+
+
+def are_finished(jobs):
+    assert not [job for job in jobs.values() if job["state"] in ("failed", "cancelled")], jobs
+    return all(job["state"] == "finished" for job in jobs.values())
+
+
+def submitted(server, seeds):
+    for seed in seeds:
+        server.post("/jobs", json.dumps(CONFIG | {"seed": seed}))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The content digests of the runs of five seeds, by seed, as nothing disturbed them."""
+    runs = runner.run_all(CONFIG | {"seeds": list(range(5))}, recordings=tmp_path_factory.mktemp("alone"))
+    return {run.seed: run.summary["content_digest"] for run in runs}
+
+
+def digests(recordings):
+    runs = list_runs(recordings)
+    assert [run.status for run in runs] == ["finished"] * len(runs)
+    return sorted((run.seed, run.summary["content_digest"]) for run in runs)
+
+
+def test_five_jobs_survive_that_the_server_and_then_everything_is_killed(tmp_path, undisturbed):
+    with served(tmp_path) as server:
+        submitted(server, range(5))
+        server.until(is_under_way)
+        workers = server.kill()
+        _, alive = psutil.wait_procs(workers, timeout=20)
+        assert not alive, "a worker whose server is gone closes its recording and ends"
+        statuses = {run.status for run in list_runs(tmp_path)}
+        assert "running" not in statuses
+        assert "interrupted" in statuses
+
+        server.start()
+        before = server.until(is_under_way)
+        assert sorted(before) == [1, 2, 3, 4, 5]
+        server.kill(with_workers=True)
+        server.start()
+        jobs = server.until(are_finished)
+        assert len(list_runs(tmp_path)) == 5, "no run was begun twice"
+        assert digests(tmp_path) == sorted(undisturbed.items())
+        begun = [job["begun"][0]["run_id"] for job in jobs.values()]
+        assert sorted(begun) == sorted(run.run_id for run in list_runs(tmp_path))
+
+
+def test_a_new_server_waits_for_a_worker_that_has_not_stopped_yet(tmp_path, undisturbed):
+    with served(tmp_path, "--workers", "1") as server:
+        submitted(server, [0])
+        server.until(is_under_way)
+        slow = next(process for process in server.workers() if process.nice() == 5)
+        slow.send_signal(signal.SIGSTOP)  # it owns its run, and does nothing
+        server.kill()
+        server.start()
+        server.until(lambda jobs: jobs[1]["state"] == "running")
+        psutil.wait_procs([slow], timeout=2)
+        [job] = server.get("/jobs")["jobs"]
+        assert (job["state"], job["progress"]) == ("running", None), "it has not begun to work on the run"
+        slow.send_signal(signal.SIGCONT)
+        server.until(are_finished)
+        assert digests(tmp_path) == [(0, undisturbed[0])]
+
+
+def test_a_server_that_is_told_to_stop_leaves_its_jobs_resumable_and_lets_watchers_go(tmp_path, undisturbed):
+    with served(tmp_path, "--workers", "1") as server:
+        submitted(server, [0, 1])
+        server.until(is_under_way)
+        seen = []
+
+        def watch():
+            with httpx2.stream("GET", f"{server.url}api/v1/jobs/1/events", timeout=30) as answer:
+                seen.extend(answer.iter_lines())
+
+        watcher = threading.Thread(target=watch)
+        watcher.start()
+        server.until(lambda _: seen)
+        assert server.stop() in (0, -signal.SIGTERM)
+        watcher.join(10)
+        assert not watcher.is_alive()
+        job = json.loads((tmp_path / ".jobs" / "1" / "job.json").read_text())
+        assert job["state"] == "interrupted"
+        assert [run.status for run in list_runs(tmp_path)] == ["interrupted"]
+
+        server.start()
+        last = next(line for line in reversed(seen) if line.startswith("id: ")).removeprefix("id: ")
+        server.until(are_finished)
+        rest = httpx2.get(f"{server.url}api/v1/jobs/1/events", headers={"Last-Event-ID": last}).text
+        states = [
+            json.loads(line.removeprefix("data: "))["state"]
+            for line in rest.splitlines()
+            if '"state"' in line
+        ]
+        assert states == ["interrupted", "queued", "running", "finished"]
+        assert digests(tmp_path) == [(seed, undisturbed[seed]) for seed in (0, 1)]
+
+
+def test_a_sweep_that_was_killed_ends_as_if_it_never_had_been(tmp_path):
+    found = []
+    for folder, is_killed in ((tmp_path / "calm", False), (tmp_path / "killed", True)):
+        with served(folder) as server:
+            server.post("/jobs", json.dumps(SWEEP))
+            if is_killed:
+                server.until(lambda jobs: (jobs[1]["progress"] or {}).get("done", 0) >= 1)
+                server.kill()
+                server.start()  # at once, while the old sweep still closes its recordings
+            server.until(are_finished)
+        trials = recorded(Trials(state.read_sweep("small", folder)), folder)
+        found.append([(trial.values, trial.value, trial.results[0].digest) for trial in trials])
+        assert len(list_runs(folder)) == 4
+    assert found[0] == found[1]
+
+
+def test_a_second_server_of_the_same_folder_is_refused(tmp_path):
+    from click.testing import CliRunner
+
+    from runner.cli import cli
+
+    with served(tmp_path):
+        result = CliRunner().invoke(cli, ["serve", "--port", "0", "--recordings", str(tmp_path)])
+    assert "is served by another process already" in result.output
+    assert result.exit_code == 2
