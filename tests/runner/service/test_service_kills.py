@@ -14,7 +14,9 @@ from served import served
 import runner
 from runner.runs import list_runs
 from runner.sweep import state
-from runner.sweep.trials import Trials, recorded
+from runner.sweep.loading import from_values
+from runner.sweep.task import do
+from runner.sweep.trials import Trials, recorded, run_sweep
 
 CONFIG = {
     "name": "quick",
@@ -104,9 +106,10 @@ def test_a_new_server_waits_for_a_worker_that_has_not_stopped_yet(tmp_path, undi
         assert digests(tmp_path) == [(0, undisturbed[0])]
 
 
-def test_a_server_that_is_told_to_stop_leaves_its_jobs_resumable_and_lets_watchers_go(tmp_path, undisturbed):
+def test_a_server_that_is_told_to_stop_leaves_its_job_resumable_and_lets_watchers_go(tmp_path):
+    config = CONFIG | {"evaluation": {"every": 100, "trials": 500}, "recording": {"steps": "none"}}
     with served(tmp_path, "--workers", "1") as server:
-        submitted(server, [0, 1])
+        server.post("/jobs", json.dumps(config))
         server.until(is_under_way)
         seen = []
 
@@ -134,23 +137,47 @@ def test_a_server_that_is_told_to_stop_leaves_its_jobs_resumable_and_lets_watche
             if '"state"' in line
         ]
         assert states == ["interrupted", "queued", "running", "finished"]
-        assert digests(tmp_path) == [(seed, undisturbed[seed]) for seed in (0, 1)]
+        alone = runner.run(config, recordings=tmp_path / "alone")
+        assert digests(tmp_path) == [(0, alone.summary["content_digest"])]
+
+
+class Here:
+    """A worker that needs no process."""
+
+    def __init__(self):
+        self.answers = []
+        self.idle = 1
+
+    def give(self, task):
+        self.answers.append((task, do(task, lambda: False)))
+
+    def collect(self, seconds):
+        answers, self.answers = self.answers, []
+        return answers
+
+    def stop(self):
+        pass
+
+
+def tried(folder):
+    """Return the trials of the sweep, with what came of them."""
+    trials = recorded(Trials(state.read_sweep("small", folder)), folder)
+    return [(trial.values, trial.value, trial.results[0].digest) for trial in trials]
 
 
 def test_a_sweep_that_was_killed_ends_as_if_it_never_had_been(tmp_path):
-    found = []
-    for folder, is_killed in ((tmp_path / "calm", False), (tmp_path / "killed", True)):
-        with served(folder) as server:
-            server.post("/jobs", json.dumps(SWEEP))
-            if is_killed:
-                server.until(lambda jobs: (jobs[1]["progress"] or {}).get("done", 0) >= 1)
-                server.kill()
-                server.start()  # at once, while the old sweep still closes its recordings
-            server.until(are_finished)
-        trials = recorded(Trials(state.read_sweep("small", folder)), folder)
-        found.append([(trial.values, trial.value, trial.results[0].digest) for trial in trials])
-        assert len(list_runs(folder)) == 4
-    assert found[0] == found[1]
+    calm, killed = tmp_path / "calm", tmp_path / "killed"
+    sweep = from_values(SWEEP)
+    state.begin(sweep, calm, resume=False, accept_changes=False)
+    run_sweep(sweep, calm, Here())
+    with served(killed) as server:
+        server.post("/jobs", json.dumps(SWEEP))
+        server.until(lambda jobs: (jobs[1]["progress"] or {}).get("done", 0) >= 1)
+        server.kill()
+        server.start()  # at once, while the old sweep still closes its recordings
+        server.until(are_finished)
+    assert len(list_runs(killed)) == len(tried(calm)) == 4
+    assert tried(killed) == tried(calm)
 
 
 def test_a_second_server_of_the_same_folder_is_refused(tmp_path):
