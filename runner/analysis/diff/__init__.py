@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from runner.analysis.diff.causes import Cause, Row, Update, cause_of
+from runner.analysis.diff.causes import Cause, Row, Update, cause_of, kind_of
 from runner.analysis.diff.loops import comparable, loop_environment_diff, loop_means, loop_parting
 from runner.analysis.diff.metrics import MetricDiff, metric_diffs
 from runner.analysis.diff.settings import (
@@ -87,7 +87,8 @@ def diff(
         a: one run, finished or not.
         b: another.
         targets: metric to a level, whose first crossing is to be told.
-        first: only settings, and the first step of training at which they part.
+        first: only settings, the first step of training at which they part, and what differs there; why the
+            tables came to differ is left out.
     """
     if not a.kind == b.kind == "job":
         return _diff_of_loops(a, b)
@@ -111,7 +112,7 @@ def diff(
     seen = None
     if can_compare_steps(a, b):
         parting = training_parting(a, b)
-        cause = None if parting is None else cause_of(parting, a, b)
+        cause = None if parting is None else (kind_of if first else cause_of)(parting, a, b)
         facts |= {"parting": parting, "cause": cause}
         if not first:
             facts["overlap"], seen = training_overlap(a, b)

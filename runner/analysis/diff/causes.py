@@ -18,15 +18,17 @@ from numpy.typing import NDArray
 from runner.analysis.diff.tables import own_actions_in_words
 from runner.analysis.diff.trajectory import Parting
 from runner.errors import RecordingError
-from runner.learning.learner import Held
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.words import actions_in_words, states_in_words
 
 if TYPE_CHECKING:
     from runner.analysis.tables import TableReplay
+    from runner.learning.learner import Held
 
 _STEPS_AT_ONCE = 1 << 16
+_OF_TABLES = ("greedy_action", "policy_action")
+"""Kinds of causes that lie in the tables."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ class Cause:
 def cause_of(
     parting: Parting, a: Recording, b: Recording, training: tuple[Parting, Cause] | None = None
 ) -> Cause:
-    """Return why two runs part where they do.
+    """Return why two runs part where they do, back to the update that made their tables differ.
 
     Args:
         parting: where.
@@ -81,6 +83,14 @@ def cause_of(
         b: the other.
         training: where and why their training parts, if that is known; it spares finding it again.
     """
+    cause = kind_of(parting, a, b)
+    if cause.kind in _OF_TABLES:
+        return _from_tables(cause, parting, a, b, training)
+    return cause
+
+
+def kind_of(parting: Parting, a: Recording, b: Recording) -> Cause:
+    """Return what differs where two runs part, as the steps alone tell it; no table is replayed."""
     left, right = parting.a_step, parting.b_step
     if left is None or right is None:
         longer = "B" if left is None else "A"
@@ -95,16 +105,11 @@ def cause_of(
     if bool(left["explored"]) != bool(right["explored"]):
         explorer, other = ("A", "B") if left["explored"] else ("B", "A")
         return Cause("exploration", f"{explorer} explored there, {other} took its greedy action")
-    return _action_or_outcome(parting, a, b, training)
+    return _action_or_outcome(parting, left, right, a, b)
 
 
-def _action_or_outcome(
-    parting: Parting, a: Recording, b: Recording, training: tuple[Parting, Cause] | None
-) -> Cause:
-    """Return why two runs part that were in the same state, and explored alike."""
-    left, right = parting.a_step, parting.b_step
-    assert left is not None
-    assert right is not None
+def _action_or_outcome(parting: Parting, left: np.void, right: np.void, a: Recording, b: Recording) -> Cause:
+    """Return what differs where two runs part that were in the same state, and explored alike."""
     actions = [actions_in_words(r.mdp)[s["action"]] for r, s in ((a, left), (b, right))]
     if left["action"] == right["action"]:
         told = _outcome_text(parting, a, b)
@@ -112,7 +117,9 @@ def _action_or_outcome(
     text = f"{actions[0]} in A, {actions[1]} in B"
     if left["explored"]:
         return Cause("random_action", f"both explored, and drew another action: {text}")
-    return _greedy(parting, a, b, text, training)
+    if "wolf_phc" in (a.config.get("algorithm"), b.config.get("algorithm")):
+        return Cause("policy_action", f"another action, drawn from a learned policy: {text}")
+    return Cause("greedy_action", f"other greedy action: {text}")
 
 
 def _check(recording: Recording, step: np.void) -> None:
@@ -146,15 +153,12 @@ def _reward_text(rewards: list[float]) -> str:
     return " and ".join(f"{reward:g}" for reward in rewards)
 
 
-def _greedy(
-    parting: Parting, a: Recording, b: Recording, text: str, training: tuple[Parting, Cause] | None
+def _from_tables(
+    cause: Cause, parting: Parting, a: Recording, b: Recording, training: tuple[Parting, Cause] | None
 ) -> Cause:
-    """Return the cause of another greedy action, with both Q-rows, and the first update that differs."""
+    """Return the cause of another choice, with both Q-rows, and the first update that differs."""
     from runner.analysis.tables import TableReplay
 
-    cause = Cause("greedy_action", f"other greedy action: {text}")
-    if "wolf_phc" in (a.config.get("algorithm"), b.config.get("algorithm")):
-        cause = Cause("policy_action", f"another action, drawn from a learned policy: {text}")
     steps = [_training_step(parting, recording) for recording in (a, b)]
     known = training is not None and training[0].step < min(steps)
     try:

@@ -30,7 +30,11 @@ if TYPE_CHECKING:
     "--ignore", multiple=True, metavar="GLOB", help="Leave out settings and provenance whose path fits."
 )
 @click.option("--all", "everything", is_flag=True, help="Also what is the same.")
-@click.option("--first", is_flag=True, help="Only settings, and the first step of training that differs.")
+@click.option(
+    "--first",
+    is_flag=True,
+    help="Only settings, and where training parts first; not how the tables came to differ.",
+)
 @click.option(
     "--target", "targets", multiple=True, metavar="METRIC=LEVEL", help="Tell who reaches a level first."
 )

@@ -101,6 +101,16 @@ def test_another_discount_shows_in_the_first_update_that_used_it(compare, record
     assert update.step < difference.parting.step
 
 
+def test_the_first_difference_alone_is_what_the_whole_tells_first(compare, record):
+    whole = compare("discount=0.9")
+    with open_recording(record()) as a, open_recording(record("discount=0.9")) as b:
+        difference = diff(a, b, first=True)
+    assert (difference.cause.kind, difference.cause.text) == (whole.cause.kind, whole.cause.text)
+    assert (difference.parting.step, difference.config) == (whole.parting.step, whole.config)
+    assert difference.cause.update is difference.overlap is None
+    assert not difference.tables + difference.metrics + difference.evaluations
+
+
 def test_the_second_tables_quirk_shows_in_the_second_table(compare):
     difference = compare("quirks.second_table_uses_first_action=false")
     assert [change.path for change in difference.config] == ["quirks.second_table_uses_first_action"]
