@@ -10,4 +10,7 @@ cluster    the same on Ray
 state      a sweep on disk: the file as resolved; its runs are the truth
 trials     batches of trials, from what is recorded or by running them
 results    ranking, importance, the best configuration
+plots      what is drawn of a sweep
+figure     the drawing
+page       a sweep as one page
 """

@@ -1,6 +1,7 @@
 """Workers on Ray: the same tasks, on as many machines as a cluster has.
 
-The machines of a cluster must have the project installed, and see the recordings folder under one path.
+The machines of a cluster must have the project installed, and see the recordings folder under one path: a run
+is recorded on its worker's own disk, and moved there when it is whole.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import os
 import socket
 import threading
+from dataclasses import replace
 from typing import Any, Final, Self
 
 from runner.errors import MissingExtra, RunnerError
@@ -76,6 +78,7 @@ class RayWorkers:
         self._count = max(1, min(count or processors, most))
         # Two calls at a time: `stop` must get through while a task is being done.
         self._actor = self._ray.remote(Doer).options(num_cpus=1, max_concurrency=2, max_restarts=0)
+        self._elsewhere = address is not None
         self._idle: list[Any] = []
         self._busy: dict[Any, tuple[Any, Task]] = {}
 
@@ -87,7 +90,8 @@ class RayWorkers:
     def give(self, task: Task) -> None:
         """Have an idle worker do a task."""
         actor = self._idle.pop() if self._idle else self._actor.remote()
-        self._busy[actor.do.remote(task)] = actor, task
+        there = replace(task, elsewhere=self._elsewhere)
+        self._busy[actor.do.remote(there)] = actor, task
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
         """Return what is done, waiting so long for it; None for a worker that died, and was replaced."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from pydantic import ValidationError
 
@@ -22,6 +23,8 @@ from runner.sweep.model import Range, Sweep, SweepFile
 
 MAX_NAME = 50
 """Of a sweep's name, which stands in a tag of its runs."""
+_COMBINATIONS: Final = 64
+"""So many are tried to find values that go together."""
 
 
 def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
@@ -130,14 +133,13 @@ def _below(document: Document, key: str) -> Document:
 
 
 def _check_parameters(file: SweepFile, base: ExperimentConfig, document: Document) -> None:
-    """Try every end and choice of each parameter, the others at their first."""
-    first = {path: next(_samples(parameter)) for path, parameter in file.parameters.items()}
+    """Try every end and choice of each parameter, beside some values of the others that it goes with."""
     lines: dict[str, None] = {}
     located: dict[Located, None] = {}
     for path, parameter in file.parameters.items():
         for number, sample in enumerate(_samples(parameter)):
             try:
-                experiment = _placed(base, first | {path: sample}, document)
+                experiment = _fitting(file, base, path, sample, document)
                 if number == 0 or path.startswith("env."):
                     _check_environment(experiment, path, document)
             except ConfigError as error:
@@ -145,6 +147,27 @@ def _check_parameters(file: SweepFile, base: ExperimentConfig, document: Documen
                 located |= dict.fromkeys(error.problems)
     if lines:
         raise ConfigError("\n".join(lines), tuple(located))
+
+
+def _fitting(
+    file: SweepFile, base: ExperimentConfig, path: str, sample: object, document: Document
+) -> ExperimentConfig:
+    """Return an experiment with a value of a parameter, the others at the first values that go with it.
+
+    Raises:
+        ConfigError: none of those that were tried do.
+    """
+    samples = {
+        key: [sample] if key == path else list(_samples(each)) for key, each in file.parameters.items()
+    }
+    problem = None
+    for values in itertools.islice(itertools.product(*samples.values()), _COMBINATIONS):
+        try:
+            return _placed(base, dict(zip(samples, values, strict=True)), document)
+        except ConfigError as error:
+            problem = problem or error
+    assert problem is not None
+    raise problem
 
 
 def _samples(parameter: Range | list[Any]) -> Iterator[Any]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from runner.config import ExperimentConfig, from_mapping
+from runner.config import ConfigError, ExperimentConfig, from_mapping
 from runner.errors import StorageError
 from runner.execution import run_job
 from runner.job import Job
@@ -38,6 +38,8 @@ class Plan:
     runs: int
     bytes_a_run: int
     """About; recordings grow with what is learned."""
+    excluded: int = 0
+    """Points of a grid that are left out: their values do not go together."""
 
     @property
     def bytes(self) -> int:
@@ -52,11 +54,21 @@ def plan_of(sweep: Sweep) -> Plan:
         RunnerError: the environment cannot be used, or the objective is not recorded.
     """
     search = Search(sweep.file)
-    config = sweep.config(search.ask(1)[0])
-    mdp = load_mdp(config.env.id, config.env.kwargs, config.rewards)
-    size = _try_out(config, mdp, sweep.objective.metric)
-    trials = search.trials
-    return Plan(trials, trials * len(sweep.seeds), size + _growth(config, mdp))
+    suggested = search.ask(search.trials if sweep.file.strategy == "grid" else sweep.file.batch)
+    configs: list[ExperimentConfig] = []
+    problems: list[ConfigError] = []
+    for values in suggested:
+        try:
+            configs.append(sweep.config(values))
+        except ConfigError as error:
+            problems.append(error)
+    if not configs:
+        raise problems[0]
+    mdp = load_mdp(configs[0].env.id, configs[0].env.kwargs, configs[0].rewards)
+    size = _try_out(configs[0], mdp, sweep.objective.metric) + _growth(configs[0], mdp)
+    excluded = len(problems) if sweep.file.strategy == "grid" else 0
+    trials = search.trials - excluded
+    return Plan(trials, trials * len(sweep.seeds), size, excluded)
 
 
 def _try_out(config: ExperimentConfig, mdp: Mdp, metric: str) -> int:

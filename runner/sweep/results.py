@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from runner.analysis.compare import statistics
 from runner.analysis.compare.statistics import Estimate
 from runner.analysis.sections import Grid, Section
 from runner.sweep.model import Sweep
-from runner.sweep.trials import Trial, Trials, best_of, recorded
+from runner.sweep.trials import State, Trial, Trials, best_of, recorded
 
 SHOWN: Final = 20
 
@@ -25,14 +26,19 @@ class Ranked:
 
     number: int
     values: dict[str, Any]
-    state: str
+    state: State
     median: float | None
     """Over the seeds; infinite for a level never reached; None without a value."""
     iqm: Estimate
     """The interquartile mean over the seeds, and its interval; nan for fewer than four."""
+    low: float | None
+    high: float | None
+    """The lowest and the highest of the seeds."""
     seeds: dict[int, float]
     runs: dict[int, str]
     errors: list[str]
+    again: list[int]
+    """Later trials that tried the same values, and so are the same."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,7 @@ class Results:
     trials: int
     """How many there are to be."""
     ranking: list[Ranked]
-    """The finished ones from the best on, then those that were given up, unfinished or failed."""
+    """The finished ones from the best on, then those given up, unfinished, failed and excluded."""
     importance: dict[str, float]
     """How much each parameter decides; summing up to 1, or empty."""
     best: Trial | None
@@ -70,23 +76,26 @@ def results_of(sweep: Sweep, recordings: Path) -> Results:
 
 
 def ranking(sweep: Sweep, trials: Sequence[Trial]) -> list[Ranked]:
-    """Return the trials, the best first."""
-    order = ("finished", "pruned", "unfinished", "failed")
+    """Return the trials, the best first; those of the same values once."""
+    order = get_args(State)
+    alike: dict[str, list[Trial]] = {}
+    for trial in trials:
+        alike.setdefault(json.dumps(trial.values, sort_keys=True), []).append(trial)
 
-    def key(trial: Trial) -> tuple[int, float, int]:
-        value = trial.value
+    def key(same: list[Trial]) -> tuple[int, float, int]:
+        state, value = same[0].state, same[0].value
         return (
-            order.index(trial.state),
+            order.index(state),
             math.inf if value is None else -sweep.objective.sign * value,
-            trial.number,
+            same[0].number,
         )
 
-    return [_ranked(trial) for trial in sorted(trials, key=key)]
+    return [_ranked(same) for same in sorted(alike.values(), key=key)]
 
 
 def yaml_of(sweep: Sweep, trial: Trial) -> str:
-    """Return a trial's configuration as a file that can be run, recording as the base does."""
-    config = sweep.config(trial.values)
+    """Return a trial's configuration as a file that can be run; it records steps, to be looked at."""
+    config = sweep.config(trial.values | {"name": f"{sweep.name}_best", "recording.steps": "all"})
     head = (
         f"# Trial {trial.number} of the sweep {sweep.name}: {words(trial.values)}.\n"
         f"# {sweep.objective.described}: {trial.value:g}, the median over {len(trial.results)} seeds.\n"
@@ -102,36 +111,55 @@ def sections(results: Results, shown: int | None = SHOWN) -> list[Section]:
         shown: how many trials; None for all.
     """
     ranked = results.ranking[:shown]
-    counts = {
-        state: sum(r.state == state for r in results.ranking) for state in ("finished", "pruned", "failed")
-    }
-    told = ", ".join(f"{count} {state}" for state, count in counts.items() if count) or "none finished"
-    sweep = results.sweep
-    left = len(results.ranking) - len(ranked)
-    heading = [
-        f"{sweep.file.strategy}, {results.trials:,} trials ({told}), {len(sweep.seeds)} seeds each. "
-        f"Objective: {sweep.objective.described}.",
-        *([f"The best {len(ranked)} of {len(results.ranking):,}; --all shows all."] if left else []),
-    ]
-    grid = Grid(
-        ("trial", "median", "IQM", "95 % interval", *sweep.file.parameters, "state"),
-        [_row(entry) for entry in ranked],
-    )
-    errors = [f"Trial {entry.number}: {entry.errors[0]}" for entry in ranked if entry.errors]
-    found = [
-        Section(f"Sweep {sweep.name}", heading, [grid]),
-        *([Section("Failed", errors)] if errors else []),
-    ]
+    grid = _ranking_grid(results.sweep, ranked)
+    found = [Section(f"Sweep {results.sweep.name}", _heading(results, len(ranked)), [grid])]
+    for state, title in (("failed", "Failed"), ("excluded", "Left out: these values do not go together")):
+        told = [f"Trial {e.number}: {e.errors[0]}" for e in results.ranking if e.state == state]
+        found += [Section(title, told)] if told else []
     if results.importance:
         shares = [(path, f"{100 * share:.0f} %") for path, share in results.importance.items()]
         found.append(
             Section(
                 "What mattered",
-                ["Share of what decides (PED-ANOVA)."],
+                ["Share of what decides, over all that was tried (fANOVA)."],
                 [Grid(("parameter", "share"), shares)],
             )
         )
     return found
+
+
+def _heading(results: Results, shown: int) -> list[str]:
+    """Return what there was of a sweep, and what its ranking shows."""
+    sweep, ranking = results.sweep, results.ranking
+    states = [entry.state for entry in ranking for _ in range(1 + len(entry.again))]
+    told = ", ".join(f"{states.count(s)} {s}" for s in get_args(State) if s in states) or "none begun"
+    again = sum(len(entry.again) for entry in ranking)
+    return [
+        f"{sweep.file.strategy}, {results.trials:,} trials ({told}), {len(sweep.seeds)} seeds each. "
+        f"Objective: {sweep.objective.described}.",
+        *([f"{again} trials tried values again, and are shown once."] if again else []),
+        *([f"The best {shown} of {len(ranking):,}; --all shows all."] if shown < len(ranking) else []),
+    ]
+
+
+def _ranking_grid(sweep: Sweep, ranked: Sequence[Ranked]) -> Grid:
+    """Return the ranking as a table; the interquartile mean only where there are seeds enough."""
+    means = any(not math.isnan(entry.iqm.value) for entry in ranked)
+    headings = ("trial", "median", "range", *(("IQM", "95 % interval") if means else ()))
+    return Grid(
+        (*headings, *sweep.file.parameters, "state"),
+        [
+            (
+                str(entry.number),
+                _number(entry.median),
+                _between(entry.low, entry.high),
+                *((_number(entry.iqm.value), _between(entry.iqm.low, entry.iqm.high)) if means else ()),
+                *(spoken(value) for value in entry.values.values()),
+                entry.state,
+            )
+            for entry in ranked
+        ],
+    )
 
 
 def words(values: Mapping[str, Any]) -> str:
@@ -144,16 +172,8 @@ def spoken(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _row(entry: Ranked) -> tuple[str, ...]:
-    low, high = _number(entry.iqm.low), _number(entry.iqm.high)
-    return (
-        str(entry.number),
-        _number(entry.median),
-        _number(entry.iqm.value),
-        f"{low} to {high}" if low else "",
-        *(spoken(value) for value in entry.values.values()),
-        entry.state,
-    )
+def _between(low: float | None, high: float | None) -> str:
+    return f"{_number(low)} to {_number(high)}" if _number(low) else ""
 
 
 def _number(value: float | None) -> str:
@@ -162,7 +182,8 @@ def _number(value: float | None) -> str:
     return "never" if math.isinf(value) else f"{value:,.4g}"
 
 
-def _ranked(trial: Trial) -> Ranked:
+def _ranked(alike: list[Trial]) -> Ranked:
+    trial, *later = alike
     values = {seed: trial.seed_values[seed] for seed in sorted(trial.seed_values)}
     known = np.array([value for value in values.values() if not math.isnan(value)])
     return Ranked(
@@ -171,7 +192,10 @@ def _ranked(trial: Trial) -> Ranked:
         trial.state,
         None if trial.value is None else statistics.bounded(trial.value),
         statistics.interquartile_mean(known),
+        statistics.bounded(known.min()) if len(known) else None,
+        statistics.bounded(known.max()) if len(known) else None,
         {seed: statistics.bounded(value) for seed, value in values.items()},
         {seed: trial.results[seed].run_id for seed in sorted(trial.results)},
         trial.errors,
+        [same.number for same in later],
     )

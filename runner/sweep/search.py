@@ -81,16 +81,23 @@ class Search:
     def importance(self) -> dict[str, float]:
         """Return how much each parameter decides, summing up to 1; empty if too little is known.
 
-        S. Watanabe, A. Bansal and F. Hutter, "PED-ANOVA: efficiently quantifying hyperparameter importance
-        in arbitrary subspaces", IJCAI 2023.
+        F. Hutter, H. Hoos and K. Leyton-Brown, "An efficient approach for assessing hyperparameter
+        importance", ICML 2014 (functional ANOVA of a random forest).
+
+        Raises:
+            MissingExtra: scikit-learn is not installed.
         """
-        from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+        try:
+            import sklearn  # noqa: F401 - Optuna's evaluator needs it
+        except ImportError as error:
+            raise MissingExtra("scikit-learn", "sweep", "what mattered in a sweep") from error
+        from optuna.importance import FanovaImportanceEvaluator, get_param_importances
         from optuna.trial import TrialState
 
         done = self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
         if len({trial.value for trial in done}) < 2:
             return {}
-        found = get_param_importances(self._study, evaluator=PedAnovaImportanceEvaluator())
+        found = get_param_importances(self._study, evaluator=FanovaImportanceEvaluator(seed=0))
         return {name: float(share) for name, share in found.items() if math.isfinite(share)}
 
     def _grid_point(self, number: int) -> dict[str, Any]:

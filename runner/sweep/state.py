@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -48,6 +48,11 @@ def folder_of(name: str, recordings: Path) -> Path:
 def sweeps_in(recordings: Path) -> list[str]:
     """Return the names of the sweeps of a recordings folder."""
     return sorted(file.parent.name for file in (recordings / FOLDER).glob(f"*/{FILE}"))
+
+
+def is_sweep(names: Sequence[str], recordings: Path) -> bool:
+    """Return whether names are the one of a sweep, rather than of runs."""
+    return len(names) == 1 and names[0] in sweeps_in(recordings)
 
 
 def read_sweep(name: str, recordings: Path) -> Sweep:

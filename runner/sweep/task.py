@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import secrets
+import shutil
+import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -17,7 +20,7 @@ from runner.labels import Labels, change_labels
 from runner.mdp import Mdp, load_mdp
 from runner.recording.reader import open_recording
 from runner.resume import resume
-from runner.runs import Run, create_run, find_run, unless_empty
+from runner.runs import Run, create_run, find_run, list_runs, unless_empty
 from runner.sweep.model import Objective
 from runner.sweep.readings import Curve, curve_of, hopeless, readings
 
@@ -43,6 +46,8 @@ class Task:
     """The run that there is already; empty if it is to be begun."""
     accept_changes: bool = False
     """Whether to go on with a run that other code began."""
+    elsewhere: bool = False
+    """Whether to record on the worker's own disk, and to move the run when it is whole."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +71,43 @@ def do(task: Task, stop: Callable[[], bool]) -> Result:
         task: what to do.
         stop: asked every few milliseconds whether to stop; the run is then interrupted, its recording kept.
     """
+    if task.elsewhere:
+        return _do_elsewhere(task, stop)
     try:
         run = _run(task, stop)
         return result_of(run, task.objective) if is_over(run) else Result("interrupted", run.run_id)
     except RunnerError as error:
         return Result("failed", task.run_id, error=str(error))
+
+
+def _do_elsewhere(task: Task, stop: Callable[[], bool]) -> Result:
+    """Do a task in a folder of this machine's own; then move what was recorded where it belongs."""
+    recordings = Path(task.recordings)
+    try:
+        with tempfile.TemporaryDirectory(prefix="dualtaxi-sweep-") as folder:
+            own = Path(folder)
+            if task.run_id:
+                shutil.copytree(recordings / task.run_id, own / task.run_id)
+            result = do(replace(task, recordings=folder, elsewhere=False), stop)
+            for run in list_runs(own):
+                _move_whole(run.folder, recordings)
+    except OSError as error:
+        return Result("failed", task.run_id, error=f"{recordings}: cannot be written ({error.strerror}).")
+    return result
+
+
+def _move_whole(run: Path, recordings: Path) -> None:
+    """Put a run's folder among the recordings, in the place of the same one if it is there."""
+    place, mark = recordings / run.name, secrets.token_hex(4)
+    fresh, old = (recordings / f".{run.name}.{mark}.{kind}" for kind in ("fresh", "old"))
+    try:
+        shutil.copytree(run, fresh)
+        if place.exists():
+            place.rename(old)
+        fresh.rename(place)
+    finally:
+        for folder in (fresh, old):
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def result_of(run: Run, objective: Objective) -> Result:

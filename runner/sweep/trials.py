@@ -25,6 +25,7 @@ from runner.sweep.task import Result, Task, is_over, result_of
 
 INTERRUPTED: Final = "interrupted"
 WAIT_SECONDS: Final = 0.2
+State = Literal["finished", "pruned", "unfinished", "failed", "excluded"]
 
 
 @dataclass
@@ -44,10 +45,12 @@ class Trial:
     """By seed, what its run is worth; a run that was given up is worth what it had then."""
 
     @property
-    def state(self) -> Literal["finished", "pruned", "failed", "unfinished"]:
-        """Whether all its runs are over; pruned if half of them were given up."""
+    def state(self) -> State:
+        """Whether all its runs are over; pruned if half of them were given up; excluded: there are none."""
         states = [result.status for result in self.results.values()]
-        if self.error or "failed" in states:
+        if self.error:
+            return "excluded"
+        if "failed" in states:
             return "failed"
         if len(states) < len(self.identities) or "interrupted" in states:
             return "unfinished"
@@ -90,6 +93,8 @@ class Standing:
     running: int = 0
     pruned: int = 0
     failed: int = 0
+    excluded: int = 0
+    """Trials whose values do not go together; they have no runs."""
     begun: int = 0
     """Runs that this process had begun, or gone on with."""
     bytes: int = 0
@@ -247,7 +252,9 @@ class _Batch:
         """Take in the runs that are over, and find out which are left to do."""
         tasks: dict[str, Task] = {}
         for trial in self._batch:
-            self._standing.failed += len(self._sweep.seeds) if trial.error else 0
+            if trial.error:
+                self._standing.excluded += 1
+                self._standing.runs -= len(self._sweep.seeds)
             for seed, identity in trial.identities.items():
                 result = self._record.result_of(identity)
                 if result is None:

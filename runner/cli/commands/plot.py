@@ -24,15 +24,19 @@ from runner.cli.output import say
 @click.option("--force", is_flag=True, help="Replace the file if it exists.")
 @recordings_option
 def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: Path | None) -> None:
-    """Draw every metric of one or several runs over episodes, in one figure.
+    """Draw every metric of one or several runs over episodes, in one figure; or a sweep.
 
     Runs that differ in nothing but the seed are drawn as one line, their median, with a band from the
     lowest to the highest. The name of several runs stands for all of them.
+
+    The name of a sweep stands for it: its objective is drawn against each parameter and in parallel
+    coordinates, and over episodes for the best and the median trial.
 
     \b
     Examples:
       dualtaxi plot @latest
       dualtaxi plot cooperative competitive -o comparison.pdf
+      dualtaxi plot hyperparameters -o hyperparameters.png
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.series import groups_of, read_series
     from runner.export.plots import panels_of
@@ -40,11 +44,16 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     from runner.export.report_runs import find_runs, shortcomings, state_of, write_new
     from runner.recording.reader import open_recording
     from runner.runs import recordings_folder
+    from runner.sweep.state import is_sweep
 
     check_suffix(output)
     matplotlib_of("a plot")
+    folder = recordings_folder(recordings)
+    if is_sweep(run_names, folder):
+        _draw_sweep(run_names[0], folder, output, force)
+        return
     series = []
-    for run in map(recorded, find_runs(run_names, recordings_folder(recordings))):
+    for run in map(recorded, find_runs(run_names, folder)):
         with open_recording(run.recording) as recording:
             series.append(read_series(recording))
             if state_of(recording) != "finished":
@@ -53,3 +62,18 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     panels = panels_of(groups)
     write_new(output, force, lambda path: save_figure(path, groups, panels))
     click.echo(f"{output}: {len(panels)} metrics of {len(series)} run{'s' if len(series) > 1 else ''}")
+
+
+def _draw_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
+    from runner.export.report_runs import write_new
+    from runner.sweep.figure import save_figure
+    from runner.sweep.plots import learning, panel_of, picture_of
+    from runner.sweep.results import results_of
+    from runner.sweep.state import read_sweep
+
+    results = results_of(read_sweep(name, recordings), recordings)
+    picture = picture_of(results)
+    groups, panels = learning(results, recordings)
+    panel = panel_of(results.sweep.objective.metric, panels)
+    write_new(output, force, lambda path: save_figure(path, f"Sweep {name}", picture, groups, panel))
+    click.echo(f"{output}: the sweep {name}, {len(picture.trials)} trials, {len(picture.axes)} parameters")

@@ -46,28 +46,50 @@ def command(
     force: bool,
     recordings: Path | None,
 ) -> None:
-    """Write one self-contained page about one or several runs.
+    """Write one self-contained page about one or several runs, or about a sweep.
 
     It has the plots, what was learned before, in the middle of and after training, all evaluations, the
     configuration and provenance, and a replay of the best and the worst trial of the last evaluation and
     of the first and the last training episode. It needs no network.
 
+    The page of a sweep, which its name stands for, has the objective against each parameter, parallel
+    coordinates, the ranking, what mattered, and the learning curves of the best and the median trial.
+
     \b
     Examples:
       dualtaxi report @latest
       dualtaxi report cooperative competitive -o comparison.html
+      dualtaxi report hyperparameters -o hyperparameters.html
       dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
     """  # noqa: D301 - Click wants the backspace itself
     from runner.export.report import require_packages, write_report
     from runner.export.report_runs import find_runs, parse_trial, write_new
     from runner.runs import recordings_folder
+    from runner.sweep.state import is_sweep
 
     require_packages()
+    folder = recordings_folder(recordings)
+    if is_sweep(run_names, folder):
+        if episodes or trials:
+            raise click.UsageError("a sweep's page shows no episode: leave out --episode and --eval.")
+        _report_sweep(run_names[0], folder, output, force)
+        return
     chosen = [("train", number, 0) for number in episodes]
     chosen += [("eval", *parse_trial(text)) for text in trials]
-    paths = [run.recording for run in map(recorded, find_runs(run_names, recordings_folder(recordings)))]
+    paths = [run.recording for run in map(recorded, find_runs(run_names, folder))]
     said: list[str] = []
     write_new(output, force, lambda path: said.extend(write_report(path, paths, chosen)))
     for sentence in said:
         say(sentence)
     click.echo(f"{output}: {size(output.stat().st_size)}, {len(paths)} run{'s' if len(paths) > 1 else ''}")
+
+
+def _report_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
+    from runner.export.report_runs import write_text_new
+    from runner.sweep.page import render_sweep
+    from runner.sweep.results import results_of
+    from runner.sweep.state import read_sweep
+
+    results = results_of(read_sweep(name, recordings), recordings)
+    write_text_new(output, force, render_sweep(results, recordings))
+    click.echo(f"{output}: {size(output.stat().st_size)}, the sweep {name}")

@@ -162,7 +162,7 @@ def show(
     """Rank the trials of the sweep NAME, with intervals over seeds; tell what mattered.
 
     A trial counts by the median over its seeds; beside it stands the interquartile mean (IQM) with its
-    95 % bootstrap interval, for four seeds and more. What mattered is Optuna's PED-ANOVA importance.
+    95 % bootstrap interval, for four seeds and more. What mattered is Optuna's fANOVA importance.
 
     \b
     Examples:
@@ -261,6 +261,7 @@ def _standing(sweep: Sweep, standing: Standing) -> dict[str, str]:
     told = {
         sweep.name: f"{bar:░<20} {standing.done:,} of {standing.runs:,} runs, {standing.running} running"
         + (f", {standing.pruned:,} given up" if standing.pruned else "")
+        + (f", {standing.excluded:,} trials left out" if standing.excluded else "")
         + (f", {standing.failed:,} failed" if standing.failed else ""),
         "rate": (f"{rate:.1f} runs/s, {duration(left / rate)} left" if rate else "–")
         + f", {duration(standing.seconds)} so far, {size(standing.bytes)} of disk",
@@ -281,7 +282,12 @@ def _tell_plan(sweep: Sweep, plan: Plan, as_json: bool) -> None:
             {
                 "sweep": f"{sweep.name}, {sweep.file.strategy}",
                 "runs": f"{plan.runs:,}: {plan.trials:,} trials, {len(sweep.seeds)} seeds each, of "
-                f"{amount(sweep.base.episodes)} episodes",
+                f"{amount(sweep.base.episodes)} episodes"
+                + (
+                    f"; {plan.excluded} trials left out, whose values do not go together"
+                    if plan.excluded
+                    else ""
+                ),
                 **values,
                 "objective": sweep.objective.described,
                 "disk": f"about {size(plan.bytes)}, {size(plan.bytes_a_run)} a run",
@@ -310,6 +316,7 @@ def _tell(sweep: Sweep, trials: Trials, standing: Standing, as_json: bool) -> No
                 "done": standing.done,
                 "pruned": standing.pruned,
                 "failed": standing.failed,
+                "excluded": standing.excluded,
                 "stopped": standing.stopped or None,
                 "seconds": round(standing.seconds, 3),
                 "bytes": standing.bytes,
@@ -322,7 +329,7 @@ def _tell(sweep: Sweep, trials: Trials, standing: Standing, as_json: bool) -> No
             told["best"] = f"{best.value:g} in trial {best.number}: {words(best.values)}"
         draw(facts(told | {"next": f"dualtaxi sweep show {sweep.name}"}))
     for trial in trials.told:
-        for error in trial.errors:
+        for error in trial.errors if trial.state == "failed" else ():
             say(f"Failed: trial {trial.number}, {error}")
     if standing.stopped:
         say(f"Stopped: {standing.stopped}. --resume goes on from there.")

@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import time
+from dataclasses import replace
 
 import pytest
 from sweeping import Here, described, digests, swept
@@ -20,7 +21,8 @@ from runner.runs import create_run, find_run, list_runs
 from runner.sweep import state
 from runner.sweep.loading import from_values
 from runner.sweep.local import LocalWorkers
-from runner.sweep.results import ranking, results_of
+from runner.sweep.plan import plan_of
+from runner.sweep.results import ranking, results_of, sections
 
 
 def test_each_run_is_an_ordinary_one_tagged_with_the_sweep(done):
@@ -61,6 +63,23 @@ def test_a_sweep_that_was_cut_off_twice_goes_on_as_if_it_never_had_been(done, sw
     assert digests(trials) == digests(done[1])
     assert third.done == 12 - 3 - 4
     assert len(list_runs(tmp_path)) == 12
+
+
+def test_runs_recorded_elsewhere_are_moved_whole_and_gone_on_with(done, sweep, tmp_path):
+    class Elsewhere(Here):
+        def give(self, task):
+            super().give(replace(task, elsewhere=True))
+
+    first = Elsewhere(most=3)
+    _, standing = swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
+    assert standing.stopped
+    begun = {run.run_id for run in list_runs(tmp_path)}
+    assert {run.status for run in list_runs(tmp_path)} == {"finished", "interrupted"}
+    trials, _ = swept(tmp_path, sweep, Elsewhere())
+    assert digests(trials) == digests(done[1])
+    assert begun < {run.run_id for run in list_runs(tmp_path)}
+    assert len(list_runs(tmp_path)) == 12
+    assert [path.name for path in tmp_path.glob(".*")] == [".sweeps"]
 
 
 def test_a_finished_sweep_is_not_done_again(done, sweep):
@@ -139,7 +158,7 @@ def test_two_trials_that_want_one_job_share_its_run(tmp_path):
     assert standing.done == 16
 
 
-def test_values_that_do_not_go_together_are_a_failed_trial(tmp_path):
+def test_values_that_do_not_go_together_are_left_out(tmp_path):
     base = described()["base"] | {"env": {"id": "dualtaxi:DualTaxi-v1"}, "mode": "competitive", "episodes": 2}
     parameters = {
         "mode": ["competitive", "cooperative"],
@@ -149,9 +168,11 @@ def test_values_that_do_not_go_together_are_a_failed_trial(tmp_path):
         described(strategy="grid", trials=None, seeds=[0], base=base, parameters=parameters, objective={})
     )
     trials, standing = swept(tmp_path, sweep)
-    assert [trial.state for trial in trials.told] == ["finished", "finished", "finished", "failed"]
+    assert [trial.state for trial in trials.told] == ["finished", "finished", "finished", "excluded"]
     assert "found tables: joint" in trials.told[3].errors[0]
-    assert standing.failed == 1
+    assert (standing.runs, standing.done, standing.failed, standing.excluded) == (3, 3, 0, 1)
+    assert plan_of(sweep).excluded == 1
+    assert "found tables: joint" in str(sections(results_of(sweep, tmp_path)))
 
 
 def test_a_changed_sweep_is_refused_with_what_changed(sweep, tmp_path):

@@ -1,0 +1,62 @@
+"""A sweep as one self-contained page: what came of it, what mattered, and how the best trial learned."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from runner.export.plots_figure import COLOURS, footnote, is_wide, panel_svg
+from runner.export.report import TEMPLATES, require_packages, templates
+from runner.sweep.figure import parallel_svg, parameter_svgs
+from runner.sweep.plots import learning, picture_of
+from runner.sweep.results import Results, sections
+
+
+def render_sweep(results: Results, recordings: Path) -> str:
+    """Return the page.
+
+    Args:
+        results: of the sweep.
+        recordings: the folder of its runs.
+
+    Raises:
+        MissingExtra: Jinja2 or Matplotlib is not installed.
+        RunnerError: no trial is finished yet, or a run cannot be read.
+    """
+    require_packages()
+    picture = picture_of(results)
+    groups, panels = learning(results, recordings)
+    made = sections(results)
+    return (
+        templates()
+        .get_template("sweep.html")
+        .render(
+            title=made[0].title,
+            lead=made[0].sentences,
+            sections=[_section(each) for each in made],
+            parameters=parameter_svgs(picture),
+            parallel=parallel_svg(picture),
+            note=picture.footnote,
+            best=results.best_yaml,
+            legend=[
+                (i % len(COLOURS), COLOURS[i % len(COLOURS)], group.label.partition(",")[0], group.described)
+                for i, group in enumerate(groups)
+            ],
+            panels=[{"svg": panel_svg(panel, len(groups)), "wide": is_wide(panel)} for panel in panels],
+            footnote=footnote(groups),
+            moment=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+            style=(TEMPLATES / "report.css").read_text("utf-8"),
+            dark=(TEMPLATES / "report_dark.css").read_text("utf-8"),
+        )
+    )
+
+
+def _section(section: Any) -> dict[str, Any]:
+    return {
+        "id": re.sub(r"\W+", "-", section.title.partition(":")[0].lower()),
+        "title": section.title,
+        "sentences": section.sentences,
+        "grids": section.grids,
+    }

@@ -1,0 +1,118 @@
+"""Plots and page of a sweep."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from click.testing import CliRunner
+from sweeping import described, digests, swept
+
+from runner.cli import cli
+from runner.config import from_mapping
+from runner.errors import RunnerError
+from runner.sweep import state
+from runner.sweep.loading import from_values
+from runner.sweep.plots import learning, panel_of, picture_of
+from runner.sweep.results import results_of
+
+
+@pytest.fixture(scope="module")
+def results(done, sweep):
+    return results_of(sweep, done[0])
+
+
+def typed(*words):
+    result = CliRunner().invoke(cli, [str(word) for word in words])
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def test_each_trial_stands_at_its_values(results, done):
+    picture = picture_of(results)
+    by_number = {trial.number: trial for trial in done[1].told}
+    assert picture.trials[0].number == done[1].best().number
+    step_size, discount = picture.axes
+    for place, choice, value, trial in zip(
+        step_size.values, discount.values, picture.values, picture.trials, strict=True
+    ):
+        told = by_number[trial.number]
+        assert place == told.values["step_size"]
+        assert discount.choices[int(choice)] == str(told.values["discount"])
+        assert value == told.value
+    assert all(
+        low <= value <= high for value, (low, high) in zip(picture.values, picture.ranges, strict=True)
+    )
+
+
+def test_the_best_and_the_median_learn_as_their_runs_did(results, done):
+    groups, panels = learning(results, done[0])
+    best = next(group for group in groups if group.label.startswith("best"))
+    assert {run.run_id for run in best.runs} == set(results.ranking[0].runs.values())
+    panel = panel_of("training.mean_reward", panels)
+    curve = next(curve for curve in panel.curves if groups[curve.group] is best)
+    assert curve.median[-1] == pytest.approx(results.ranking[0].median)
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
+def test_a_sweep_is_drawn_by_its_name(done, tmp_path, suffix):
+    output = tmp_path / f"small.{suffix}"
+    told = typed("plot", "small", "-o", output, "--recordings", done[0])
+    assert "the sweep small, 6 trials, 2 parameters" in told.stdout
+    assert output.stat().st_size > 10_000
+
+
+def test_the_page_of_a_sweep_stands_alone(done, results, tmp_path):
+    output = tmp_path / "small.html"
+    typed("report", "small", "-o", output, "--recordings", done[0])
+    page = output.read_text()
+    for title in ("step_size", "discount", "Learning curves", "Ranking", "The best configuration"):
+        assert title in page
+    assert not re.search(r"(src|href)=.(https?:)?//", page)
+    assert results.best_yaml.splitlines()[0] in page
+    ids = re.findall(r'\bid="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+
+
+def test_the_best_configuration_gives_the_best_trials_runs_with_steps(results, done):
+    import yaml
+
+    config = from_mapping(yaml.safe_load(results.best_yaml))
+    assert (config.name, config.recording.steps) == ("small_best", "all")
+    assert (
+        from_mapping(done[1].best().config).to_mapping()
+        | {
+            "name": "small_best",
+            "recording": config.to_mapping()["recording"],
+        }
+        == config.to_mapping()
+    )
+
+
+def test_nothing_finished_is_nothing_to_draw(tmp_path):
+    sweep = from_values(described())
+    state.begin(sweep, tmp_path, resume=False, accept_changes=False)
+    with pytest.raises(RunnerError, match="no finished trial yet"):
+        picture_of(results_of(sweep, tmp_path))
+
+
+def test_values_tried_again_are_shown_once(tmp_path):
+    sweep = from_values(described(strategy="random", trials=8, parameters={"discount": [0.5, 0.9]}))
+    swept(tmp_path, sweep)
+    results = results_of(sweep, tmp_path)
+    assert len(results.ranking) == 2
+    assert sum(1 + len(entry.again) for entry in results.ranking) == 8
+
+
+def test_a_level_never_reached_is_left_out_of_the_picture(tmp_path):
+    objective = {
+        "metric": "training.percent_filled",
+        "at": "first_over",
+        "level": 101,
+        "direction": "minimize",
+    }
+    sweep = from_values(described(objective=objective, trials=3))
+    trials, _ = swept(tmp_path, sweep)
+    assert len(digests(trials)) == 3
+    with pytest.raises(RunnerError, match="nothing to draw"):
+        picture_of(results_of(sweep, tmp_path))
