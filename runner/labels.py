@@ -9,7 +9,7 @@ replaced whole, under a lock.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -47,6 +47,11 @@ def read_labels(folder: Path) -> Labels:
         found = read_object(folder / LABELS_FILE, MAX_LABELS_BYTES)
     except (OSError, ValueError):
         return Labels()
+    return labels_from(found)
+
+
+def labels_from(found: Mapping[str, Any]) -> Labels:
+    """Return what is said by a JSON object; what cannot be understood counts as not said."""
     name, tags, note = found.get("name"), found.get("tags"), found.get("note")
     sound = [tag for tag in tags if is_tag(tag)] if isinstance(tags, list) else []
     return Labels(
@@ -75,7 +80,7 @@ def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
             after = change(before)
             _check(after)
             if after != before:
-                write_whole(folder / LABELS_FILE, _as_json(after))
+                write_whole(folder / LABELS_FILE, as_json(after))
             return after
     except Timeout as error:
         raise StorageError(
@@ -100,6 +105,7 @@ def _check(labels: Labels) -> None:
         raise RunnerError(f"note: found {len(labels.note):,} characters, expected at most {MAX_NOTE:,}.")
 
 
-def _as_json(labels: Labels) -> dict[str, Any]:
+def as_json(labels: Labels) -> dict[str, Any]:
+    """Return labels as their file has them; what is not said is left out."""
     told = {"name": labels.name, "tags": list(labels.tags), "note": labels.note}
     return {key: value for key, value in told.items() if value}

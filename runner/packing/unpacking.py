@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from runner.catalogue.finding import candidates
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.labels import LABELS_FILE
 from runner.packing.container import Manifest, Pack, PackError, opened
@@ -18,7 +19,7 @@ from runner.packing.packing import facts_bytes, run_facts
 from runner.recording.facts import json_object
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of, rewrite
-from runner.runs import RECORDING_FILE, RUN_FILE, Run, find_run, list_runs, new_run_id
+from runner.runs import RECORDING_FILE, RUN_FILE, Run, find_run, new_run_id, runs_in
 
 
 @dataclass(frozen=True)
@@ -45,10 +46,10 @@ def unpack(path: Path, recordings: Path, as_new: bool = False) -> Unpacked:
         StorageError: the recordings folder cannot be written, or has no room.
     """
     with opened(path) as pack:
-        if not as_new and (run := _known(pack.manifest, recordings)) is not None:
+        if not as_new and (run := _known_as(pack.manifest, recordings)) is not None:
             _take_all(pack, None)
             return Unpacked(run, pack.manifest, already=True)
-        with _workplace(recordings) as folder:
+        with workplace(recordings) as folder:
             _check_room(path, folder)
             _take_all(pack, folder)
             _check(path, folder, pack.manifest)
@@ -59,22 +60,38 @@ def unpack(path: Path, recordings: Path, as_new: bool = False) -> Unpacked:
         return Unpacked(find_run(f"{recordings}{os.sep}{run_id}", recordings), pack.manifest, False)
 
 
-def _known(manifest: Manifest, recordings: Path) -> Run | None:
-    """Return the run that is there already with this content; None if its place is free."""
-    known = next((run for run in list_runs(recordings) if run.run_id == manifest.run_id), None)
-    if known is None:
-        if os.path.lexists(recordings / manifest.run_id):
-            raise StorageError(
-                f"{recordings / manifest.run_id}: is there already and is no run; move it away."
-            )
+class Occupied(RunnerError):
+    """Another run of this id is there already."""
+
+
+def known(run_id: str, content_digest: str, recordings: Path) -> Run | None:
+    """Return the run of this id that is there already with this content; None if its place is free.
+
+    Raises:
+        Occupied: one of this id and other content is there.
+        StorageError: something that is no run has its place.
+    """
+    taken = next((run for run in candidates(recordings) if run.run_id == run_id), None)
+    found = taken and next(runs_in(Path(taken.root, taken.entry)), None)
+    if found is None:
+        if os.path.lexists(recordings / run_id):
+            raise StorageError(f"{recordings / run_id}: is there already and is no run; move it away.")
         return None
     with contextlib.suppress(RecordingError):
-        if content_of(known.recording) == manifest.content_digest:
-            return known
-    raise RunnerError(
-        f"{recordings}: found another run {known.run_id} ({known.name}, seed {known.seed}, {known.status}), "
-        f"whose content is not that of the packed one ({manifest.status}); --as-new unpacks it under another."
+        if content_of(found.recording) == content_digest:
+            return found
+    raise Occupied(
+        f"{recordings}: found another run {found.run_id} ({found.name}, seed {found.seed}, {found.status}), "
+        "whose content is not that of the one to come"
     )
+
+
+def _known_as(manifest: Manifest, recordings: Path) -> Run | None:
+    """Return the run that is there already with the content of a packed one, as `known` does."""
+    try:
+        return known(manifest.run_id, manifest.content_digest, recordings)
+    except Occupied as error:
+        raise RunnerError(f"{error} ({manifest.status}); --as-new unpacks it under another.") from error
 
 
 def _take_all(pack: Pack, folder: Path | None) -> None:
@@ -91,7 +108,7 @@ def _take_all(pack: Pack, folder: Path | None) -> None:
 
 
 @contextlib.contextmanager
-def _workplace(recordings: Path) -> Iterator[Path]:
+def workplace(recordings: Path) -> Iterator[Path]:
     """Give a folder within a hidden one, so that it is no run as long as it is there; both are gone after."""
     made = not recordings.exists()
     hidden = recordings / f".unpacking-{secrets.token_hex(4)}"

@@ -59,6 +59,27 @@ def check_integrity(path: Path) -> None:
         _refuse_tail(path, contents.end, found, expected)
 
 
+def is_merely_cut_off(path: Path) -> bool:
+    """Return whether an unfinished recording is, as far as it goes, what its recorder wrote.
+
+    Raises:
+        RecordingError: the file cannot be read, or begins as none of ours does.
+    """
+    try:
+        with path.open("rb") as stream:
+            _check_beginning(stream, path)
+        contents = survey(path, keep_result=True, check=_IndexCheck(path).take)
+        if contents.reason:
+            return may_be_cut(path, contents)
+        with RecordingFile.inspect(path, contents) as file:
+            expected = file.tail()
+        with path.open("rb") as stream:
+            stream.seek(contents.end)
+            return expected.startswith(stream.read(len(expected) + 1))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+
+
 def checked_survey(path: Path) -> Contents:
     """Return what of a recording is good to the last byte, from its beginning on; its result left out.
 

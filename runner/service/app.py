@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator
 from http import HTTPStatus
 from typing import Any, Final
 
+import anyio
 import anyio.to_thread
 from fastapi import APIRouter, FastAPI
 
@@ -16,13 +17,16 @@ from runner import __version__
 from runner.errors import RunnerError
 from runner.service import pages
 from runner.service.apart import Apart
-from runner.service.api import comparing, files, jobs, reading, runs
+from runner.service.api import comparing, files, jobs, reading, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
 from runner.service.kept import Kept
 from runner.service.problems import answer_errors, answers
 from runner.service.security import Tokens
 from runner.service.settings import Settings
+from runner.service.upload import Limits as UploadLimits
+from runner.service.upload import Upload
+from runner.service.uploads import Uploads
 from runner.service.work import Jobs
 
 API: Final = "/api/v1"
@@ -79,7 +83,7 @@ def _api() -> APIRouter:
         HTTPStatus.INSUFFICIENT_STORAGE,
     )
     api = APIRouter(responses=general)
-    for part in (runs, reading, comparing, files, jobs):
+    for part in (runs, reading, comparing, files, jobs, uploads):
         api.include_router(part.router)
     return api
 
@@ -105,6 +109,21 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
         app.state.jobs = stack.enter_context(
             Jobs(settings.recordings[0], settings.workers, most_waiting=settings.limits.jobs)
         )
+        app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
+        app.state.uploads = stack.enter_context(
+            Uploads(
+                settings.recordings[0],
+                UploadLimits(most_bytes=settings.limits.upload_bytes),
+                lambda upload: _uploaded(app, upload),
+            )
+        )
         app.state.apart.prepare()
         yield {}
         app.state.stopping.set()
+
+
+def _uploaded(app: FastAPI, upload: Upload) -> None:
+    """Say what became of an upload."""
+    app.state.catalogue.changed()
+    facts = {"state": upload.state, "run_id": upload.run_id, "bytes": upload.size, "problem": upload.problem}
+    LOG.info("upload", extra=facts)

@@ -55,6 +55,11 @@ class Catalogue:
         """Say that a run is not as it was: whoever asks from now on is told of it as it is."""
         self._changed = time.monotonic()
 
+    @property
+    def last_change(self) -> float:
+        """When something was last said to have changed, in seconds of the monotonic clock."""
+        return self._changed
+
     def read(self, work: Callable[[Index], Found]) -> Found:
         """Return what some work finds in the index.
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 OPEN_PATHS: Final = ("/healthz", "/readyz", "/login", "/static/")
 """What needs no token: these, and what is below those that end in a slash."""
 UPLOADS: Final = "/api/v1/uploads"
-"""Below it a body may be as long as a recording."""
+"""Below it what is sent by PATCH may be as long as a recording."""
 LEAST_RATE: Final = 1000
 """Bytes a second of a body, on average; slower clients are cut off."""
 POLICY: Final = (
@@ -70,7 +70,8 @@ class Guard:
             await refusal(status_of(error), trouble_of(error), said)(scope, receive, _with_headers(send))
             return
         limits = self._settings.limits
-        most = limits.upload_bytes if scope["path"].startswith(UPLOADS) else limits.body_bytes
+        streamed = scope["method"] == "PATCH" and scope["path"].startswith(UPLOADS)
+        most = limits.upload_bytes if streamed else limits.body_bytes
         body = Body(receive, most, limits.idle_seconds)
         await self._app(scope, body.receive, _with_headers(send))
 

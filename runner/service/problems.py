@@ -26,11 +26,13 @@ from runner.errors import (
     StorageError,
 )
 from runner.service.queue import NoSuchJob, NotPossibleNow, QueueFull
+from runner.service.upload import Conflict, TooLarge, TooMany
 
 LOG: Final = logging.getLogger("dualtaxi.service")
 
 _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
     ConfigError: HTTPStatus.UNPROCESSABLE_ENTITY,
+    Conflict: HTTPStatus.CONFLICT,
     Diverged: HTTPStatus.CONFLICT,
     EnvironmentNotUsable: HTTPStatus.UNPROCESSABLE_ENTITY,
     MissingExtra: HTTPStatus.NOT_IMPLEMENTED,
@@ -40,6 +42,8 @@ _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
     RecordingError: HTTPStatus.CONFLICT,
     RunNotFound: HTTPStatus.NOT_FOUND,
     StorageError: HTTPStatus.INSUFFICIENT_STORAGE,
+    TooLarge: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+    TooMany: HTTPStatus.TOO_MANY_REQUESTS,
 }
 
 

@@ -1,0 +1,381 @@
+"""A client of the service: pushes runs, and pulls them, whatever the connection does meanwhile.
+
+    from runner.service.client import Client
+
+    with Client("http://localhost:8000") as client:
+        client.push(runner.find_run("@latest", Path("recordings")))
+
+What was sent before a connection broke is not sent again; the same run pushed twice is there once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
+from urllib.parse import urlsplit
+
+from blake3 import blake3
+
+from runner.errors import MissingExtra, RunnerError
+from runner.runs import Run
+
+if TYPE_CHECKING:
+    import httpx2
+
+TOKEN_VARIABLE: Final = "DUALTAXI_TOKEN"
+TOKEN_FILE_VARIABLE: Final = "DUALTAXI_TOKEN_FILE"
+API: Final = "/api/v1"
+PIECE: Final = 32 << 20
+"""So much is sent in one request; a proxy in front of the server must let it pass."""
+_READ: Final = 1 << 20
+_MAX_TOKEN_FILE: Final = 4096
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 5.0
+_WAIT_SECONDS: Final = 20
+_PASSING: Final = (408, 429, 500, 502, 503, 504, 507)
+"""What a server answers that may answer otherwise a little later."""
+
+Report = Callable[[int, int], object]
+"""Told how many bytes of how many are there."""
+
+
+class ServerError(RunnerError):
+    """A server refuses what was asked of it; its own words stand in the message."""
+
+    exit_code = 1
+
+    def __init__(self, message: str, status: int = 0) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class ServerAway(ServerError):
+    """A server does not answer, or cannot do what was asked at present."""
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """What is sent: a file, and what its sender says of the run in it."""
+
+    path: Path
+    name: str = ""
+    run_id: str = ""
+    content_digest: str | None = None
+    run: Mapping[str, Any] = field(default_factory=dict)
+    labels: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, run: Run) -> Parcel:
+        """Return a run that is over, to be sent.
+
+        Raises:
+            RunnerError: it is running, or in an archive alone.
+        """
+        if run.status not in ("finished", "interrupted", "failed"):
+            raise RunnerError(
+                f"run {run.run_id} is {run.status}; only one that is over and here can be pushed."
+            )
+        summary, labels = run.summary, run.labels
+        told = {"name": str(run.facts["name"]), "status": run.status, "proof": run.facts.get("proof")}
+        told |= {key: summary.get(key) for key in ("seconds", "error")}
+        return cls(
+            run.recording,
+            run.name,
+            run.run_id,
+            summary.get("content_digest"),
+            {key: value for key, value in told.items() if value is not None},
+            {"name": labels.name, "tags": list(labels.tags), "note": labels.note},
+        )
+
+
+@dataclass(frozen=True)
+class Sent:
+    """An upload as the server says it stands."""
+
+    id: str
+    state: str
+    offset: int
+    run_id: str = ""
+    already: bool = False
+    problem: str = ""
+
+
+class Client:
+    """A connection to a server; a context manager.
+
+    Args:
+        url: where it is, such as `http://localhost:8000`.
+        token: what lets it in; `found_token()` looks for one where it is usually kept.
+        patience: for so many seconds it is tried again when the server is away.
+
+    Raises:
+        RunnerError: it is no address of a server.
+        MissingExtra: HTTPX is not installed.
+    """
+
+    def __init__(self, url: str, token: str | None = None, patience: float = 60.0) -> None:
+        self.url = checked_url(url)
+        self._patience = patience
+        try:
+            import httpx2
+        except ImportError as error:
+            raise MissingExtra("httpx2", "service", "speaking to a server") from error
+        parts = urlsplit(self.url)
+        origin = f"{parts.scheme}://{parts.netloc}"
+        self._errors = httpx2.TransportError
+        self._http = httpx2.Client(
+            base_url=self.url + API,
+            headers={"Authorization": f"Bearer {token}"} if token else {"Origin": origin},
+            timeout=httpx2.Timeout(30.0, read=60.0),
+        )
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._http.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
+
+    # --- pushing --------------------------------------------------------------------------------------
+
+    def push(self, parcel: Parcel | Run, report: Report = lambda *_: None, begun: Sent | None = None) -> Sent:
+        """Send a run, and return what became of it when the server has verified and stored it.
+
+        Args:
+            parcel: a run that is over, or a file with what is said of it.
+            report: told the progress.
+            begun: the upload that has its beginning already.
+
+        Raises:
+            ServerError: it was refused, with the reason.
+            ServerAway: the server did not answer for too long; what it has, it keeps for the next time.
+            RunnerError: the run cannot be sent.
+        """
+        if isinstance(parcel, Run):
+            parcel = Parcel.of(parcel)
+        size, digest = _size_and_digest(parcel.path)
+        sent = _Delivery(self, parcel, size, digest, report, begun).done(self._patience)
+        if sent.state == "refused" and begun is not None:  # the file has become another since it began
+            sent = _Delivery(self, parcel, size, digest, report, None).done(self._patience)
+        if sent.state == "refused":
+            raise ServerError(f"{self.url}: refused the run {parcel.run_id}: {sent.problem}")
+        return sent
+
+    def begin(self, **announced: Any) -> Sent:
+        """Begin an upload, or find the one of the same bytes.
+
+        Raises:
+            ServerError: the server refuses, or is away.
+        """
+        told = {key: value for key, value in announced.items() if value not in (None, "")}
+        return _sent(self.ask("POST", "/uploads", json=told))
+
+    def append(self, sent: Sent, path: Path, end: int) -> Sent:
+        """Send what an upload lacks of a file up to some place, in one request; not more than a piece.
+
+        Raises:
+            ServerError: the server refuses, or is away.
+        """
+        size = min(end - sent.offset, PIECE)
+        with path.open("rb") as stream:
+            stream.seek(sent.offset)
+            answer = self.ask(
+                "PATCH",
+                f"/uploads/{sent.id}",
+                content=_pieces(stream, size, path),
+                headers={"Upload-Offset": str(sent.offset), "Content-Length": str(size)},
+            )
+        return Sent(sent.id, sent.state, int(answer.headers["Upload-Offset"]), sent.run_id)
+
+    def standing(self, sent: Sent, wait: float = 0) -> Sent:
+        """Return how an upload stands now, or when it is verified.
+
+        Raises:
+            ServerError: the server refuses, or is away.
+        """
+        return _sent(self.ask("GET", f"/uploads/{sent.id}", params={"wait": wait}))
+
+    def complete(self, sent: Sent, parcel: Parcel, size: int, digest: str) -> Sent:
+        """Say that all is there.
+
+        Raises:
+            ServerError: the server refuses, or is away.
+        """
+        told = {"digest": digest, "size": size, "run": dict(parcel.run), "labels": dict(parcel.labels)}
+        return _sent(self.ask("POST", f"/uploads/{sent.id}/complete", json=told))
+
+    def ask(self, method: str, path: str, **request: Any) -> httpx2.Response:
+        """Return the answer to a request, which is no error.
+
+        Raises:
+            ServerError: the server refuses, or is away.
+        """
+        try:
+            answer = self._http.request(method, path, **request)
+        except self._errors as error:
+            raise ServerAway(f"{self.url}: does not answer ({error or type(error).__name__}).") from error
+        if answer.is_success:
+            return answer
+        kind = ServerAway if answer.status_code in _PASSING else ServerError
+        raise kind(f"{self.url}: {_message(answer)}", answer.status_code)
+
+
+class _Delivery:
+    """A file on its way, step by step; a step that fails is taken again after a while."""
+
+    def __init__(
+        self, client: Client, parcel: Parcel, size: int, digest: str, report: Report, begun: Sent | None
+    ) -> None:
+        self._client, self._parcel, self._report = client, parcel, report
+        self._size, self._digest = size, digest
+        self._sent = begun
+        self._is_stale = begun is not None
+
+    def done(self, patience: float) -> Sent:
+        """Return the upload when it is stored or refused.
+
+        Raises:
+            ServerError: the server refuses the request, or was away for longer than the patience.
+        """
+        furthest, moved, pause = -1, time.monotonic(), _FIRST_PAUSE
+        while True:
+            try:
+                sent = self._sent = self._step()
+                self._is_stale = False
+            except ServerError as error:
+                if not _may_pass(error) or time.monotonic() + pause > moved + patience:
+                    raise
+                self._sent = None if error.status == HTTPStatus.NOT_FOUND else self._sent
+                self._is_stale = True
+                time.sleep(pause)
+                pause = min(2 * pause, _LONGEST_PAUSE)
+                continue
+            if sent.state in ("stored", "refused"):
+                return sent
+            if sent.offset > furthest:
+                furthest, moved, pause = sent.offset, time.monotonic(), _FIRST_PAUSE
+            self._report(sent.offset, self._size)
+
+    def _step(self) -> Sent:
+        client, sent, parcel = self._client, self._sent, self._parcel
+        if sent is None:
+            known = {"name": parcel.name, "run_id": parcel.run_id, "content_digest": parcel.content_digest}
+            return client.begin(digest=self._digest, size=self._size, **known)
+        if self._is_stale:
+            return client.standing(sent)
+        if sent.state == "verifying":
+            return self._verified(client.standing(sent, _WAIT_SECONDS))
+        if sent.offset < self._size:
+            return client.append(sent, parcel.path, self._size)
+        return client.complete(sent, parcel, self._size, self._digest)
+
+    def _verified(self, sent: Sent) -> Sent:
+        """Return an upload unless it could not be verified for now."""
+        if sent.state == "receiving" and sent.problem:
+            raise ServerAway(f"{self._client.url}: {sent.problem}")
+        return sent
+
+
+def _may_pass(error: ServerError) -> bool:
+    return isinstance(error, ServerAway) or error.status in (HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
+
+
+def checked_url(url: str) -> str:
+    """Return the address of a server, without a slash at its end.
+
+    Raises:
+        RunnerError: it is none.
+    """
+    parts = urlsplit(url)
+    if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
+        raise RunnerError(f"server: found {url!r}, expected an address such as http://localhost:8000.")
+    if parts.username is not None or parts.password is not None:
+        raise RunnerError(
+            f"server: found a name or password in the address of {parts.hostname}, expected none: a token is "
+            f"given by --token, ${TOKEN_VARIABLE} or a file named by ${TOKEN_FILE_VARIABLE}."
+        )
+    return url.rstrip("/")
+
+
+def found_token(said: str | None = None, file: Path | None = None) -> str | None:
+    """Return a token: what is said, or in a file; else what the variables say; None if there is none.
+
+    Raises:
+        RunnerError: it is none, or its file cannot be read.
+    """
+    if said is None and file is None:
+        said, named = os.environ.get(TOKEN_VARIABLE), os.environ.get(TOKEN_FILE_VARIABLE)
+        file = Path(named) if named else None
+    if said:
+        return _checked_token(said, "token")
+    return None if file is None else _checked_token(_beginning_of(file), os.fspath(file))
+
+
+def _beginning_of(file: Path) -> str:
+    try:
+        with file.open(encoding="utf-8") as stream:
+            return stream.read(_MAX_TOKEN_FILE)
+    except (OSError, ValueError) as error:
+        raise RunnerError(f"{file}: cannot be read, expected a file with a token.") from error
+
+
+def _checked_token(text: str, where: str) -> str:
+    token = text.strip()
+    if not token or not token.isascii() or not token.isprintable() or " " in token:
+        raise RunnerError(f"{where}: found no token, expected one line of letters and digits.")
+    return token
+
+
+def _size_and_digest(path: Path) -> tuple[int, str]:
+    try:
+        size = path.stat().st_size
+        digest = blake3()
+        if size:
+            digest.update_mmap(path)
+    except OSError as error:
+        raise RunnerError(f"{path}: cannot be read ({error.strerror}).") from error
+    return size, digest.hexdigest()
+
+
+def _pieces(stream: BinaryIO, size: int, path: Path) -> Iterator[bytes]:
+    """Yield so many bytes.
+
+    Raises:
+        RunnerError: there are fewer.
+    """
+    while size:
+        piece = stream.read(min(_READ, size))
+        if not piece:
+            raise RunnerError(f"{path}: became shorter while it was sent; try again.")
+        size -= len(piece)
+        yield piece
+
+
+def _sent(answer: httpx2.Response) -> Sent:
+    """Return what an answer says of an upload.
+
+    Raises:
+        ServerError: it says something else.
+    """
+    try:
+        told = answer.json()
+        return Sent(*(told[key] for key in ("id", "state", "offset", "run_id", "already", "problem")))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ServerError(
+            f"{answer.url}: found another answer than a dualtaxi server gives; is the address right?"
+        ) from error
+
+
+def _message(answer: httpx2.Response) -> str:
+    """Return what a server says is wrong."""
+    with contextlib.suppress(ValueError, KeyError, TypeError):
+        return str(answer.json()["error"]["message"])
+    return f"answers {answer.status_code} {answer.reason_phrase}; is it a dualtaxi server?"

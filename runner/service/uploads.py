@@ -1,0 +1,412 @@
+"""Uploads: recordings and packed runs on their way into a folder of runs; no HTTP in it.
+
+    recordings/.uploads/4f0c…/upload.json    what it is, and where it stands; replaced whole
+    recordings/.uploads/4f0c…/body           the bytes so far: its length is the offset to go on from
+
+An upload is received, piece by piece and in order; then verified, by a process of its own; and then stored,
+which is one renaming, or refused. The folder is the truth: a server that was killed goes on where it stands.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import secrets
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, Self
+
+from filelock import FileLock, Timeout
+
+from runner.documents import write_whole
+from runner.errors import RunnerError, RunNotFound, StorageError
+from runner.packing.admission import sync
+from runner.runs import run_at_once
+from runner.service.upload import (
+    BODY_FILE,
+    STATE_FILE,
+    Announcement,
+    Completion,
+    Conflict,
+    Limits,
+    State,
+    TooLarge,
+    TooMany,
+    Upload,
+    read_upload,
+)
+from runner.service.verifying import Verdict, Verifier
+
+FOLDER: Final = ".uploads"
+LOCK_FILE: Final = "lock"
+SWEEP_SECONDS: Final = 600.0
+"""So often is looked for uploads that are to be forgotten."""
+
+
+class Uploads:
+    """The uploads into one folder of runs; safe to use from several threads.
+
+    Args:
+        recordings: the folder of runs; made if it is missing.
+        limits: what is taken.
+        settled: told of each upload that was verified, by another thread.
+
+    Raises:
+        StorageError: the folder cannot be written.
+        RunnerError: another server takes uploads into it.
+    """
+
+    def __init__(
+        self,
+        recordings: Path,
+        limits: Limits = Limits(),  # noqa: B008 - frozen
+        settled: Callable[[Upload], object] = lambda _: None,
+    ) -> None:
+        self.limits = limits
+        self._tell = settled
+        self._recordings = recordings
+        self._folder = recordings / FOLDER
+        self._guard = threading.RLock()
+        self._swept = 0.0
+        self._used: set[str] = set()
+        self._lock = _only_server(self._folder)
+        self._uploads = {upload.upload_id: upload for upload in _read_all(self._folder)}
+        self._verifier = Verifier()
+        self._pool = ThreadPoolExecutor(limits.verifiers, "verifying")
+        self._forget_old()
+        for upload in self._uploads.values():
+            if upload.state == "verifying":
+                self._pool.submit(self._verify, upload.upload_id)
+
+    def close(self) -> None:
+        """Stop; what is being verified will be verified anew."""
+        self._verifier.stop()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._lock.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
+
+    # --- what is known --------------------------------------------------------------------------------
+
+    def all(self) -> list[Upload]:
+        """Return every upload that is known, the newest first."""
+        with self._guard:
+            return sorted(self._uploads.values(), key=lambda upload: upload.created, reverse=True)
+
+    def get(self, upload_id: str, owner: str) -> Upload:
+        """Return an upload of this owner.
+
+        Raises:
+            RunNotFound: there is none of this id, or it is another's.
+        """
+        with self._guard:
+            upload = self._uploads.get(upload_id)
+        if upload is None or not secrets.compare_digest(upload.owner.encode(), owner.encode()):
+            raise RunNotFound("no such upload: it was given up, is long over, or belongs to another token.")
+        return upload
+
+    def offset(self, upload: Upload) -> int:
+        """Return how many bytes of it are there."""
+        if upload.state == "receiving":
+            with _on_disk():
+                return self._body(upload.upload_id).stat().st_size
+        return upload.size or 0
+
+    # --- receiving ------------------------------------------------------------------------------------
+
+    def begin(self, owner: str, announced: Announcement) -> tuple[Upload, bool]:
+        """Return the upload of what is announced, and whether it is a new one.
+
+        The same digest from the same owner is the same upload. What is in the folder of runs already is
+        stored at once.
+
+        Raises:
+            TooLarge, TooMany: it is not taken.
+            StorageError: there is no room.
+        """
+        with self._guard:
+            if time.monotonic() - self._swept > SWEEP_SECONDS:
+                self._forget_old()
+            known = self._known(owner, announced)
+            if known is not None:
+                return known, False
+            run_id = self._stored_as(announced)
+            if not run_id:
+                self._check_room(announced.size)
+            upload = Upload(
+                upload_id=secrets.token_hex(16),
+                owner=owner,
+                created=datetime.now(UTC).isoformat(timespec="milliseconds"),
+                state="stored" if run_id else "receiving",
+                announced=announced,
+                run_id=run_id,
+                already=bool(run_id),
+            )
+            self._create(upload)
+            return upload, True
+
+    @contextlib.contextmanager
+    def appending(self, upload_id: str, owner: str, offset: int, length: int | None) -> Iterator[Appending]:
+        """Give what takes the bytes from an offset on; what was taken stays, however this ends.
+
+        Args:
+            upload_id: which upload.
+            owner: whose.
+            offset: where the bytes begin, which must be where those that are there end.
+            length: how many are said to come; None if that is not said.
+
+        Raises:
+            Conflict: they do not follow, or others are coming right now.
+            TooLarge: they would be too many.
+            StorageError: there is no room.
+        """
+        with self._in_use(upload_id, owner) as upload:
+            there = self.offset(upload)
+            if upload.state != "receiving" or offset != there:
+                raise Conflict(f"found bytes from {offset:,} on, expected {there:,} ({upload.state}).")
+            most = self.limits.most_bytes if upload.size is None else upload.size
+            if offset + (length or 0) > most:
+                raise TooLarge(f"found {offset + (length or 0):,} bytes, expected at most {most:,}.")
+            self._check_free(length or 0)
+            with _on_disk():
+                stream = self._body(upload_id).open("ab", buffering=0)
+            with stream:
+                yield Appending(stream.fileno(), most - offset)
+
+    def complete(self, upload_id: str, owner: str, completion: Completion) -> Upload:
+        """Say that all is there; it is put on disk, and verified. Returns the upload as it then is.
+
+        Raises:
+            Conflict: it is not all there, or another digest was announced or completed.
+        """
+        with self._in_use(upload_id, owner) as upload, _on_disk():
+            if upload.state != "receiving":
+                return _repeated(upload, completion)
+            if (there := self.offset(upload)) != completion.size:
+                raise Conflict(f"found {there:,} bytes, expected the {completion.size:,} of the completion.")
+            if upload.announced.digest not in (None, completion.digest):
+                raise Conflict("found another digest than the one announced; begin another upload.")
+            sync(self._body(upload_id))
+            changes = {"state": "verifying", "completion": completion, "problem": ""}
+            completed = upload.model_copy(update=changes)
+            self._write(completed)
+            with self._guard:
+                self._uploads[upload_id] = completed
+        self._pool.submit(self._verify, upload_id)
+        return completed
+
+    def give_up(self, upload_id: str, owner: str) -> None:
+        """Forget an upload, and remove what was received.
+
+        Raises:
+            Conflict: it is being received or verified.
+        """
+        with self._in_use(upload_id, owner) as upload, self._guard:
+            if upload.state == "verifying":
+                raise Conflict("the upload is being verified; wait for its end.")
+            self._forget(upload)
+
+    @contextlib.contextmanager
+    def _in_use(self, upload_id: str, owner: str) -> Iterator[Upload]:
+        """Give an upload that nobody else changes meanwhile."""
+        with self._guard:
+            upload = self.get(upload_id, owner)
+            if upload_id in self._used:
+                raise Conflict("another request sends to this upload; wait for its end.")
+            self._used.add(upload_id)
+        try:
+            yield upload
+        finally:
+            with self._guard:
+                self._used.discard(upload_id)
+
+    # --- inside ---------------------------------------------------------------------------------------
+
+    def _known(self, owner: str, announced: Announcement) -> Upload | None:
+        """Return the upload of the same bytes by the same owner, unless it came to nothing."""
+        if announced.digest is None:
+            return None
+        for upload in self._uploads.values():
+            same = (upload.announced.digest, upload.announced.size) == (announced.digest, announced.size)
+            if same and upload.owner == owner and upload.state != "refused":
+                gone = upload.state == "stored" and self._run(upload.run_id) is None
+                if not gone:
+                    return upload
+        return None
+
+    def _stored_as(self, announced: Announcement) -> str:
+        """Return the id of the run that has the announced content, if it is there already."""
+        facts = self._run(announced.run_id)
+        there = facts and facts.get("content_digest")
+        return announced.run_id if there and there == announced.content_digest else ""
+
+    def _run(self, run_id: str) -> dict[str, Any] | None:
+        """Return the summary of a run, None if there is none."""
+        if not re.fullmatch(r"[\w.-]{1,100}", run_id):
+            return None
+        run = run_at_once(run_id, self._recordings)
+        return None if run is None else run.summary
+
+    def _check_room(self, size: int | None) -> None:
+        if (size or 0) > self.limits.most_bytes:
+            raise TooLarge(f"found {size:,} bytes, expected at most {self.limits.most_bytes:,}.")
+        underway = sum(upload.state in ("receiving", "verifying") for upload in self._uploads.values())
+        if underway >= self.limits.most_open:
+            raise TooMany(f"{self.limits.most_open:,} uploads are open; try again when some are done.")
+        self._check_free(size or 0)
+
+    def _check_free(self, size: int) -> None:
+        free = shutil.disk_usage(self._folder).free - self.limits.spare_bytes
+        if size > free:
+            raise StorageError(f"the server has room for {max(free, 0):,} bytes, expected {size:,}.")
+
+    def _verify(self, upload_id: str) -> None:
+        """Have an upload verified, and say what came of it; the bytes go once they are needed no more."""
+        with self._guard:
+            upload = self._uploads.get(upload_id)
+        if upload is None or upload.state != "verifying":
+            return
+        verdict = self._verifier.verify(self._folder / upload_id, self._recordings)
+        if verdict is None:
+            return  # the server stops
+        settled = upload.model_copy(update=_settled(verdict))
+        with contextlib.suppress(StorageError):  # after a restart it is verified once more, to the same end
+            self._write(settled)
+        if settled.state != "receiving":
+            self._body(upload_id).unlink(missing_ok=True)
+        self._tell(settled)
+        with self._guard:
+            self._uploads[upload_id] = settled
+
+    def _write(self, upload: Upload) -> None:
+        with _on_disk():
+            write_whole(self._folder / upload.upload_id / STATE_FILE, upload.model_dump(mode="json"))
+
+    def _create(self, upload: Upload) -> None:
+        with _on_disk():
+            (self._folder / upload.upload_id).mkdir(parents=True)
+            self._body(upload.upload_id).touch()
+        self._write(upload)
+        self._uploads[upload.upload_id] = upload
+
+    def _body(self, upload_id: str) -> Path:
+        return self._folder / upload_id / BODY_FILE
+
+    def _forget_old(self) -> None:
+        """Forget the uploads to which nothing comes any more, and those that are long over."""
+        self._swept, now = time.monotonic(), time.time()
+        with self._guard:
+            for upload in list(self._uploads.values()):
+                days = (now - self._touched(upload)) / 86400
+                idle = upload.state == "receiving" and upload.upload_id not in self._used
+                most = self.limits.idle_days if idle else self.limits.kept_days
+                if (idle or upload.state in ("stored", "refused")) and days > most:
+                    self._forget(upload)
+
+    def _touched(self, upload: Upload) -> float:
+        """Return when something of an upload last changed, in seconds."""
+        folder = self._folder / upload.upload_id
+        times = [datetime.fromisoformat(upload.created).timestamp()]
+        for path in (folder / STATE_FILE, folder / BODY_FILE):
+            with contextlib.suppress(OSError):
+                times.append(path.stat().st_mtime)
+        return max(times)
+
+    def _forget(self, upload: Upload) -> None:
+        del self._uploads[upload.upload_id]
+        shutil.rmtree(self._folder / upload.upload_id, ignore_errors=True)
+
+
+class Appending:
+    """Takes the bytes of one request."""
+
+    def __init__(self, descriptor: int, most: int) -> None:
+        self._descriptor = descriptor
+        self._left = most
+
+    def write(self, data: bytes | bytearray) -> None:
+        """Append bytes.
+
+        Raises:
+            TooLarge: they are more than were said to come; nothing of these is kept.
+            StorageError: the disk is full or failing; what was written is kept.
+        """
+        if len(data) > self._left:
+            raise TooLarge("found more bytes than the upload is said to have.")
+        self._left -= len(data)
+        view = memoryview(data)
+        with _on_disk():
+            while view:
+                view = view[os.write(self._descriptor, view) :]
+
+
+def _settled(verdict: Verdict) -> dict[str, Any]:
+    """Return what a verdict makes of an upload: a run, nothing, or one to be completed again."""
+    if verdict.try_again:
+        return {"state": "receiving", "completion": None, "problem": verdict.problem}
+    state: State = "refused" if verdict.problem else "stored"
+    return {
+        "state": state,
+        "run_id": verdict.run_id,
+        "already": verdict.already,
+        "problem": verdict.problem,
+    }
+
+
+def _repeated(upload: Upload, completion: Completion) -> Upload:
+    """Return an upload that was completed before, in the same way."""
+    if upload.completion is not None and upload.completion.digest != completion.digest:
+        raise Conflict("the upload was completed with another digest; begin another one.")
+    return upload
+
+
+@contextlib.contextmanager
+def _on_disk() -> Iterator[None]:
+    """Tell a client of an error of the disk without saying where on it.
+
+    Raises:
+        StorageError: there was one.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise StorageError(f"the server's disk cannot be written ({error.strerror}).") from error
+
+
+def _only_server(folder: Path) -> FileLock:
+    """Return the lock of a folder of uploads, held.
+
+    Raises:
+        StorageError: the folder cannot be made.
+        RunnerError: another process holds it.
+    """
+    lock = FileLock(folder / LOCK_FILE, thread_local=False)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise RunnerError(f"{folder.parent}: another server has this folder; stop it first.") from error
+    except OSError as error:
+        raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
+    return lock
+
+
+def _read_all(folder: Path) -> Iterator[Upload]:
+    """Yield the uploads in a folder; of which it is not known what they are, they are removed."""
+    for entry in list(folder.iterdir()):
+        if not entry.is_dir():
+            continue
+        try:
+            yield read_upload(entry)
+        except (OSError, ValueError):
+            shutil.rmtree(entry, ignore_errors=True)

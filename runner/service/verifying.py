@@ -1,0 +1,199 @@
+"""Verifying an upload, by a process of its own that has bounds and may die; what passes becomes a run.
+
+    python -m runner.service.verifying recordings/.uploads/4f0c… recordings
+
+prints its verdict as JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from blake3 import blake3
+from filelock import FileLock
+from mcap.writer import MCAP0_MAGIC
+
+from runner.errors import RunnerError, StorageError
+from runner.labels import labels_from
+from runner.service.upload import BODY_FILE, Completion, read_upload
+
+PATIENCE_SECONDS: Final = 120.0
+"""A verification may last so long,"""
+BYTES_A_SECOND: Final = 2 << 20
+"""and longer the more there is to verify."""
+MOST_MEMORY: Final = 2 << 30
+_LOCK_FILE: Final = "verifying.lock"
+_STOPPED: Final = {
+    -getattr(signal, name) for name in ("SIGTERM", "SIGINT", "SIGHUP") if hasattr(signal, name)
+}
+"""How a process ends that is stopped together with the server."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came of a verification."""
+
+    run_id: str = ""
+    """The run that it became."""
+    already: bool = False
+    """Whether that run had been there before."""
+    problem: str = ""
+    """Why it is no run; empty if it is."""
+    try_again: bool = False
+    """Whether that lies with the server: its disk is full."""
+
+
+class Verifier:
+    """Starts the processes, and ends them with the server."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._running: set[subprocess.Popen[bytes]] = set()
+        self._stopping = False
+
+    def verify(self, folder: Path, recordings: Path) -> Verdict | None:
+        """Verify the upload in a folder; None if the server is stopped meanwhile."""
+        with self._lock:
+            if self._stopping:
+                return None
+            try:
+                process = _started(folder, recordings)
+            except OSError as error:
+                return Verdict(
+                    problem=f"the server has no process for it ({error.strerror}).", try_again=True
+                )
+            self._running.add(process)
+        try:
+            return self._outcome(process, PATIENCE_SECONDS + _size(folder / BODY_FILE) / BYTES_A_SECOND)
+        finally:
+            with self._lock:
+                self._running.discard(process)
+
+    def stop(self) -> None:
+        """End what runs, and begin nothing more."""
+        with self._lock:
+            self._stopping = True
+            for process in self._running:
+                process.kill()
+
+    def _outcome(self, process: subprocess.Popen[bytes], seconds: float) -> Verdict | None:
+        try:
+            said, _ = process.communicate(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+            return Verdict(
+                problem=f"its verification was ended after {seconds:,.0f} s, more than any run needs."
+            )
+        if self._stopping or process.returncode in _STOPPED:
+            return None
+        if process.returncode:
+            return Verdict(problem=f"its verification failed (exit code {process.returncode}).")
+        return Verdict(**json.loads(said))
+
+
+def _started(folder: Path, recordings: Path) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-m", __name__, os.fspath(folder), os.fspath(recordings)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # Ctrl-C is for the server, which then stops it
+    )
+
+
+def judge(folder: Path, recordings: Path) -> Verdict:
+    """Verify the upload in a folder, and make it a run if it passes."""
+    body = folder / BODY_FILE
+    with FileLock(folder / _LOCK_FILE):  # of a server that was killed, the verification may still go on
+        try:
+            completion = read_upload(folder).completion
+            if completion is None or digest_of(body) != completion.digest:
+                return Verdict(
+                    problem="found another digest than was said: bytes changed on their way; send it again."
+                )
+            return _taken(body, completion, recordings)
+        except StorageError as error:
+            return Verdict(problem=_without_paths(error, body, recordings), try_again=True)
+        except RunnerError as error:
+            return Verdict(problem=_without_paths(error, body, recordings))
+        except OSError as error:
+            return Verdict(problem=f"the server's disk cannot be used ({error.strerror}).", try_again=True)
+
+
+def digest_of(path: Path) -> str:
+    """Return the BLAKE3 of a file.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    digest = blake3()
+    if path.stat().st_size:
+        digest.update_mmap(path)
+    return digest.hexdigest()
+
+
+def _taken(body: Path, completion: Completion, recordings: Path) -> Verdict:
+    """Take a recording or a packed run into the folder of runs.
+
+    Raises:
+        RunnerError: it is neither, is damaged, or another run has its id.
+    """
+    from runner.packing.admission import admit, sync
+    from runner.packing.unpacking import unpack
+
+    with body.open("rb") as stream:
+        bare = stream.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
+    if bare:
+        labels = labels_from(completion.labels.model_dump())
+        admitted = admit(body, _said(completion), labels, recordings)
+        return Verdict(admitted.run.run_id, admitted.already)
+    unpacked = unpack(body, recordings)
+    sync(unpacked.run.folder)
+    sync(recordings)
+    return Verdict(unpacked.run.run_id, unpacked.already)
+
+
+def _said(completion: Completion) -> dict[str, Any]:
+    """Return what was told of a run, in the form of `run.json`."""
+    told = completion.run.model_dump(exclude_none=True)
+    summary = {key: told.pop(key) for key in ("seconds", "error") if key in told}
+    return told | {"summary": summary}
+
+
+def _without_paths(error: RunnerError, body: Path, recordings: Path) -> str:
+    """Return what is wrong without saying where the server keeps what."""
+    text = str(error)
+    for path, name in ((body, "the upload"), (recordings, "the server's runs")):
+        for form in (os.fspath(path.absolute()), os.fspath(path)):
+            text = text.replace(form, name)
+    return text
+
+
+def _size(path: Path) -> int:
+    with contextlib.suppress(OSError):
+        return path.stat().st_size
+    return 0
+
+
+def _bound() -> None:
+    """Bound what this process may take, and let others go first."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        os.nice(10)
+        resource.setrlimit(resource.RLIMIT_DATA, (MOST_MEMORY, MOST_MEMORY))
+
+
+if __name__ == "__main__":
+    _bound()
+    print(json.dumps(asdict(judge(Path(sys.argv[1]), Path(sys.argv[2])))))

@@ -1,0 +1,310 @@
+"""An upload becomes a run whole, or nothing at all: in pieces, twice, after a restart, damaged, hostile."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from blake3 import blake3
+
+from runner.errors import RunnerError, RunNotFound, StorageError
+from runner.labels import Labels, change_labels
+from runner.packing.packing import pack
+from runner.runs import find_run, list_runs
+from runner.service.upload import Announcement, Completion, Conflict, Limits, Told, TooLarge, TooMany
+from runner.service.uploads import FOLDER, Uploads
+from tests.runner.recording.making import LAKE, TAXIS, make_run
+
+ANNA, BEN = "anna", "ben"
+
+
+@pytest.fixture(scope="module")
+def lake(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("uploads"), LAKE)
+
+
+@pytest.fixture(scope="module")
+def taxis(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("uploads"), TAXIS)
+
+
+@pytest.fixture
+def uploads(tmp_path):
+    made = Uploads(tmp_path / "runs", Limits(spare_bytes=0))
+    yield made
+    made.close()
+
+
+def completion(data: bytes, **told) -> Completion:
+    return Completion(digest=blake3(data).hexdigest(), size=len(data), run=Told(**told))
+
+
+def announced(data: bytes, **more) -> Announcement:
+    return Announcement(digest=blake3(data).hexdigest(), size=len(data), **more)
+
+
+def send(uploads, data, owner=ANNA, whole=None, **told):
+    """Upload bytes in one go, and return the upload when its verification is over."""
+    upload, _ = uploads.begin(owner, announced(data))
+    with uploads.appending(upload.upload_id, owner, 0, len(data)) as sink:
+        sink.write(data)
+    return over(uploads, uploads.complete(upload.upload_id, owner, whole or completion(data, **told)))
+
+
+def over(uploads, upload):
+    for _ in range(600):
+        upload = uploads.get(upload.upload_id, upload.owner)
+        if upload.state != "verifying":
+            return upload
+        time.sleep(0.05)
+    raise AssertionError("the verification did not end")
+
+
+def visible(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
+
+
+def test_a_recording_becomes_the_run_it_is(uploads, taxis, tmp_path):
+    data = taxis.recording.read_bytes()
+    upload, new = uploads.begin(ANNA, announced(data))
+    assert new
+    for offset in range(0, len(data), 10_000):
+        piece = data[offset : offset + 10_000]
+        with uploads.appending(upload.upload_id, ANNA, offset, len(piece)) as sink:
+            sink.write(piece)
+    assert uploads.offset(upload) == len(data)
+    assert list_runs(tmp_path / "runs") == []
+    seconds = taxis.summary["seconds"]
+    verifying = uploads.complete(upload.upload_id, ANNA, completion(data, seconds=seconds, name="taxis"))
+    assert verifying.state == "verifying"
+    assert over(uploads, verifying).run_id == taxis.run_id
+    run = find_run(taxis.run_id, tmp_path / "runs")
+    assert {key: value for key, value in taxis.facts.items() if key != "owner"} == run.facts
+    assert run.recording.read_bytes() == data
+    assert sorted(path.name for path in run.folder.iterdir()) == ["recording.mcap", "run.json"]
+    assert not (tmp_path / "runs" / FOLDER / upload.upload_id / "body").exists()
+
+
+def test_a_packed_run_is_taken_with_its_labels(uploads, lake, tmp_path):
+    shutil.copytree(lake.folder, tmp_path / "mine" / lake.run_id)
+    run = find_run(lake.run_id, tmp_path / "mine")
+    change_labels(run.folder, lambda labels: replace(labels, tags=("good",), note="seen"))
+    data = pack(run, tmp_path / "a.dualtaxi").path.read_bytes()
+    stored = send(uploads, data)
+    assert (stored.state, stored.run_id) == ("stored", lake.run_id)
+    assert find_run(lake.run_id, tmp_path / "runs").labels == Labels("", ("good",), "seen")
+
+
+def test_the_same_bytes_are_the_same_upload_and_the_same_run(uploads, lake, tmp_path):
+    data = lake.recording.read_bytes()
+    first, _ = uploads.begin(ANNA, announced(data))
+    assert uploads.begin(ANNA, announced(data)) == (first, False)
+    assert uploads.begin(BEN, announced(data))[1], "another's upload is not handed out"
+    done = send(uploads, data)
+    assert uploads.begin(ANNA, announced(data)) == (done, False)
+    again = uploads.complete(done.upload_id, ANNA, completion(data))
+    assert again == done
+    others = send(uploads, data, BEN)
+    assert (others.state, others.already) == ("stored", True)
+    digest = lake.summary["content_digest"]
+    known, _ = uploads.begin("carl", Announcement(run_id=lake.run_id, content_digest=digest))
+    assert (known.state, known.already) == ("stored", True)
+    assert visible(tmp_path / "runs") == [lake.run_id]
+    shutil.rmtree(tmp_path / "runs" / lake.run_id)
+    fresh, new = uploads.begin(ANNA, announced(data))
+    assert (new, fresh.state) == (True, "receiving"), "a run that was removed can be sent again"
+
+
+def test_what_was_received_outlives_the_server(lake, tmp_path):
+    data = lake.recording.read_bytes()
+    first = Uploads(tmp_path / "runs")
+    upload, _ = first.begin(ANNA, announced(data))
+    with (
+        contextlib.suppress(ConnectionError),
+        first.appending(upload.upload_id, ANNA, 0, len(data)) as sink,
+    ):
+        sink.write(data[:5_000])
+        raise ConnectionError
+    with pytest.raises(RunnerError, match="another server"):
+        Uploads(tmp_path / "runs")
+    first.close()
+    second = Uploads(tmp_path / "runs")
+    known, new = second.begin(ANNA, announced(data))
+    assert (known, new, second.offset(known)) == (upload, False, 5_000)
+    with second.appending(upload.upload_id, ANNA, 5_000, len(data) - 5_000) as sink:
+        sink.write(data[5_000:])
+    second._verifier.stop()  # killed while it verifies
+    second.complete(upload.upload_id, ANNA, completion(data))
+    second.close()
+    third = Uploads(tmp_path / "runs")
+    assert over(third, upload).run_id == lake.run_id
+    third.close()
+
+
+def test_a_verification_that_was_over_when_the_server_died_is_not_done_twice(uploads, lake, tmp_path):
+    data = lake.recording.read_bytes()
+    stored = send(uploads, data)
+    folder = tmp_path / "runs" / FOLDER / stored.upload_id
+    state = json.loads((folder / "upload.json").read_text())
+    uploads.close()
+    (folder / "upload.json").write_text(json.dumps(state | {"state": "verifying", "run_id": ""}))
+    (folder / "body").write_bytes(data)
+    again = Uploads(tmp_path / "runs")
+    known = over(again, stored)
+    assert (known.state, known.run_id, known.already) == ("stored", lake.run_id, True)
+    again.close()
+
+
+def altered(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        altered,
+        lambda data: b"",
+        lambda data: b"PK\x03\x04" + bytes(10_000),
+        lambda data: data[:8] + bytes(5_000),
+        lambda data: data.replace(b"mcap", b"mcaq"),
+    ],
+    ids=["altered", "empty", "a zip", "a magic and nothing", "other names"],
+)
+def test_what_is_no_sound_run_is_refused_and_leaves_nothing(uploads, lake, tmp_path, change):
+    refused = send(uploads, change(lake.recording.read_bytes()))
+    assert refused.state == "refused"
+    assert refused.problem.startswith("the upload: ")
+    assert str(tmp_path) not in refused.problem
+    assert visible(tmp_path / "runs") == []
+    assert not (tmp_path / "runs" / FOLDER / refused.upload_id / "body").exists()
+    again, new = uploads.begin(ANNA, refused.announced)
+    assert new, "and can be sent anew"
+    assert again.upload_id != refused.upload_id
+
+
+def test_bytes_that_changed_on_their_way_are_refused(uploads, lake):
+    data = lake.recording.read_bytes()
+    upload, _ = uploads.begin(ANNA, announced(data))
+    with uploads.appending(upload.upload_id, ANNA, 0, None) as sink:
+        sink.write(altered(data))
+    refused = over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data)))
+    assert "another digest" in refused.problem
+
+
+def test_another_run_of_the_same_id_stays_as_it_is(uploads, lake, taxis, tmp_path):
+    shutil.copytree(taxis.folder, tmp_path / "runs" / lake.run_id)
+    facts = json.loads((tmp_path / "runs" / lake.run_id / "run.json").read_text())
+    (tmp_path / "runs" / lake.run_id / "run.json").write_text(json.dumps(facts | {"run_id": lake.run_id}))
+    refused = send(uploads, lake.recording.read_bytes())
+    assert "another run" in refused.problem
+    assert find_run(lake.run_id, tmp_path / "runs").recording.read_bytes() == taxis.recording.read_bytes()
+
+
+def test_a_run_that_was_cut_off_is_taken_as_interrupted(uploads, taxis, tmp_path):
+    data = taxis.recording.read_bytes()[:-3_000]
+    stored = send(uploads, data, status="interrupted")
+    assert stored.run_id == taxis.run_id, stored.problem
+    assert find_run(taxis.run_id, tmp_path / "runs").status == "interrupted"
+
+
+def test_a_client_that_lies_or_errs_gets_no_further(uploads, lake):
+    data = lake.recording.read_bytes()
+    upload, _ = uploads.begin(ANNA, announced(data))
+    with pytest.raises(RunNotFound):
+        uploads.get(upload.upload_id, BEN)
+    with pytest.raises(RunNotFound), uploads.appending("../" + upload.upload_id, ANNA, 0, 1):
+        pass
+    with pytest.raises(Conflict, match="expected 0"), uploads.appending(upload.upload_id, ANNA, 7, 1):
+        pass
+    with pytest.raises(TooLarge), uploads.appending(upload.upload_id, ANNA, 0, len(data) + 1):
+        pass
+    with uploads.appending(upload.upload_id, ANNA, 0, None) as sink:
+        with pytest.raises(TooLarge):
+            sink.write(data + b"more")
+        with pytest.raises(Conflict), uploads.appending(upload.upload_id, ANNA, 0, 1):
+            pass
+        with pytest.raises(Conflict):
+            uploads.complete(upload.upload_id, ANNA, completion(data))
+        with pytest.raises(Conflict):
+            uploads.give_up(upload.upload_id, ANNA)
+    assert uploads.offset(upload) == 0
+    with pytest.raises(Conflict, match="found 0 bytes"):
+        uploads.complete(upload.upload_id, ANNA, completion(data))
+    with uploads.appending(upload.upload_id, ANNA, 0, None) as sink:
+        sink.write(data)
+    other = completion(data).model_copy(update={"digest": "0" * 64})
+    with pytest.raises(Conflict, match="another digest"):
+        uploads.complete(upload.upload_id, ANNA, other)
+
+
+def test_what_is_too_much_is_not_taken(lake, tmp_path):
+    uploads = Uploads(tmp_path / "runs", Limits(most_bytes=1_000, most_open=2))
+    with pytest.raises(TooLarge, match="1,000"):
+        uploads.begin(ANNA, Announcement(size=1_001))
+    first, _ = uploads.begin(ANNA, Announcement())
+    with uploads.appending(first.upload_id, ANNA, 0, None) as sink, pytest.raises(TooLarge):
+        sink.write(bytes(1_001))
+    uploads.begin(ANNA, Announcement())
+    with pytest.raises(TooMany):
+        uploads.begin(BEN, Announcement())
+    uploads.give_up(first.upload_id, ANNA)
+    uploads.begin(BEN, Announcement())
+    uploads.close()
+    full = Uploads(tmp_path / "full", Limits(spare_bytes=1 << 60))
+    with pytest.raises(StorageError, match="room for 0 bytes"):
+        full.begin(ANNA, Announcement(size=10))
+    full.close()
+
+
+def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
+    data = lake.recording.read_bytes()
+    upload, _ = uploads.begin(ANNA, announced(data))
+    real, room = os.write, [6_000]
+
+    def full(descriptor, view):
+        if room[0] == 0:
+            raise OSError(28, "No space left on device")
+        written = real(descriptor, view[: room[0]])
+        room[0] -= written
+        return written
+
+    monkeypatch.setattr("runner.service.uploads.os.write", full)
+    with (
+        pytest.raises(StorageError, match="No space left"),
+        uploads.appending(upload.upload_id, ANNA, 0, None) as sink,
+    ):
+        sink.write(data)
+    monkeypatch.undo()
+    assert uploads.offset(upload) == 6_000
+    with uploads.appending(upload.upload_id, ANNA, 6_000, None) as sink:
+        sink.write(data[6_000:])
+    assert over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data))).state == "stored"
+
+
+def test_what_is_over_or_abandoned_is_forgotten_in_time(lake, tmp_path):
+    uploads = Uploads(tmp_path / "runs")
+    stored = send(uploads, lake.recording.read_bytes())
+    idle, _ = uploads.begin(ANNA, Announcement(name="idle"))
+    fresh, _ = uploads.begin(ANNA, Announcement(name="fresh"))
+    uploads.close()
+    for upload, days in ((stored, 2), (idle, 8)):
+        folder = tmp_path / "runs" / FOLDER / upload.upload_id
+        state = json.loads((folder / "upload.json").read_text())
+        (folder / "upload.json").write_text(json.dumps(state | {"created": "2020-01-01T00:00:00.000+00:00"}))
+        for path in folder.iterdir():
+            os.utime(path, (time.time() - days * 86400,) * 2)
+    (tmp_path / "runs" / FOLDER / ("0" * 32)).mkdir()
+    again = Uploads(tmp_path / "runs")
+    assert [upload.upload_id for upload in again.all()] == [fresh.upload_id]
+    assert [path.name for path in (tmp_path / "runs" / FOLDER).iterdir() if path.is_dir()] == [
+        fresh.upload_id
+    ]
+    assert visible(tmp_path / "runs") == [lake.run_id]
+    again.close()
