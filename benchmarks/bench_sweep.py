@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import statistics
 import tempfile
 import time
@@ -12,7 +13,9 @@ from runner.execution import Session, recorder_for
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import load_mdp
+from runner.runs import list_runs
 from runner.sweep import state
+from runner.sweep.cluster import RayWorkers
 from runner.sweep.loading import from_values
 from runner.sweep.local import LocalWorkers
 from runner.sweep.model import Sweep
@@ -29,7 +32,9 @@ def measure(quick: bool) -> list[Figure]:
     pairs = [
         (_study(20 if quick else 100, 1), _study(20 if quick else 100, 2)) for _ in range(1 if quick else 3)
     ]
-    whole = _study(runs, 2)
+    memory: list[float] = []
+    whole = _study(runs, 2, memory)
+    remote = [_on_ray(10 if quick else 40) for _ in range(1 if quick else 3)]
     return [
         figure(
             f"a study of {runs:,} runs, two workers",
@@ -49,6 +54,15 @@ def measure(quick: bool) -> list[Figure]:
             f"hashing in it: {own:.0f} ms",
         ),
         figure("  two workers against one", [one / two for one, two in pairs], "x", (1.7, 1.9)),
+        figure("  memory of a worker, the most", memory, "MB", (400, 250), higher_is_better=False),
+        figure(
+            "  a run on Ray besides its own time, one worker",
+            remote,
+            "ms",
+            (200, 100),
+            higher_is_better=False,
+            detail="the time of a study on Ray, less what its runs say that they took, over their number",
+        ),
     ]
 
 
@@ -71,14 +85,46 @@ def _sweep(runs: int) -> Sweep:
     )
 
 
-def _study(runs: int, workers: int) -> float:
-    """Return the seconds of a study whose workers are started, and have loaded what they need, before."""
+def _study(runs: int, workers: int, memory: list[float] | None = None) -> float:
+    """Return the seconds of a study whose workers are started, and have loaded what they need, before.
+
+    Args:
+        runs: how many.
+        workers: processes of this machine.
+        memory: takes in the megabytes that each worker had at most.
+    """
     sweep, warm = _sweep(runs), _sweep(2 * workers)
     with tempfile.TemporaryDirectory() as folder, LocalWorkers(workers) as those:
-        for each in (warm, sweep):
-            state.begin(each, Path(folder), resume=False, accept_changes=False)
+        _begin(Path(folder), sweep, warm)
         run_sweep(warm, Path(folder), those)
-        return seconds(lambda: run_sweep(sweep, Path(folder), those))
+        elapsed = seconds(lambda: run_sweep(sweep, Path(folder), those))
+        if memory is not None:
+            workers_of_ours = [p for p in multiprocessing.active_children() if p.name == "sweep-worker"]
+            memory += [_peak_megabytes(process.pid) for process in workers_of_ours]
+        return elapsed
+
+
+def _on_ray(runs: int) -> float:
+    """Return the milliseconds that a run on Ray takes besides its own time, on one worker."""
+    sweep, warm = _sweep(runs), _sweep(2)
+    with tempfile.TemporaryDirectory() as folder, RayWorkers(1, None, runs) as those:
+        _begin(Path(folder), sweep, warm)
+        run_sweep(warm, Path(folder), those)
+        elapsed = seconds(lambda: run_sweep(sweep, Path(folder), those))
+        made = [run for run in list_runs(Path(folder)) if run.name == sweep.name]
+        return 1e3 * (elapsed - sum(run.summary["seconds"] for run in made)) / len(made)
+
+
+def _begin(folder: Path, *sweeps: Sweep) -> None:
+    for each in sweeps:
+        state.begin(each, folder, resume=False, accept_changes=False)
+
+
+def _peak_megabytes(pid: int | None) -> float:
+    """Return the most memory that a process had resident at once, in units of 10**6 bytes."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+    (line,) = (line for line in status.splitlines() if line.startswith("VmHWM:"))
+    return int(line.split()[1]) * 1024 / 1e6
 
 
 def _overheads(repetitions: int) -> tuple[list[float], float]:

@@ -114,7 +114,7 @@ def sections(results: Results, shown: int | None = SHOWN) -> list[Section]:
     grid = _ranking_grid(results.sweep, ranked)
     found = [Section(f"Sweep {results.sweep.name}", _heading(results, len(ranked)), [grid])]
     for state, title in (("failed", "Failed"), ("excluded", "Left out: these values do not go together")):
-        told = [f"Trial {e.number}: {e.errors[0]}" for e in results.ranking if e.state == state]
+        told = _errors([entry for entry in results.ranking if entry.state == state])
         found += [Section(title, told)] if told else []
     if results.importance:
         shares = [(path, f"{100 * share:.0f} %") for path, share in results.importance.items()]
@@ -126,6 +126,14 @@ def sections(results: Results, shown: int | None = SHOWN) -> list[Section]:
             )
         )
     return found
+
+
+def _errors(entries: Sequence[Ranked]) -> list[str]:
+    """Return why trials came to nothing, those of one reason together."""
+    alike: dict[str, list[str]] = {}
+    for entry in entries:
+        alike.setdefault(entry.errors[0], []).append(str(entry.number))
+    return [f"Trial {', '.join(numbers)}: {error}" for error, numbers in alike.items()]
 
 
 def _heading(results: Results, shown: int) -> list[str]:
@@ -168,8 +176,10 @@ def words(values: Mapping[str, Any]) -> str:
 
 
 def spoken(value: Any) -> str:
-    """Return a value in a few characters."""
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    """Return a value in a few characters, as a configuration would have it."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _between(low: float | None, high: float | None) -> str:

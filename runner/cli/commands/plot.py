@@ -76,4 +76,4 @@ def _draw_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
     groups, panels = learning(results, recordings)
     panel = panel_of(results.sweep.objective.metric, panels)
     write_new(output, force, lambda path: save_figure(path, f"Sweep {name}", picture, groups, panel))
-    click.echo(f"{output}: the sweep {name}, {len(picture.trials)} trials, {len(picture.axes)} parameters")
+    click.echo(f"{output}: the sweep {name}, {len(picture.trials)} trials")
