@@ -107,7 +107,12 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
         stack.callback(app.state.catalogue.close)
         settings: Settings = app.state.settings
         app.state.jobs = stack.enter_context(
-            Jobs(settings.recordings[0], settings.workers, most_waiting=settings.limits.jobs)
+            Jobs(
+                settings.recordings[0],
+                settings.workers,
+                most_waiting=settings.limits.jobs,
+                ray=settings.ray,
+            )
         )
         app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
         app.state.uploads = stack.enter_context(

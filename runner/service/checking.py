@@ -194,7 +194,7 @@ class Checker:
 
 def _serve(pipe: Any, recordings: Path) -> None:
     """Check what comes through a pipe, until it is closed; the process's main function."""
-    from runner.service.doing import leave_signals
+    from runner.service.doing.process import leave_signals
 
     leave_signals()
     with contextlib.suppress(EOFError, OSError):

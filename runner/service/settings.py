@@ -70,6 +70,8 @@ class Settings:
     """Whether reading needs a token too; it always does when the host is not a loopback one."""
     workers: int = 2
     """Processes that do jobs at the same time."""
+    ray: str | None = None
+    """The address of a cluster of Ray that does the jobs' runs; None: processes beside the service."""
     limits: Limits = Limits()
 
     def __post_init__(self) -> None:

@@ -21,7 +21,8 @@ from typing import Any, Final, Self
 from runner.errors import StorageError
 from runner.estimate import free_bytes
 from runner.service.checking import Checked, Checker
-from runner.service.doing import Order, Outcome, work
+from runner.service.doing.order import Order, Outcome
+from runner.service.doing.process import work
 from runner.service.queue import Event, Job, NotPossibleNow, Queue, now
 
 GOODBYE_SECONDS: Final = 15.0
@@ -268,6 +269,8 @@ class Jobs:
 
     def _share(self) -> None:
         """Give the slots that nobody waits for to the first sweep, and take them back when somebody does."""
+        if self._ray is not None:
+            return  # a sweep's workers are the cluster's
         jobs = {job.number: job for job in self.queue.jobs()}
         waiting = any(job.state == "queued" for job in jobs.values()) and not self._short_of_disk()
         spare = max(0, self.workers - len(self._busy) - waiting)

@@ -32,6 +32,33 @@ def require_ray() -> Any:
     return ray
 
 
+def connect(address: str | None, processors: int | None = None) -> Any:
+    """Return the module `ray`, connected to a cluster.
+
+    Args:
+        address: of the cluster, or `auto`; None starts Ray on this machine.
+        processors: how many Ray is to use of this machine; None for all.
+
+    Raises:
+        MissingExtra: Ray is not installed.
+        RunnerError: the cluster cannot be reached.
+    """
+    ray = require_ray()
+    options = {"log_to_driver": False, "logging_level": "ERROR"}
+    if address is None:
+        options |= {"num_cpus": processors or os.cpu_count(), "include_dashboard": False}
+    try:
+        _knock(address or "")
+        ray.init(address=address or "local", **options)
+    except (ConnectionError, OSError, RuntimeError, ValueError) as error:
+        raise RunnerError(
+            f"--ray: no cluster at {address or 'this machine'} can be reached "
+            f"({str(error).strip().splitlines()[0]}); `ray status` says whether one runs, and --ray "
+            "without an address starts one here."
+        ) from error
+    return ray
+
+
 class Doer:
     """Does tasks, one at a time, and can be told to stop meanwhile; an actor of Ray."""
 
@@ -61,19 +88,7 @@ class RayWorkers:
     """
 
     def __init__(self, count: int | None, address: str | None, most: int) -> None:
-        self._ray = require_ray()
-        options = {"log_to_driver": False, "logging_level": "ERROR"}
-        if address is None:
-            options |= {"num_cpus": count or os.cpu_count(), "include_dashboard": False}
-        try:
-            _knock(address or "")
-            self._ray.init(address=address or "local", **options)
-        except (ConnectionError, OSError, RuntimeError, ValueError) as error:
-            raise RunnerError(
-                f"--ray: no cluster at {address or 'this machine'} can be reached "
-                f"({str(error).strip().splitlines()[0]}); `ray status` says whether one runs, and --ray "
-                "without an address starts one here."
-            ) from error
+        self._ray = connect(address, count)
         processors = int(self._ray.cluster_resources().get("CPU", 1))
         self._count = max(1, min(count or processors, most))
         # Two calls at a time: `stop` must get through while a task is being done.

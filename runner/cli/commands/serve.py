@@ -38,6 +38,11 @@ from runner.cli.output import say
     metavar="N",
     help="So many jobs at the same time.",
 )
+@click.option(
+    "--ray",
+    metavar="ADDRESS",
+    help="Have jobs done by the cluster of Ray there, which sees the recordings under the same path.",
+)
 def command(
     recordings: tuple[Path, ...],
     host: str,
@@ -46,6 +51,7 @@ def command(
     proxies: tuple[str, ...],
     require_token: bool,
     workers: int,
+    ray: str | None,
 ) -> None:
     """Open the runs to browsers and programs: list, replay, compare, upload, submit.
 
@@ -79,7 +85,12 @@ def command(
         proxies=",".join(proxies),
         tokens_for_all=require_token,
         workers=workers,
+        ray=ray,
     )
+    if ray is not None:
+        from runner.sweep.cluster import require_ray
+
+        require_ray()
     require_free(settings.recordings[0])  # refused before anybody can ask for anything
     app = create_app(settings)
     listening = bind(settings)
