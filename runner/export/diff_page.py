@@ -48,31 +48,47 @@ def render_diff(difference: RunDiff, a: Recording, b: Recording) -> str:
         MissingExtra: Jinja2 or Matplotlib is not installed.
     """
     require_packages()
-    names = [f"{who['name']}, seed {who['seed']} ({who['run_id']})" for who in (difference.a, difference.b)]
-    told = {section.title: section for section in sections(difference, everything=True)}
     return (
         templates()
         .get_template("diff.html")
         .render(
-            title=f"{difference.a['name']} against {difference.b['name']}",
-            lead=in_short(difference),
-            notes=difference.notes,
-            legend=[(i, COLOURS[i], "AB"[i], name) for i, name in enumerate(names)],
-            partings=[_parting(difference, *pair, a, b) for pair in _partings(difference)],
-            training=_overlap_told(told["Training"], difference),
-            tables={"figures": _table_figures(difference, a, b), **_parts(told["Q-tables"])},
+            told_of(difference, a, b),
             panels=_panels(a, b),
-            metrics=_parts(told["Metrics"]),
-            others=[
-                {"id": title.lower(), "title": title, **_parts(told[title])}
-                for title in ("Configuration", "Environment", "Costs", "Provenance")
-            ],
-            runs=told["Runs"].grids[0],
             ramp=", ".join(svg_maps.RAMP),
             style=(TEMPLATES / "report.css").read_text("utf-8") + svg.STYLE + svg_maps.STYLE,
             dark=(TEMPLATES / "report_dark.css").read_text("utf-8"),
         )
     )
+
+
+def told_of(difference: RunDiff, a: Recording, b: Recording) -> dict[str, Any]:
+    """Return what a page tells and shows of a difference, its pictures as SVG.
+
+    Args:
+        difference: of these two.
+        a: one run.
+        b: the other.
+
+    Raises:
+        MissingExtra: Matplotlib is not installed.
+    """
+    names = [f"{who['name']}, seed {who['seed']} ({who['run_id']})" for who in (difference.a, difference.b)]
+    told = {section.title: section for section in sections(difference, everything=True)}
+    return {
+        "title": f"{difference.a['name']} against {difference.b['name']}",
+        "lead": in_short(difference),
+        "notes": difference.notes,
+        "legend": [(i, COLOURS[i], "AB"[i], name) for i, name in enumerate(names)],
+        "partings": [_parting(difference, *pair, a, b) for pair in _partings(difference)],
+        "training": _overlap_told(told["Training"], difference),
+        "tables": {"figures": _table_figures(difference, a, b), **_parts(told["Q-tables"])},
+        "metrics": _parts(told["Metrics"]),
+        "others": [
+            {"id": title.lower(), "title": title, **_parts(told[title])}
+            for title in ("Configuration", "Environment", "Costs", "Provenance")
+        ],
+        "runs": told["Runs"].grids[0],
+    }
 
 
 def _parts(section: Section) -> dict[str, Any]:
@@ -99,6 +115,7 @@ def _parting(
     where = where_in_words(parting)
     return {
         "id": f"parting-{parting.phase}",
+        "spot": _spot(parting),
         "title": "Where training parts" if parting.phase == "train" else "Where an evaluation parts",
         "where": where[0].upper() + where[1:],
         "cause": cause.text[0].upper() + cause.text[1:],
@@ -106,6 +123,12 @@ def _parting(
         "pictures": list(_pictures(parting, a, b)),
         "rows": [_values(row) for row in cause.rows],
     }
+
+
+def _spot(parting: Parting) -> list[int]:
+    """Return (episode, t) of training, or (training episodes before, trial, t) of an evaluation."""
+    before = [] if parting.after is None else [parting.after]
+    return [int(part) for part in (*before, parting.episode, parting.t)]
 
 
 def _pictures(parting: Parting, a: Recording, b: Recording) -> Iterator[dict[str, str]]:

@@ -17,7 +17,7 @@ from runner import __version__
 from runner.errors import RunnerError
 from runner.service import pages
 from runner.service.apart import Apart
-from runner.service.api import comparing, files, jobs, reading, runs, uploads
+from runner.service.api import comparing, files, jobs, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
 from runner.service.kept import Kept
@@ -83,7 +83,7 @@ def _api() -> APIRouter:
         HTTPStatus.INSUFFICIENT_STORAGE,
     )
     api = APIRouter(responses=general)
-    for part in (runs, reading, comparing, files, jobs, uploads):
+    for part in (runs, reading, replay, comparing, files, jobs, uploads):
         api.include_router(part.router)
     return api
 

@@ -31,7 +31,7 @@ _TYPES: Final = {
     "LICENSE": "text/plain",
 }
 _FOREVER: Final = "public, max-age=31536000, immutable"
-_OWN: Final = ("table.js",)
+_OWN: Final = ("charts.js", "live.js", "rerun.css", "rerun.js", "run.js", "table.js")
 _OTHERS: Final = ("icon.svg", f"{UPLOT}/uPlot.iife.min.js", f"{UPLOT}/LICENSE")
 
 
@@ -99,6 +99,7 @@ def _style() -> str:
         svg_maps.STYLE,
         (FOLDER / UPLOT / "uPlot.min.css").read_text("utf-8"),
         (FOLDER / "pages.css").read_text("utf-8"),
+        f".ramp-colours {{ background: linear-gradient(90deg, {', '.join(svg_maps.RAMP)}); }}",
         f"@media (prefers-color-scheme: dark) {{ {(REPORT / 'report_dark.css').read_text('utf-8')} }}",
     ]
     return "\n".join(parts)

@@ -1,4 +1,4 @@
-"""Pages as programs see them: answered, escaped, well formed, and with nothing inline that the policy forbids."""
+"""Pages as programs see them: answered, escaped, well formed, with nothing inline that the policy forbids."""
 
 from __future__ import annotations
 
@@ -60,9 +60,7 @@ def test_files_are_kept_for_ever_and_compressed(client):
 
 
 def test_a_runs_name_cannot_break_out(client, recordings):
-    run = next(
-        folder for folder in recordings.iterdir() if folder.is_dir() and (folder / "run.json").exists()
-    )
+    run = next(path.parent for path in recordings.glob("*/run.json"))
     (run / "labels.json").write_text('{"name": "<script>alert(1)</script>", "note": "\\"><img src=x>"}')
     page = page_of(client, "/runs?columns=id,name,note")
     assert "&lt;script&gt;alert(1)" in page

@@ -1,0 +1,173 @@
+// Metrics of one or several runs over training episodes. Of long curves the server gives the lowest and the
+// highest value of each stretch, and says so; what is zoomed into is asked for again, at full resolution.
+const box = document.querySelector("[data-charts]");
+const runs = JSON.parse(box.dataset.charts);
+const plots = box.querySelector("[data-plots]"), said = box.querySelector("[data-said]"), form = box.querySelector("form");
+const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777"];
+const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
+const SHARES = "training.reward";
+const shown = new Map();
+let range = asked(), asking = 0;
+
+function asked() {
+  const query = new URLSearchParams(location.search);
+  const part = (name) => query.get(name) ? Number(query.get(name)) : null;
+  return { from: part("from"), to: part("to") };
+}
+
+const look = () => getComputedStyle(document.documentElement);
+const colour = (i) => look().getPropertyValue(`--line-${i % COLOURS.length}`).trim() || COLOURS[i % COLOURS.length];
+const spoken = (name) => name.replaceAll("_", " ");
+
+async function curvesOf(run) {
+  const query = new URLSearchParams({ points: Math.max(400, Math.round(plots.clientWidth)) });
+  if (range.from) query.set("start", Math.max(0, Math.floor(range.from)));
+  if (range.to) query.set("stop", Math.ceil(range.to) + 1);
+  const answer = await fetch(`/api/v1/runs/${run.id}/metrics?${query}`);
+  const found = await answer.json();
+  if (!answer.ok) throw new Error(found.error.message);
+  return found.curves;
+}
+
+async function draw() {
+  const mine = ++asking;
+  box.setAttribute("aria-busy", "true");
+  try {
+    const found = await Promise.all(runs.map(curvesOf));
+    if (mine !== asking) return;
+    show(found);
+  } catch (error) {
+    said.textContent = error.message;
+  }
+  box.removeAttribute("aria-busy");
+}
+
+function show(found) {
+  const metrics = new Map();
+  found.forEach((curves, run) => curves.forEach((curve) => {
+    if (curve.metric === SHARES && runs.length > 1) return;  // as many lines as rewards
+    const panel = metrics.get(curve.metric) ?? { ...curve, lines: [] };
+    panel.lines.push({ ...curve, run });
+    metrics.set(curve.metric, panel);
+  }));
+  const ranked = [...metrics].sort(([one], [other]) => rank(one) - rank(other));
+  for (const [metric, panel] of ranked) plot(metric, panel);
+  for (const [metric, one] of shown) if (!metrics.has(metric)) { one.chart?.destroy(); one.figure.remove(); shown.delete(metric); }
+  const all = [...metrics.values()].flatMap((panel) => panel.lines);
+  const thinned = all.filter((line) => line.thinned);
+  said.textContent = !all.length ? "No metrics were recorded."
+    : thinned.length ? `Thinned: of up to ${Math.max(...thinned.map((line) => line.of)).toLocaleString("en")} points a curve the lowest and highest of each stretch are drawn. Zoom in for all of them.`
+      : "Every recorded point is drawn. Drag across a plot to zoom; double click shows all.";
+}
+
+function rank(metric) {
+  return metric === SHARES ? 4 : metric.startsWith("training.logged.") ? 3 : metric.startsWith("training.") ? 2 : metric.startsWith("event.") ? 1 : 0;
+}
+
+function plot(metric, panel) {
+  const lines = [...new Set(panel.lines.map((line) => line.line))];
+  const data = uPlot.join(panel.lines.map((line) => [line.episodes, line.values]));
+  const labels = panel.lines.map((line) => label(line, lines));
+  const kinds = JSON.stringify([labels, plots.clientWidth < 500]);
+  let one = shown.get(metric);
+  if (one && one.kinds !== kinds) { one.chart.destroy(); one.chart = null; }
+  if (!one) {
+    one = { figure: document.createElement("figure") };
+    one.figure.className = metric === SHARES ? "wide" : "";
+    one.figure.append(document.createElement("figcaption"), document.createElement("div"));
+    shown.set(metric, one);
+    plots.append(one.figure);
+  }
+  const [caption, place] = one.figure.children;
+  const [title, unit] = [document.createElement("b"), document.createElement("span")];
+  title.textContent = panel.title;
+  unit.textContent = panel.unit + (panel.lines.some((line) => line.thinned) ? ", thinned" : "");
+  caption.replaceChildren(title, " ", unit);
+  place.setAttribute("role", "img");
+  place.setAttribute("aria-label", `${panel.title}, ${panel.unit}: ${panel.lines.map((line) => summary(line, lines)).join("; ")}`);
+  const sparse = panel.lines.every((line) => line.episodes.length < 80);
+  if (one.chart) one.chart.setData(data);
+  else one.chart = new uPlot(options(panel, lines, labels, place, sparse), data, place);
+  one.kinds = kinds;
+}
+
+function label(line, lines) {
+  const parts = [runs.length > 1 ? runs[line.run].label : "", lines.length > 1 && line.line ? spoken(line.line) : ""];
+  return parts.filter(Boolean).join(", ") || line.title;
+}
+
+function summary(line, lines) {
+  const known = line.values.filter((value) => value !== null);
+  const last = known.at(-1);
+  return `${label(line, lines)} ends at ${last === undefined ? "no value" : Number(last.toPrecision(4))}, between ${Number(Math.min(...known).toPrecision(4))} and ${Number(Math.max(...known).toPrecision(4))}`;
+}
+
+function options(panel, lines, labels, place, sparse) {
+  const percent = panel.unit.startsWith("percent");
+  const positive = panel.lines.every((line) => line.values.every((value) => value === null || value >= 0));
+  const axis = { stroke: look().getPropertyValue("--soft").trim(), grid: { stroke: look().getPropertyValue("--line").trim(), width: 1 }, ticks: { show: false }, font: "12px system-ui, sans-serif" };
+  const series = panel.lines.map((line, i) => {
+    const at = lines.indexOf(line.line), several = runs.length > 1;
+    return { label: labels[i], stroke: colour(several ? line.run : at), width: 1.8, dash: several ? DASHES[at % DASHES.length] : [], spanGaps: true, points: { show: sparse, size: 4 } };
+  });
+  return {
+    width: place.clientWidth, height: 200,
+    scales: { x: { time: false }, y: { range: (_, low, high) => bounds(low, high, percent, positive) } },
+    series: [{ label: "episode" }, ...series],
+    axes: [{ ...axis, size: 30 }, { ...axis, size: 52 }],
+    legend: { show: labels.length > 1, live: true },
+    cursor: { drag: { x: true, y: false, setScale: false }, sync: { key: "metrics", setSeries: false } },
+    hooks: { setSelect: [(chart) => zoom(chart)] },
+  };
+}
+
+function bounds(low, high, percent, positive) {
+  if (percent && high <= 100 && low >= 0) return [0, 100];
+  if (low === null) return [0, 1];
+  const from = positive ? 0 : low - 0.05 * (high - low || 1);
+  return [from, high + 0.05 * (high - from || 1)];
+}
+
+function zoom(chart) {
+  const { left, width } = chart.select;
+  if (width < 4) return;
+  go(Math.max(0, chart.posToVal(left, "x")), chart.posToVal(left + width, "x"));
+  chart.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+}
+
+function go(from, to, keep = true) {
+  range = { from: from === null ? null : Math.floor(from), to: to === null ? null : Math.ceil(to) };
+  form.elements.from.value = range.from ?? "";
+  form.elements.to.value = range.to ?? "";
+  if (keep) {
+    const query = new URLSearchParams(location.search);
+    for (const [name, value] of Object.entries(range)) value === null ? query.delete(name) : query.set(name, value);
+    history.pushState(null, "", `?${query}`);
+  }
+  draw();
+}
+
+form.addEventListener("submit", (event) => {
+  event.preventDefault();
+  const part = (name) => form.elements[name].value === "" ? null : Number(form.elements[name].value);
+  go(part("from"), part("to"));
+});
+box.querySelector("[data-reset]").addEventListener("click", () => go(null, null));
+plots.addEventListener("dblclick", () => go(null, null));
+addEventListener("popstate", () => { const { from, to } = asked(); go(from, to, false); });
+
+let width = plots.clientWidth;
+new ResizeObserver(() => {
+  if (plots.clientWidth === width) return;
+  width = plots.clientWidth;
+  for (const { chart, figure } of shown.values()) chart?.setSize({ width: figure.children[1].clientWidth, height: 200 });
+}).observe(plots);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  for (const one of shown.values()) one.kinds = null;
+  draw();
+});
+
+form.elements.from.value = range.from ?? "";
+form.elements.to.value = range.to ?? "";
+await draw();
+if (document.querySelector("[data-live]")) setInterval(() => { if (!document.hidden) draw(); }, 4000);

@@ -1,0 +1,119 @@
+"""What pages show of a run that takes long to find; by `Apart`, in a process of its own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+from runner.recording.reader import Recording, open_recording
+
+BEHIND: Final = 1
+"""Steps before the first that is asked for, so that the one that led there can be told."""
+
+
+def part(path: Path, which: tuple[int, ...], start: int, steps: int) -> bytes:
+    """Return a part of an episode as JSON: what `replay.js` shows.
+
+    Args:
+        path: the recording.
+        which: (episode,) of training, or (training episodes before, trial) of an evaluation.
+        start: the first step.
+        steps: at most so many.
+
+    Raises:
+        RecordingError: there is no such episode or step, or no steps were recorded.
+    """
+    from runner.export import svg
+    from runner.export.report_replay import payload, training_episode, trial
+
+    with open_recording(path) as recording:
+        recording.require_job("a replay in the page", "The Rerun viewer shows what it recorded.")
+        first = max(0, start - BEHIND)
+        found = (
+            training_episode(recording, which[0], steps, first)
+            if len(which) == 1
+            else trial(recording, which[0], which[1], steps, first)
+        )
+        mdp = recording.mdp
+        drawing = None if mdp.scene is None or mdp.scene_cells is None else svg.Drawing(mdp.scene)
+        places = None if drawing is None else lambda states: drawing.places(mdp, states)
+        told = payload(recording, [found], places)
+        episode = told.pop("episodes")[0]
+        episode |= {
+            "description": found.outcome,
+            "length": found.length,
+            "first": found.first,
+            "before": list(found.before),
+        }
+        told |= {"trail": svg.TRAIL, "episode": episode, "scene": mdp.scene}
+        return json.dumps(told, separators=(",", ":"), ensure_ascii=False).encode()
+
+
+def typical(path: Path) -> bytes:
+    """Return the address of the episode that is most worth looking at: `eval/3000/17`, or `train/0`."""
+    from runner.export.report_replay import last_episode, last_whole_evaluation, typical_trial
+
+    with open_recording(path) as recording:
+        if last_whole_evaluation(recording) is None:
+            return f"train/{last_episode(recording)}".encode()
+        after, number = typical_trial(recording)
+        return f"eval/{after}/{number}".encode()
+
+
+def learned(path: Path) -> bytes:
+    """Return policy and values of a run at stages of learning, as JSON: a row of maps for each."""
+    from runner.export.report_maps import maps_of, stages_of
+    from runner.frames import agents_of
+
+    with open_recording(path) as recording:
+        if recording.kind != "job":
+            return b"[]"
+        mdp = recording.mdp
+        start = _typical_start(recording)
+        rows = maps_of(mdp, agents_of(recording), stages_of(recording), start)
+        return json.dumps([asdict(row) for row in rows]).encode()
+
+
+def difference(paths: Sequence[Path]) -> bytes:
+    """Return in what two runs differ, as JSON: what the page of `dualtaxi diff` tells and shows."""
+    from runner.analysis.diff import diff
+    from runner.export.diff_page import told_of
+
+    with open_recording(paths[0]) as a, open_recording(paths[1]) as b:
+        return json.dumps(told_of(diff(a, b), a, b), default=asdict).encode()
+
+
+def _typical_start(recording: Recording) -> int:
+    from runner.errors import RecordingError
+    from runner.export.report_replay import trial, typical_trial
+
+    try:
+        return int(trial(recording, *typical_trial(recording)).states[0])
+    except RecordingError:
+        return int(recording.mdp.start.argmax())
+
+
+def spot(run: Any, at: tuple[int, ...]) -> bytes:
+    """Return the step of the viewer's timeline at (episode, t) or (training episodes before, trial, t)."""
+    from runner.export.rerun.selection import Request
+    from runner.export.rerun.spots import with_spot
+
+    return str(with_spot(run, Request(), at or None).time).encode()
+
+
+def sweep(name: str, recordings: Path) -> bytes:
+    """Return what came of a sweep, as JSON: sections as `dualtaxi sweep show` prints them, and the trials."""
+    from runner.sweep.results import results_of, sections
+    from runner.sweep.state import read_sweep
+
+    results = results_of(read_sweep(name, recordings), recordings)
+    told = {
+        "sections": [asdict(section) for section in sections(results, None)],
+        "runs": {entry.number: list(entry.runs.values()) for entry in results.ranking},
+        "best": results.best_yaml,
+        "parameters": list(results.sweep.file.parameters),
+    }
+    return json.dumps(told, default=str).encode()
