@@ -12,10 +12,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from runner.archive.layout import PHASES, Shape
+from runner.archive.values import SpaceColumns
 from runner.errors import RecordingError
 from runner.mdp import Mdp
 from runner.recording import schema
+from runner.recording.facts import kind_of, sizes_of, spaces_of
 from runner.recording.reader import Recording
+from runner.recording.recorder import BLOCK_BYTES
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 
 Records = NDArray[np.void]
@@ -25,31 +28,53 @@ _BLANKS: Final = 16_384
 _WHOLE_OF_STEPS: Final = ("t", "state", "action", "next_state")
 _SAME_OF_STEPS: Final = ("step", "episode", "terminated", "truncated")
 _WHOLE_OF_EPISODES: Final = ("length", "penalties")
+_SAME_OF_TRANSITIONS: Final = ("step", "episode", "terminated", "truncated")
+_WHOLE_OF_TRANSITIONS: Final = ("t", "acted", "agents_terminated", "agents_truncated")
+_SAME_OF_RESETS: Final = ("reset", "episode", "step")
 _SAME_OF_EPISODES: Final = ("episode", "last_step", "success", "terminated", "truncated")
 
 
-def shape_of(run: Mapping[str, str], mdp: Mdp, where: str) -> Shape:
-    """Return what fixes the columns of a run's steps and episodes.
+def shape_of(run: Mapping[str, str], mdp: Mdp | None, where: str) -> Shape:
+    """Return what fixes the tables of a run and their columns.
 
     Args:
         run: the recording's metadata record of that name.
-        mdp: its environment.
+        mdp: its environment, if that is tabular.
         where: named in errors.
 
     Raises:
-        RecordingError: the two contradict each other.
+        RecordingError: they contradict each other.
     """
     try:
         learners = json.loads(run["agents"])
     except (ValueError, RecursionError):
         learners = None
     known = isinstance(learners, list) and all(isinstance(name, str) for name in learners)
-    if not known or (len(learners), len(mdp.event_names)) != (int(run["learners"]), int(run["events"])):
+    events = mdp.event_names if mdp else ()
+    if not known or (len(learners), len(events)) != (int(run["learners"]), int(run["events"])):
         raise RecordingError(
-            f"{where}: found learners {learners!r} and {len(mdp.event_names)} events, "
+            f"{where}: found learners {learners!r} and {len(events)} events, "
             f"expected {run['learners']} and {run['events']}."
         )
-    return Shape(run["run_id"], tuple(learners), mdp.agents, mdp.action_counts, mdp.event_names)
+    return Shape(
+        run_id=run["run_id"],
+        kind=kind_of(run),
+        learners=tuple(learners),
+        agents=mdp.agents if mdp else (),
+        action_counts=mdp.action_counts if mdp else (),
+        events=events,
+        sizes=sizes_of(run, where),
+        spaces=_space_columns(run, where),
+    )
+
+
+def _space_columns(run: Mapping[str, str], where: str) -> dict[str, SpaceColumns]:
+    """Return the columns of values by the field that holds them; none of a job."""
+    if kind_of(run) == "job":
+        return {}
+    spaces = spaces_of(run, where)
+    fields = {"action": "action", "next_observation": "observation", "observation": "observation"}
+    return {field: SpaceColumns(spaces[space], field, where) for field, space in fields.items()}
 
 
 def merged(
@@ -78,26 +103,29 @@ def merged(
 
 def batch_of(topic: Topic, records: Records, shape: Shape) -> pa.RecordBatch:
     """Return the columns of message records of one fixed-width topic, [n] rows."""
-    columns = _step_columns if topic.message is schema.STEP else _episode_columns
+    columns, _ = _WAYS[topic.message]
     made = {
         "run_id": _constant(0, len(records), [shape.run_id]),
         "phase": _constant(PHASES.index(topic.phase), len(records), PHASES),
         "position": (records["log_time"] // _TICK).astype(np.int64),
         **columns(records, shape),
     }
-    table = shape.steps if topic.message is schema.STEP else shape.episodes
-    return pa.record_batch([pa.array(made[field.name], field.type) for field in table], schema=table)
+    table = shape.columns_of(topic.message)
+    arrays = [made[field.name] for field in table]
+    ready = [
+        one if isinstance(one, pa.Array) else pa.array(one, field.type)
+        for one, field in zip(arrays, table, strict=True)
+    ]
+    return pa.record_batch(ready, schema=table)
 
 
 def records_of(topic: Topic, batch: pa.RecordBatch, shape: Shape) -> Records:
     """Return the message records of rows that are all of one topic."""
-    records = _blank(topic, shape.counts[topic], -(-batch.num_rows // _BLANKS) * _BLANKS)[
-        : batch.num_rows
-    ].copy()
+    records = _blanks(topic, shape.sizes[topic], batch.num_rows)
     columns = {name: batch.column(name) for name in batch.schema.names if name not in ("run_id", "phase")}
     times = _numbers(columns.pop("position")).astype(np.uint64) * _TICK
     records["log_time"] = records["publish_time"] = times
-    fill = _fill_steps if topic.message is schema.STEP else _fill_episodes
+    _, fill = _WAYS[topic.message]
     fill(records, columns, shape)
     return records
 
@@ -141,10 +169,17 @@ def of_phase(batch: pa.RecordBatch, phase: str, where: str) -> pa.RecordBatch:
     return batch if chosen.all() else batch.filter(pa.array(chosen))
 
 
+def _blanks(topic: Topic, sizes: schema.Sizes, n: int) -> Records:
+    """Return n blank records: if they are small, copied from others, which is quicker than to make them."""
+    most = -(-n // _BLANKS) * _BLANKS
+    if most * schema.record_dtype(topic.message, sizes).itemsize > BLOCK_BYTES:
+        return schema.blank_records(topic, sizes, n)
+    return _blank(topic, sizes, most)[:n].copy()
+
+
 @lru_cache(8)
-def _blank(topic: Topic, counts: tuple[int, ...], n: int) -> Records:
-    """Return n blank records, to be copied: that is quicker than to make them."""
-    return schema.blank_records(topic, counts, n)
+def _blank(topic: Topic, sizes: schema.Sizes, n: int) -> Records:
+    return schema.blank_records(topic, sizes, n)
 
 
 def _step_columns(records: Records, shape: Shape) -> dict[str, Any]:
@@ -168,6 +203,38 @@ def _fill_steps(records: Records, columns: Columns, shape: Shape) -> None:
     _fill_summed(records["rewards"], "reward", columns, shape)
 
 
+def _transition_columns(records: Records, shape: Shape) -> dict[str, Any]:
+    columns: dict[str, Any] = {name: _int32(records[name]) for name in _WHOLE_OF_TRANSITIONS}
+    columns |= {name: np.ascontiguousarray(records[name]) for name in _SAME_OF_TRANSITIONS}
+    for name in ("action", "next_observation"):
+        columns |= shape.spaces[name].columns(records[name])
+    return columns | _summed("reward", records["rewards"], shape)
+
+
+def _fill_transitions(records: Records, columns: Columns, shape: Shape) -> None:
+    for name in (*_WHOLE_OF_TRANSITIONS, *_SAME_OF_TRANSITIONS):
+        records[name] = _numbers(columns[name])
+    for name in ("action", "next_observation"):
+        shape.spaces[name].fill(records[name], columns)
+    _fill_summed(records["rewards"], "reward", columns, shape)
+
+
+def _reset_columns(records: Records, shape: Shape) -> dict[str, Any]:
+    columns: dict[str, Any] = {name: np.ascontiguousarray(records[name]) for name in _SAME_OF_RESETS}
+    columns["environment"] = _int32(records["environment"])
+    seed = np.ascontiguousarray(records["seed"])
+    columns["seed"] = pa.array(seed, pa.uint64(), mask=~records["seeded"])
+    return columns | shape.spaces["observation"].columns(records["observation"])
+
+
+def _fill_resets(records: Records, columns: Columns, shape: Shape) -> None:
+    for name in (*_SAME_OF_RESETS, "environment"):
+        records[name] = _numbers(columns[name])
+    records["seed"] = _numbers(columns["seed"].fill_null(0))
+    records["seeded"] = _numbers(columns["seed"].is_valid())
+    shape.spaces["observation"].fill(records["observation"], columns)
+
+
 def _episode_columns(records: Records, shape: Shape) -> dict[str, Any]:
     columns: dict[str, Any] = {name: _int32(records[name]) for name in _WHOLE_OF_EPISODES}
     columns |= {name: np.ascontiguousarray(records[name]) for name in _SAME_OF_EPISODES}
@@ -181,6 +248,15 @@ def _fill_episodes(records: Records, columns: Columns, shape: Shape) -> None:
     for i, name in enumerate(shape.event_columns):
         records["events"][:, i] = _numbers(columns[name])
     _fill_summed(records["returns"], "return", columns, shape)
+
+
+_WAYS: Final = {
+    schema.STEP: (_step_columns, _fill_steps),
+    schema.TRANSITION: (_transition_columns, _fill_transitions),
+    schema.EPISODE: (_episode_columns, _fill_episodes),
+    schema.RESET: (_reset_columns, _fill_resets),
+}
+"""To columns and back, by the message."""
 
 
 def _summed(name: str, values: NDArray[np.float64], shape: Shape) -> dict[str, Any]:

@@ -68,10 +68,8 @@ def _json(said: Mapping[str, Any]) -> bytes:
 
 
 def content_digest(topics: Mapping[str, str]) -> str:
-    """Return the content digest made of the hashes of topics, `/log` left out."""
-    return combine(
-        {topic.name: topics[topic.name] for topic in schema.TOPICS if topic.digested and topic.name in topics}
-    )
+    """Return the content digest made of the hashes of topics; those that it does not cover are left out."""
+    return combine({name: topics[name] for name in topics.keys() & schema.DIGESTED})
 
 
 def read_manifest(data: bytes, where: str) -> Manifest:
@@ -113,7 +111,7 @@ def _check(manifest: Manifest) -> None:
     for name in ("run_id", "name", "created", "status"):
         if not isinstance(manifest.run[name], str):
             raise ValueError(f"of its run it says that {name} is {manifest.run[name]!r}")
-    if unknown := set(manifest.topics) - {topic.name for topic in schema.TOPICS}:
+    if unknown := set(manifest.topics) - {topic.name for topic in schema.ALL_TOPICS}:
         raise ValueError(f"it has topics {sorted(unknown)}")
 
 

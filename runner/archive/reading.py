@@ -21,7 +21,7 @@ from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_o
 from runner.archive.pages import largest_page
 from runner.errors import RecordingError
 from runner.mdp import Mdp
-from runner.recording.facts import check_run, environment_of, json_object
+from runner.recording.facts import check_run, environment_of, json_object, kind_of
 from runner.recording.index import UNPACKED_A_BYTE
 from runner.recording.schema import Topic
 
@@ -117,17 +117,26 @@ class Archive:
             self.metadata.get("config", {}).get("json"), f"{self.folder}: the metadata 'config'"
         )
 
+    @property
+    def kind(self) -> str:
+        """Of which kind the run is, one of `schema.KINDS`."""
+        return kind_of(self.metadata["run"])
+
+    @cached_property
+    def _environment(self) -> dict[str, Any]:
+        where = f"{self.folder}: {layout.ENVIRONMENT}"
+        return json_object(self.attachment(layout.ENVIRONMENT), where)
+
     @cached_property
     def mdp(self) -> Mdp:
         """The run's environment."""
-        where = str(self.folder)
-        description = json_object(self.attachment(layout.ENVIRONMENT), f"{where}: {layout.ENVIRONMENT}")
-        return environment_of(description, self.attachment, where)
+        return environment_of(dict(self._environment), self.attachment, str(self.folder))
 
     @cached_property
     def shape(self) -> Shape:
-        """What fixes the columns of steps and episodes."""
-        return shape_of(self.metadata["run"], self.mdp, str(self.folder))
+        """What fixes the tables of messages and their columns."""
+        tabular = self.kind in ("job", "step") and self._environment.get("arrays") != []
+        return shape_of(self.metadata["run"], self.mdp if tabular else None, str(self.folder))
 
     def attachment(self, name: str) -> bytes:
         """Return an attachment's data.
@@ -186,7 +195,7 @@ class Archive:
         groups = [about.row_group(k) for k in range(about.num_row_groups)]
         if any(group.num_rows > MAX_ROWS_A_GROUP for group in groups):
             raise RecordingError(f"{path}: has a group of more than {MAX_ROWS_A_GROUP:,} rows.")
-        if rows * _ROW_BYTES > size * UNPACKED_A_BYTE + _UNPACKED_ANYWAY:
+        if rows * max(_ROW_BYTES, layout.row_bytes(columns)) > size * UNPACKED_A_BYTE + _UNPACKED_ANYWAY:
             raise RecordingError(f"{path}: {size:,} bytes declare {rows:,} rows; made to exhaust the disk.")
         if (found := largest_page(path, about)) > MAX_PAGE_BYTES:
             raise RecordingError(
@@ -196,5 +205,5 @@ class Archive:
 
 def _refuse_nulls(batch: pa.RecordBatch, path: Path) -> None:
     for name, column in zip(batch.schema.names, batch.columns, strict=True):
-        if column.null_count and name != "data":
+        if column.null_count and name not in layout.MAY_BE_NULL:
             raise RecordingError(f"{path}: found {column.null_count} rows without {name}, expected none.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,18 +15,22 @@ from blake3 import blake3
 
 from runner.archive import layout
 from runner.archive.columns import Records, of_phase, record_bytes, records_of
+from runner.archive.layout import Table
 from runner.archive.manifest import Entry, Manifest
 from runner.archive.reading import Archive
 from runner.archive.replay import Meetings, Tables
 from runner.archive.rows import message_payload
 from runner.config import from_mapping
+from runner.config.model import Recording as Plan
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
+from runner.recording.facts import json_object
 from runner.recording.messages import QTable, encode_q_table
+from runner.recording.piles import Piles
 from runner.recording.pipeline import Pipeline
 from runner.recording.reader import open_recording
-from runner.recording.recorder import EPISODES_A_BLOCK, storage_error
+from runner.recording.recorder import BLOCK_BYTES, capacity_of, storage_error
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 
@@ -50,7 +55,7 @@ def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: 
     archive = Archive(folder)
     archive.check_files()
     try:
-        with RecordingFile(path) as file:
+        with RecordingFile(path, schema.KINDS[archive.kind]) as file:
             _Restoring(archive, file, report).restore()
         with open_recording(path):  # what cannot be read is not restored
             pass
@@ -87,26 +92,24 @@ class _Restoring:
         self._file = file
         self._report = report
         self._where = str(archive.folder)
-        self._config = from_mapping(archive.config)
-        plan = self._config.recording
+        self._shape = archive.shape
+        plan = _plan_of(archive)
         self._chunk_steps = plan.chunk_steps
         self._pipeline = Pipeline(file, Packing(plan.compression, plan.level or 0, plan.index), lambda: None)
+        self._piles = Piles(self._send)
         self._room = threading.Semaphore(_UNDER_WAY)
-        self._log = blake3()
-        self._counts = {topic.name: 0 for topic in schema.TOPICS}
+        topics = schema.KINDS[archive.kind]
+        self._undigested = {topic: blake3() for topic in topics if not topic.digested}
+        self._counts = {topic.name: 0 for topic in topics}
         self._steps_done = 0
 
     def restore(self) -> None:
         """Restore everything, and compare its hashes with those in the manifest."""
         try:
             self._describe()
-            self._restore_steps()
-            self._restore_blocks(
-                layout.EPISODES, (schema.TRAIN_EPISODE, schema.EVAL_EPISODE), self._send_episodes
-            )
-            for topic in layout.ROW_BY_ROW:
-                for row in self._rows(topic):
-                    self._send_message(topic, row["position"], self._payload(topic, row))
+            for table in self._shape.tables:
+                self._restore_table(table)
+                self._piles.flush()
         finally:
             self._pipeline.close()
         self._raise_failure()
@@ -124,42 +127,58 @@ class _Restoring:
         for name, media_type in self._archive.attachments:
             self._file.add_attachment(name, media_type, self._archive.attachment(name))
 
-    def _restore_steps(self) -> None:
+    def _restore_table(self, table: Table) -> None:
+        if table.topics[0] not in self._shape.sizes:
+            self._restore_messages(table)
+        elif self._archive.kind == "job" and table.name == layout.STEPS:
+            self._restore_learning(table)
+        else:
+            for topic, records in self._records(table):
+                self._send_block(topic, records)
+
+    def _restore_learning(self, table: Table) -> None:
+        """Restore the steps of a job, and the snapshots that they make."""
         seed = int(self._archive.metadata["run"]["seed"])
         tables = Tables(self._archive.config, self._archive.mdp, seed, self._where)
         meetings = Meetings(tables, self._snapshots(), partial(self._restore_snapshot, tables))
-
-        def send(topic: Topic, records: Records) -> None:
+        for topic, records in self._records(table):
             if topic is schema.TRAIN_STEP:
                 meetings.take(records)
-            self._send_block(topic, records, self._chunk_steps)
-            self._steps_done += len(records)
-            self._report(self._steps_done)
-
-        self._restore_blocks(layout.STEPS, (schema.TRAIN_STEP, schema.EVAL_STEP), send)
+            self._send_block(topic, records)
         meetings.finish()
 
-    def _restore_blocks(
-        self, name: str, topics: tuple[Topic, Topic], send: Callable[[Topic, Records], None]
-    ) -> None:
-        """Send on the rows of a table of training and evaluation, as records."""
-        archive = self._archive
-        columns = archive.shape.steps if name == layout.STEPS else archive.shape.episodes
-        for batch in archive.batches(name, columns, archive.count(*topics), self._chunk_steps):
-            for topic in topics:
-                mine = of_phase(batch, topic.phase, f"{self._where}: {name}")
+    def _records(self, table: Table) -> Iterator[tuple[Topic, Records]]:
+        """Yield the rows of a table as records, at most so many as a chunk has."""
+        archive, rows = self._archive, self._most(table.topics[0])
+        for batch in archive.batches(table.name, table.columns, archive.count(*table.topics), rows):
+            for topic in table.topics:
+                mine = of_phase(batch, topic.phase, f"{self._where}: {table.name}")
                 if mine.num_rows:
-                    send(topic, records_of(topic, mine, archive.shape))
+                    yield topic, records_of(topic, mine, self._shape)
 
-    def _send_episodes(self, topic: Topic, records: Records) -> None:
-        self._send_block(topic, records, EPISODES_A_BLOCK)
+    def _restore_messages(self, table: Table) -> None:
+        """Restore a table of messages that vary in size, a row each."""
+        phases = {topic.phase: topic for topic in table.topics}
+        for row in self._rows(table):
+            topic = table.topics[0] if len(phases) == 1 else phases.get(row["phase"])
+            if topic is None:
+                raise RecordingError(f"{self._where}: {table.name}: found the phase {row['phase']!r}.")
+            self._send_message(topic, row["position"], self._payload(topic, row))
 
-    def _send_block(self, topic: Topic, records: Records, most: int) -> None:
-        """Send records to the file, at most so many a chunk."""
-        for start in range(0, len(records), most):
-            some = records[start : start + most]
-            offsets = np.arange(len(some), dtype=np.uint64) * np.uint64(some.itemsize)
-            self._send(topic, record_bytes(some), some["log_time"], offsets)
+    def _most(self, topic: Topic) -> int:
+        """Return how many messages of a topic a chunk has at most."""
+        return capacity_of(topic, self._shape.sizes[topic], self._chunk_steps)
+
+    def _send_block(self, topic: Topic, records: Records) -> None:
+        """Send records to the file as a chunk."""
+        offsets = np.arange(len(records), dtype=np.uint64) * np.uint64(records.itemsize)
+        self._send(topic, record_bytes(records), records["log_time"], offsets)
+        self._count_steps(topic, len(records))
+
+    def _count_steps(self, topic: Topic, n: int) -> None:
+        if topic.name in ("/train/step", "/eval/step"):
+            self._steps_done += n
+            self._report(self._steps_done)
 
     def _send_message(self, topic: Topic, position: int, payload: bytes) -> None:
         time = position * STEP_NANOSECONDS
@@ -167,10 +186,12 @@ class _Restoring:
             raise RecordingError(
                 f"{self._where}: {topic.name}: found {len(payload):,} bytes after {position} steps."
             )
-        record = memoryview(schema.message_record(topic, time, payload))
-        if topic is schema.LOG_TOPIC:
-            self._log.update(record)
-        self._send(topic, record, np.array([time], np.uint64), np.zeros(1, np.uint64))
+        if not topic.digested:
+            self._undigested[topic].update(schema.message_record(topic, time, payload))
+        self._piles.add(topic, time, payload)
+        if topic.message is schema.IMAGE or self._archive.kind == "job":
+            self._piles.flush()
+        self._count_steps(topic, 1)
 
     def _send(self, topic: Topic, records: memoryview, times: Any, offsets: Any) -> None:
         self._raise_failure()
@@ -185,23 +206,24 @@ class _Restoring:
         if failure is not None:
             raise failure
 
-    def _rows(self, topic: Topic) -> Iterator[dict[str, Any]]:
-        """Yield the rows of a topic's own table."""
-        name = layout.MESSAGES[topic]
-        n = 1 if topic is schema.Q_TABLE_TOPIC else _ROWS_AT_ONCE
-        for batch in self._archive.batches(name, layout.SCHEMAS[name], self._archive.count(topic), n):
+    def _rows(self, table: Table) -> Iterator[dict[str, Any]]:
+        """Yield the rows of a table."""
+        most = BLOCK_BYTES // layout.row_bytes(table.columns)
+        n = 1 if "data" in table.columns.names else max(1, min(most, _ROWS_AT_ONCE))
+        for batch in self._archive.batches(table.name, table.columns, self._archive.count(*table.topics), n):
             yield from batch.to_pylist()
 
     def _payload(self, topic: Topic, row: dict[str, Any]) -> bytes:
         try:
-            return message_payload(topic, row["position"], row)
+            return message_payload(topic, row["position"], row, self._shape)
         except (TypeError, ValueError, OverflowError) as error:
             raise RecordingError(
                 f"{self._where}: {topic.name} after {row['position']} steps: makes no sense ({error})."
             ) from error
 
     def _snapshots(self) -> Iterator[_Row]:
-        return (_Row(row["step"], row) for row in self._rows(schema.Q_TABLE_TOPIC))
+        table = Table(layout.Q_TABLES, (schema.Q_TABLE_TOPIC,), layout.SCHEMAS[layout.Q_TABLES])
+        return (_Row(row["step"], row) for row in self._rows(table))
 
     def _restore_snapshot(self, tables: Tables, snapshot: _Row) -> None:
         """Send a snapshot, from its values or as the steps before it make it."""
@@ -227,7 +249,8 @@ class _Restoring:
 
     def _compare(self) -> None:
         """Compare what was restored with what was archived."""
-        hashes = self._pipeline.hash.topics() | {schema.LOG_TOPIC.name: self._log.hexdigest()}
+        hashes = self._pipeline.hash.topics()
+        hashes |= {topic.name: digest.hexdigest() for topic, digest in self._undigested.items()}
         found = {name: Entry(count, hashes[name]) for name, count in self._counts.items() if count}
         for name in sorted(found.keys() | self._archive.manifest.topics.keys()):
             told, expected = found.get(name), self._archive.manifest.topics.get(name)
@@ -235,6 +258,21 @@ class _Restoring:
                 raise RecordingError(
                     f"{self._where}: {name}: restored {_in_words(told)}, expected {_in_words(expected)}."
                 )
+
+
+def _plan_of(archive: Archive) -> Plan:
+    """Return how the recording was packed.
+
+    Raises:
+        RunnerError: its configuration makes no sense of it.
+    """
+    config = archive.config
+    if archive.kind == "job":
+        return from_mapping(config).recording
+    parts = json_object(json.dumps(config.get("recording")), f"{archive.folder}: 'recording' in its config")
+    if parts.get("compression") != "zstd":
+        parts.pop("level", None)  # a loop is told it all the same
+    return from_mapping({"episodes": 1, "recording": parts}).recording
 
 
 def _in_words(entry: Entry | None) -> str:

@@ -1,16 +1,20 @@
-"""Messages of variable size to rows and back: metrics, log lines, snapshots of Q-tables."""
+"""Messages of variable size to rows and back: metrics, log lines, snapshots, what only loops record."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from blake3 import blake3
 
+from runner.archive.layout import Shape
 from runner.recording import schema
-from runner.recording.messages import QTable, decode, encode, encode_log
+from runner.recording.messages import QTable, decode, encode, encode_image, encode_log
 from runner.recording.schema import STEP_NANOSECONDS, Topic
+
+_OF_SPACES: Final = (schema.TRANSITION, schema.RESET)
+"""The messages that hold values of spaces, whose columns differ from run to run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,25 +30,50 @@ class PlacedTable:
         return self.table.step
 
 
-def message_row(topic: Topic, payload: bytes) -> dict[str, Any]:
-    """Return a message of metrics or of the log as the values of its columns.
+def message_row(topic: Topic, payload: bytes, shape: Shape) -> dict[str, Any]:
+    """Return a message as the values of its columns, but run and position.
 
     Raises:
         RecordingError: the payload is no such message.
+        ValueError: it holds no value of its space.
     """
     values = decode(topic.message, payload)
-    if topic is schema.LOG_TOPIC:
+    if topic.message is schema.LOG:
         level = values["level"]
         known = 0 <= level < len(schema.LOG_LEVELS)
-        return {"level": schema.LOG_LEVELS[level if known else 0], "message": values["message"]}
-    return values
+        level = schema.LOG_LEVELS[level if known else 0]
+        return {"name": values["name"], "level": level, "message": values["message"]}
+    if topic.message is schema.IMAGE:
+        return {"phase": topic.phase, "format": values["format"], "data": values["data"]}
+    if topic.message in _OF_SPACES:
+        for field in values.keys() & shape.spaces.keys():
+            values |= shape.spaces[field].row(values.pop(field))
+        if topic.message is schema.TRANSITION:
+            rewards = values.pop("rewards")
+            values |= {"reward": sum(rewards[1:], rewards[0])}
+            values |= zip(shape.per_learner("reward"), rewards, strict=False)
+        elif not values.pop("seeded"):
+            values["seed"] = None
+    return ({"phase": topic.phase} if topic.phase else {}) | values
 
 
-def message_payload(topic: Topic, position: int, row: Mapping[str, Any]) -> bytes:
+def message_payload(topic: Topic, position: int, row: Mapping[str, Any], shape: Shape) -> bytes:
     """Return the message that a row came from."""
-    if topic is schema.LOG_TOPIC:
-        return encode_log(row["message"], position * STEP_NANOSECONDS / 1e9, row["level"])
-    return encode(topic.message, {field.name: row[field.name] for field in topic.message.fields})
+    if topic.message is schema.LOG:
+        return encode_log(row["message"], position * STEP_NANOSECONDS / 1e9, row["level"], row["name"])
+    if topic.message is schema.IMAGE:
+        return encode_image(row["data"], row["format"], position, topic.phase)
+    fields = {field.name: row[field.name] for field in topic.message.fields if field.name in row}
+    if topic.message in _OF_SPACES:
+        names = {field.name for field in topic.message.fields} & shape.spaces.keys()
+        fields |= {name: shape.spaces[name].value(row) for name in names}
+        if topic.message is schema.TRANSITION:
+            fields["rewards"] = [row[name] for name in shape.per_learner("reward") or ["reward"]]
+        elif row["seed"] is None:
+            del fields["seed"]
+        else:
+            fields["seeded"] = True
+    return encode(topic.message, fields)
 
 
 def snapshot_row(run_id: str, snapshot: PlacedTable, with_values: bool) -> dict[str, Any]:

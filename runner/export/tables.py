@@ -1,4 +1,8 @@
-"""Steps, episodes and measures as tables, for spreadsheets and data frames: CSV or Parquet, a file each."""
+"""Steps, episodes and measures as tables, for spreadsheets and data frames: CSV or Parquet, a file each.
+
+Of somebody's own loop also its resets and infos. A column has a number or a text; what has more numbers than
+`runner.archive.values` spreads over columns is bytes, which CSV cannot hold.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +18,22 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
-from runner.archive.writing import episode_batches, step_batches
+from runner.archive import layout
+from runner.archive.batches import Batches
 from runner.export.scalars import measures
 from runner.recording.reader import Recording
 
 Ranges = tuple[tuple[int, int | None], ...]
 Report = Callable[[int], None]
-FILES: Final = ("steps.csv", "episodes.csv", "metrics.csv")
-OURS: Final = (
-    *FILES,
-    *(f"{name}.gz" for name in FILES),
-    "steps.parquet",
-    "episodes.parquet",
-    "metrics.parquet",
+_TABLES: Final = {
+    "steps": layout.STEPS,
+    "episodes": layout.EPISODES,
+    "resets": layout.RESETS,
+    "infos": layout.INFOS,
+}
+"""Name -> the table of an archive that it is."""
+OURS: Final = tuple(
+    name + ending for name in (*_TABLES, "metrics") for ending in (".csv", ".csv.gz", ".parquet")
 )
 _METRICS: Final = pa.schema(
     [
@@ -70,11 +77,11 @@ def write_tables(
         OSError: the folder cannot be written.
     """
     ending = f".{form}.gz" if gz else f".{form}"
+    reading = Batches(recording)
+    own = {table.name: table for table in reading.shape.tables}
     tables = {
-        "steps": _chosen(step_batches(recording), choice),
-        "episodes": _chosen(episode_batches(recording), choice),
-        "metrics": metric_batches(recording),
-    }
+        name: _chosen(reading.of(own[file]), choice) for name, file in _TABLES.items() if file in own
+    } | {"metrics": metric_batches(recording)}
     rows = {}
     for name, batches in tables.items():
         rows[name + ending] = _write(
@@ -101,7 +108,7 @@ def _chosen(batches: Iterator[pa.RecordBatch], choice: Choice) -> Iterator[pa.Re
     """Yield the rows that are chosen."""
     for batch in batches:
         kept = batch if not choice.phase else batch.filter(pc.equal(batch["phase"], choice.phase))
-        if choice.episodes:
+        if choice.episodes and "episode" in kept.schema.names:
             kept = kept.filter(_within(kept["episode"], choice.episodes))
         if kept.num_rows:
             yield kept
@@ -135,7 +142,7 @@ def _write(path: Path, form: str, gz: bool, batches: Iterator[pa.RecordBatch], r
             writer = pa.parquet.ParquetWriter(str(path), columns, compression="zstd")
         stack.enter_context(writer)
         for batch in _with(first, batches):
-            writer.write_batch(batch.cast(columns) if form == "csv" else batch)
+            writer.write_batch(batch.select(columns.names).cast(columns) if form == "csv" else batch)
             rows += batch.num_rows
             report(rows)
     return rows
@@ -146,8 +153,20 @@ def _with(first: pa.RecordBatch, rest: Iterator[pa.RecordBatch]) -> Iterator[pa.
     yield from rest
 
 
+def left_out(recording: Recording) -> list[str]:
+    """Return the columns of a recording that CSV cannot hold: arrays of many numbers."""
+    tables = Batches(recording).shape.tables
+    found = [one.name for table in tables if table.name in _TABLES.values() for one in table.columns]
+    kept = [name for table in tables for name in _plain(table.columns).names]
+    return list(dict.fromkeys(name for name in found if name not in kept))
+
+
 def _plain(columns: pa.Schema) -> pa.Schema:
-    """Return a schema that CSV can hold: texts that repeat are texts."""
+    """Return a schema that CSV can hold: texts that repeat are texts, and bytes are left out."""
     return pa.schema(
-        [(field.name, pa.string() if pa.types.is_dictionary(field.type) else field.type) for field in columns]
+        [
+            (one.name, pa.string() if pa.types.is_dictionary(one.type) else one.type)
+            for one in columns
+            if not pa.types.is_fixed_size_binary(one.type)
+        ]
     )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.schema import MessageType
+from runner.recording.schema import STEP_NANOSECONDS, MessageType
 from runner.recording.spaces import NUMBERS
 
 
@@ -121,3 +121,10 @@ def encode_log(text: str, seconds: float, level: str = "INFO", name: str = "dual
             "name": name,
         },
     )
+
+
+def encode_image(data: bytes, kind: str, position: int, phase: str) -> bytes:
+    """Return a `foxglove.CompressedImage` after so many steps; `kind` is `png` or `jpeg`."""
+    seconds, nanos = divmod(position * STEP_NANOSECONDS, 10**9)
+    stamp = {"seconds": seconds, "nanos": nanos}
+    return encode(schema.IMAGE, {"timestamp": stamp, "data": data, "format": kind, "frame_id": phase})

@@ -209,6 +209,11 @@ class Recording:
         """What is said of the environment beside its arrays: agents, events, scene."""
         return json_object(self.attachment("environment.json"), f"{self.path}: environment.json")
 
+    @property
+    def tabular(self) -> bool:
+        """Whether the environment's arrays are there, so that it has an `mdp`."""
+        return self.kind in ("job", "step") and self.environment.get("arrays") != []
+
     # --- blocks ------------------------------------------------------------------------------------
 
     @cached_property

@@ -21,6 +21,7 @@ from runner.errors import StorageError
 from runner.recording import schema
 from runner.recording.chunks import Packing
 from runner.recording.past import Past
+from runner.recording.piles import Piles
 from runner.recording.pipeline import Pipeline
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
@@ -31,8 +32,6 @@ BLOCKS_UNDER_WAY: Final = 8
 EPISODES_A_BLOCK: Final = 2048
 BLOCK_BYTES: Final = 8 << 20
 """A block has no more bytes than this, unless one record has."""
-_PILE_BYTES: Final = 1 << 18
-_PILE_MESSAGES: Final = 4096
 
 
 @dataclass
@@ -54,15 +53,6 @@ class _Lane:
     open: _Block | None = None
     free: queue.SimpleQueue[_Block] = field(default_factory=queue.SimpleQueue)
     made: int = 0
-
-
-@dataclass
-class _Pile:
-    """Messages of one topic of variable size, waiting to be a chunk together."""
-
-    records: bytearray = field(default_factory=bytearray)
-    times: list[int] = field(default_factory=list)
-    offsets: list[int] = field(default_factory=list)
 
 
 class Recorder:
@@ -101,18 +91,18 @@ class Recorder:
             topic: _Lane(
                 topic,
                 own,
-                capacity=_capacity(topic, own, chunk_steps),
+                capacity=capacity_of(topic, own, chunk_steps),
                 write=record_steps or topic.message is not schema.STEP,
             )
             for topic, own in sizes.items()
         }
-        self._piles: dict[Topic, _Pile] = {}
         self.steps = {"train": 0, "eval": 0}
         """Steps committed so far, a phase."""
         self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
         """Messages committed so far, a topic."""
         self._last_flush = time.monotonic()
         self._pipeline = Pipeline(file, packing or Packing(), beat)
+        self._piles = Piles(self._pipeline.send)
 
     @property
     def bytes_written(self) -> int:
@@ -179,17 +169,8 @@ class Recorder:
             StorageError: the disk is full or failing; everything before is kept.
         """
         self._raise_failure()
-        pile = self._piles.setdefault(topic, _Pile())
-        if pile.records and len(pile.records) + len(payload) > _PILE_BYTES:
-            self._close_pile(topic)
-            pile = self._piles.setdefault(topic, _Pile())
-        log_time = position * STEP_NANOSECONDS
-        pile.offsets.append(len(pile.records))
-        pile.times.append(log_time)
-        pile.records += schema.message_record(topic, log_time, payload)
+        self._piles.add(topic, position * STEP_NANOSECONDS, payload)
         self.counts[topic.name] += 1
-        if len(pile.times) == _PILE_MESSAGES:
-            self._close_pile(topic)
 
     def submit(self, topic: Topic, make: Callable[[], bytes], position: int) -> None:
         """Record one message that is yet to be made, by a thread of the recorder's own.
@@ -205,8 +186,7 @@ class Recorder:
 
     def flush(self) -> None:
         """Close every open block, so that it is written now."""
-        for topic in list(self._piles):
-            self._close_pile(topic)
+        self._piles.flush()
         for lane in self._lanes.values():
             if lane.open is not None and lane.open.filled:
                 self._close_block(lane)
@@ -287,11 +267,6 @@ class Recorder:
             used=partial(lane.free.put, block),
         )
 
-    def _close_pile(self, topic: Topic) -> None:
-        pile = self._piles.pop(topic)
-        times, offsets = (np.array(numbers, np.uint64) for numbers in (pile.times, pile.offsets))
-        self._pipeline.send(topic, memoryview(pile.records), times, offsets)
-
     def _raise_failure(self) -> None:
         failure = self._pipeline.failure
         if isinstance(failure, OSError) and self._file is not None:
@@ -300,7 +275,7 @@ class Recorder:
             raise failure
 
 
-def _capacity(topic: Topic, sizes: schema.Sizes, chunk_steps: int) -> int:
+def capacity_of(topic: Topic, sizes: schema.Sizes, chunk_steps: int) -> int:
     """Return how many records a block of a topic has."""
     most = EPISODES_A_BLOCK if topic.message in (schema.EPISODE, schema.RESET) else chunk_steps
     return max(1, min(most, BLOCK_BYTES // schema.record_dtype(topic.message, sizes).itemsize))

@@ -304,6 +304,8 @@ KINDS: Final = {
 ALL_TOPICS: Final = tuple(
     sorted({topic for topics in KINDS.values() for topic in topics}, key=lambda topic: topic.channel)
 )
+DIGESTED: Final = frozenset(topic.name for topic in ALL_TOPICS if topic.digested)
+"""The names of the topics that the content digest covers."""
 MESSAGES: Final = tuple(dict.fromkeys(topic.message for topic in ALL_TOPICS))
 """Every message; the id of a schema is its place here, from 1."""
 

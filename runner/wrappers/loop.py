@@ -23,7 +23,7 @@ from runner.recording.arrays import pack_array
 from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
 from runner.recording.digest import combine
 from runner.recording.facts import sizes_of
-from runner.recording.messages import encode, encode_log
+from runner.recording.messages import encode, encode_image, encode_log
 from runner.recording.recorder import FLUSH_SECONDS, Recorder, storage_error
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.writer import RecordingFile
@@ -311,11 +311,9 @@ class Loop(Generic[R]):
         kind = self.plan.frame_format
         with self.lock:
             position = self._moment()
-            seconds, tenths = divmod(position, 10)
-            fields = {"timestamp": {"seconds": seconds, "nanos": tenths * STEP_NANOSECONDS}, "format": kind}
 
             def make() -> bytes:
-                return encode(schema.IMAGE, fields | {"data": image_bytes(pixels, kind), "frame_id": phase})
+                return encode_image(image_bytes(pixels, kind), kind, position, phase)
 
             self._recorder.submit(self._topics[f"/{phase}/frame"], make, position)
 

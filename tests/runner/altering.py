@@ -12,7 +12,7 @@ from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.chunks import Packing, encode_chunk
 from runner.recording.contents import survey
-from runner.recording.schema import BLOCK_TOPICS, TOPICS, Topic
+from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
 
 Change = Callable[[Any], Any]
@@ -28,7 +28,7 @@ def altered(source: Path, target: Path, topic: Topic | None, change: Change, **m
         change: takes all of them, as one array, or as a list of (log time, payload), and gives them back.
         metadata: what changes the entries of a metadata record.
     """
-    with open_recording(source) as recording, RecordingFile(target) as file:
+    with open_recording(source) as recording, RecordingFile(target, recording.topics) as file:
         contents = survey(source, keep_result=True)
         names = [entry.name for entry in contents.metadata]
         entries = {name: recording.metadata(name) for name in names}
@@ -38,7 +38,7 @@ def altered(source: Path, target: Path, topic: Topic | None, change: Change, **m
                 file.add_metadata(name, entries[name])
         for entry in contents.attachments:
             file.add_attachment(entry.name, entry.media_type, recording.attachment(entry.name))
-        for one in TOPICS:
+        for one in recording.topics:
             turn = change if one is topic else lambda messages: messages
             _write(file, one, *_records(recording, one, turn))
         file.finish("result", entries["result"])
@@ -47,7 +47,7 @@ def altered(source: Path, target: Path, topic: Topic | None, change: Change, **m
 
 def _records(recording: Any, topic: Topic, change: Change) -> tuple[list[bytes], list[int]]:
     """Return the bytes and the log time of each message of a topic, changed."""
-    if topic in BLOCK_TOPICS:
+    if topic in recording.dtypes:
         blocks = [block.copy() for block in recording.blocks(topic)]
         if not blocks:
             return [], []

@@ -70,7 +70,7 @@ def _export(
     from runner.export.places import new_folder, require_pyarrow, require_steps, shortcomings
 
     require_pyarrow(f"export {form}")
-    from runner.export.tables import OURS, Choice, write_tables
+    from runner.export.tables import OURS, Choice, left_out, write_tables
     from runner.recording.reader import open_recording
 
     run = find_recorded(run_name, recordings)
@@ -83,6 +83,8 @@ def _export(
             rows = write_tables(recording, folder, form, choice, gz, report)
         for shortcoming in shortcomings(recording):
             say(shortcoming)
+        if form == "csv" and (large := left_out(recording)):
+            say(f"Left out, as CSV cannot hold their bytes: {', '.join(large)}; `export parquet` has them.")
     for name, count in rows.items():
         click.echo(f"{path / name}  {size((path / name).stat().st_size)}, {count:,} rows")
 
@@ -92,7 +94,8 @@ csv: click.Command = _command(
     """Export RUN as CSV: steps.csv, episodes.csv and metrics.csv in a folder.
 
     Columns are named as the recording's fields; each agent's action and reward has its own. metrics.csv has
-    a row for each measure. Numbers are written so that they read back as they were.
+    a row for each measure. Of a loop there are resets.csv and infos.csv too, and each number of an
+    observation or action has a column. Numbers are written so that they read back as they were.
 
     \b
     Examples:
@@ -106,7 +109,9 @@ parquet: click.Command = _command(
     "parquet",
     """Export RUN as Parquet: steps.parquet, episodes.parquet and metrics.parquet in a folder.
 
-    Columns are named as the recording's fields; each agent's action and reward has its own.
+    Columns are named as the recording's fields; each agent's action and reward has its own. Of a loop there
+    are resets.parquet and infos.parquet too, and each number of an observation or action has a column; an
+    array of more than 64 is one column of bytes.
 
     \b
     Examples:

@@ -93,8 +93,7 @@ class LoopExporter:
         self._selection = selection
         self._root = root
         self._learners = tuple(agents_of(recording))
-        tabular = recording.kind == "step" and bool(recording.environment["arrays"])
-        self._scene = scene_of(recording.mdp) if tabular else None
+        self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._logged: list[str] = []
         self._frames = [phase for phase in PHASES if any(True for _ in recording.messages(_frame(phase)))]
         self._arrays: list[str] = []

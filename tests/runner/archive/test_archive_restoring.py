@@ -14,7 +14,6 @@ import pytest
 from runner.archive import layout
 from runner.archive.manifest import Entry, Manifest, entries_of
 from runner.archive.restoring import check, restore
-from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError
 from runner.recording import open as open_recording
 from runner.recording import schema
@@ -22,26 +21,8 @@ from runner.recording.integrity import check_integrity
 from runner.recording.repair import repair
 from runner.verify import verify
 from tests.runner.altering import altered
+from tests.runner.archive.whole import archived, contents
 from tests.runner.recording.making import LAKE, TAXIS, make_run
-
-
-def archived(path, folder):
-    folder.mkdir()
-    with open_recording(path) as recording:
-        write_archive(recording, folder)
-    return folder
-
-
-def contents(path):
-    """Return all that a recording holds, but where its chunks were closed."""
-    with open_recording(path) as recording:
-        blocks = {
-            topic.name: b"".join(block.tobytes() for block in recording.blocks(topic))
-            for topic in schema.BLOCK_TOPICS
-        }
-        messages = {topic.name: list(recording.messages(topic)) for topic in layout.MESSAGES}
-        metadata = {name: recording.metadata(name) for name in recording.metadata_names}
-        return blocks, messages, metadata, list(recording.attachments())
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from runner.archive import layout
+from runner.archive.batches import Batches
 from runner.archive.manifest import entry_of, read_manifest
-from runner.archive.writing import step_batches, write_archive
+from runner.archive.writing import write_archive
 from runner.errors import RecordingError
 from runner.recording import open as open_recording
 from runner.recording import schema
@@ -47,7 +48,8 @@ def test_learners_of_their_own_have_columns_of_their_own(tmp_path):
     run = make_run(tmp_path, TAXIS)
     with open_recording(run.recording) as recording:
         steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
-        table = pa.Table.from_batches(step_batches(recording))
+        batches = Batches(recording)
+        table = pa.Table.from_batches(batches.of(batches.shape.tables[0]))
     table = table.filter(pa.compute.equal(table["phase"], "train"))
     for i in range(2):
         np.testing.assert_array_equal(table[f"reward_taxi_{i + 1}"].to_numpy(), steps["rewards"][:, i])

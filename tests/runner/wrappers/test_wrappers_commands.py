@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+import numpy as np
+import pandas
 import pytest
 from click.testing import CliRunner
 
@@ -13,7 +17,7 @@ import runner
 from runner.cli import cli
 from runner.recording import schema
 from runner.recording.reader import open_recording
-from tests.runner.wrappers.loops import make, play
+from tests.runner.wrappers.loops import Rooms, make, play
 
 
 @pytest.fixture(scope="session")
@@ -137,6 +141,57 @@ def test_a_loop_is_packed_and_unpacked_to_the_same_bytes(folder, tmp_path):
     assert done.exit_code == 0, done.output
     there = runner.find_run("rooms", tmp_path / "there")
     assert there.summary["content_digest"] == runner.find_run("rooms", folder).summary["content_digest"]
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_a_loop_is_archived_looked_at_and_restored(folder, name, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    there = Path(shutil.copytree(folder, tmp_path / "loops"))
+    digest = runner.find_run(name, there).summary["content_digest"]
+    told = json.loads(dualtaxi(there, "archive", name, "--remove", "--json").stdout)
+    assert told["content_digest"] == digest
+    assert told["removed"]
+    assert dualtaxi(there, "plot", name, "-o", str(tmp_path / "plot.svg")).exit_code == 0
+    original = runner.find_run(name, folder).recording
+    assert dualtaxi(there, "diff", name, str(original)).exit_code == 0
+    assert dualtaxi(there, "restore", name).exit_code == 0
+    assert runner.find_run(name, there).summary["content_digest"] == digest
+    assert dualtaxi(there, "verify", name).exit_code == 0
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_a_loops_steps_are_exported_as_tables(folder, form, name, tmp_path):
+    done = dualtaxi(folder, "export", form, name, "-o", str(tmp_path / "tables"))
+    assert done.exit_code == 0, done.output
+    read = pandas.read_csv if form == "csv" else pandas.read_parquet
+    steps, resets = (read(tmp_path / "tables" / f"{table}.{form}") for table in ("steps", "resets"))
+    with open_recording(runner.find_run(name, folder).recording) as recording:
+        seen = [step for phase in ("train", "eval") for step in recording.transitions(phase)]
+        count = recording.count(recording.topic("/train/reset"))
+    steps = steps.sort_values("position")
+    assert steps["t"].tolist() == [step["t"] for step in seen]
+    assert steps["reward"].tolist() == [step["rewards"][0] for step in seen]
+    assert len(resets.query("phase == 'train'")) == count
+    if name == "pole":
+        numbers = steps[[f"next_observation_{i}" for i in range(4)]].to_numpy(np.float32)
+        np.testing.assert_array_equal(numbers, [step["next_observation"] for step in seen])
+    if name == "rooms":
+        missions = [step["next_observation"]["mission"] for step in seen]
+        assert steps["next_observation_mission"].fillna("").tolist() == missions
+
+
+def test_csv_says_what_it_leaves_out(tmp_path):
+    class Camera(Rooms):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+
+    with runner.record(Camera(), tmp_path / "loops", name="camera") as rec:
+        list(play(rec, 20))
+    done = dualtaxi(tmp_path / "loops", "export", "csv", "camera", "-o", str(tmp_path / "tables"))
+    assert done.exit_code == 0
+    assert "Left out, as CSV cannot hold their bytes: next_observation, observation" in done.output
 
 
 def test_a_killed_loop_is_told_mended_and_compared(folder, tmp_path):

@@ -1,0 +1,129 @@
+"""A recording's messages as columns, some thousands at a time; what they turn back into is compared."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator
+from typing import Any, Final
+
+import pyarrow as pa
+from blake3 import blake3
+
+from runner.archive.columns import Records, checked_batch, merged, record_bytes, shape_of
+from runner.archive.layout import Shape, Table
+from runner.archive.manifest import Entry
+from runner.archive.rows import message_payload, message_row
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.reader import Recording
+from runner.recording.schema import STEP_NANOSECONDS, Topic
+
+_ROWS_AT_ONCE: Final = 1024
+_BYTES_AT_ONCE: Final = 4 << 20
+
+
+class Batches:
+    """The messages of a recording as Arrow columns; it counts and hashes what it gave.
+
+    Args:
+        recording: whose.
+
+    Raises:
+        RecordingError: its parts contradict each other.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._where = str(recording.path)
+        mdp = recording.mdp if recording.tabular else None
+        self.shape: Shape = shape_of(recording.run, mdp, self._where)
+        self._hashes = {topic.name: blake3() for topic in recording.topics}
+        self._counts = dict.fromkeys(self._hashes, 0)
+
+    @property
+    def entries(self) -> dict[str, Entry]:
+        """How many messages were given of each topic, and their hash; those that have any."""
+        return {
+            name: Entry(count, self._hashes[name].hexdigest())
+            for name, count in self._counts.items()
+            if count
+        }
+
+    @property
+    def steps(self) -> int:
+        """How many steps were given."""
+        return self._counts["/train/step"] + self._counts["/eval/step"]
+
+    def of(self, table: Table) -> Iterator[pa.RecordBatch]:
+        """Yield the rows of a table, in the order in which things happened.
+
+        Raises:
+            RecordingError: a message is damaged, or holds what no recorder writes.
+        """
+        if table.topics[0] in self.shape.sizes:
+            yield from (batch for _, _, batch in self.blocks(table))
+            return
+        rows: list[dict[str, Any]] = []
+        size = 0
+        for row, own in heapq.merge(*map(self._rows, table.topics), key=_position):
+            rows.append(row)
+            size += own
+            if len(rows) == _ROWS_AT_ONCE or size > _BYTES_AT_ONCE:
+                yield pa.RecordBatch.from_pylist(rows, table.columns)
+                rows, size = [], 0
+        if rows:
+            yield pa.RecordBatch.from_pylist(rows, table.columns)
+
+    def blocks(self, table: Table) -> Iterator[tuple[Topic, Records, pa.RecordBatch]]:
+        """Yield the messages of a table of fixed width: whose they are, as records and as columns."""
+        train, evaluation = table.topics
+        for topic, records in merged(self._recording, (train, evaluation)):
+            batch = checked_batch(topic, records, self.shape, self._where)
+            self._note(topic, record_bytes(records), len(records))
+            yield topic, records, batch
+
+    def messages(self, topic: Topic) -> Iterator[tuple[int, bytes]]:
+        """Yield position and payload of a topic's messages."""
+        for time, payload in self._recording.messages(topic):
+            position, rest = divmod(time, STEP_NANOSECONDS)
+            if rest:
+                raise self.foreign(topic, f"at {time} ns")
+            self._note(topic, schema.message_record(topic, time, payload), 1)
+            yield position, payload
+
+    def same(self, topic: Topic, position: int, made: bytes, payload: bytes) -> None:
+        """Compare a payload with what was made of its columns.
+
+        Raises:
+            RecordingError: they differ.
+        """
+        if made != payload:
+            raise self.foreign(topic, f"after {position} steps")
+
+    def foreign(self, topic: Topic, place: str, why: str = "") -> RecordingError:
+        """Return the error that tells of a message that columns cannot hold."""
+        return RecordingError(
+            f"{self._where}: {topic.name} {place}: found a message that no recorder writes, so that columns "
+            f"cannot hold it{why}; `dualtaxi verify` tells more."
+        )
+
+    def _rows(self, topic: Topic) -> Iterator[tuple[dict[str, Any], int]]:
+        """Yield a row a message, and the bytes of the message."""
+        run_id = self.shape.run_id
+        for position, payload in self.messages(topic):
+            try:
+                row = message_row(topic, payload, self.shape)
+                made = message_payload(topic, position, row, self.shape)
+            except (RecordingError, ValueError, LookupError) as error:
+                raise self.foreign(topic, f"after {position} steps", f" ({error})") from error
+            self.same(topic, position, made, payload)
+            yield row | {"run_id": run_id, "position": position}, len(payload)
+
+    def _note(self, topic: Topic, records: bytes | memoryview, count: int) -> None:
+        self._hashes[topic.name].update(records)
+        self._counts[topic.name] += count
+
+
+def _position(row: tuple[dict[str, Any], int]) -> int:
+    position: int = row[0]["position"]
+    return position

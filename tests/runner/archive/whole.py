@@ -1,0 +1,29 @@
+"""Archives made of recordings, and all that a recording holds."""
+
+from __future__ import annotations
+
+from runner.archive.writing import write_archive
+from runner.recording import open as open_recording
+
+
+def archived(path, folder):
+    folder.mkdir()
+    with open_recording(path) as recording:
+        write_archive(recording, folder)
+    return folder
+
+
+def contents(path):
+    """Return all that a recording holds, but where its chunks were closed."""
+    with open_recording(path) as recording:
+        blocks = {
+            topic.name: b"".join(block.tobytes() for block in recording.blocks(topic))
+            for topic in recording.dtypes
+        }
+        messages = {
+            topic.name: list(recording.messages(topic))
+            for topic in recording.topics
+            if topic not in recording.dtypes
+        }
+        metadata = {name: recording.metadata(name) for name in recording.metadata_names}
+        return blocks, messages, metadata, list(recording.attachments())
