@@ -239,9 +239,10 @@ def look(
         StorageError: a recordings folder cannot be read.
     """
     for _ in range(2):
+        before = version()
         try:
             with contextlib.closing(_opened(tell)) as database:
-                if as_known:
+                if as_known and before is not None and before.file == (version() or before).file:
                     with database.atomic("DEFERRED"):
                         return work(Index(database, roots))
                 return _look(database, roots, work, anew)
@@ -251,6 +252,7 @@ def look(
         except DatabaseError as error:
             tell(f"The index {index_path()} is damaged ({error}); it is made anew.")
             _replace()
+            as_known = False
     with contextlib.closing(_made(":memory:")) as database:
         return _look(database, roots, work, anew)
 

@@ -15,14 +15,14 @@ from fastapi import APIRouter, FastAPI
 
 from runner import __version__
 from runner.errors import RunnerError
-from runner.service import pages
+from runner.service import health, login, logs, pages
 from runner.service.apart import Apart
 from runner.service.api import comparing, files, jobs, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
 from runner.service.kept import Kept
 from runner.service.problems import answer_errors, answers
-from runner.service.security import Tokens
+from runner.service.security import Access, Tokens
 from runner.service.settings import Settings
 from runner.service.upload import Limits as UploadLimits
 from runner.service.upload import Upload
@@ -62,11 +62,14 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.kept = Kept(settings.limits.cache_bytes)
     app.state.apart = Apart(PROCESSES, settings.limits.work_seconds)
     app.state.stopping = asyncio.Event()
-    app.add_middleware(Guard, settings=settings)
+    app.state.access = Access(settings.tokens, settings.limits)
+    app.add_middleware(Guard, settings=settings, access=app.state.access)
+    app.add_middleware(logs.Access)
     answer_errors(app)
     pages.answer_errors(app)
     app.include_router(_api(), prefix=API)
-    app.include_router(_health())
+    app.include_router(health.router)
+    app.include_router(login.router)
     app.include_router(pages.router)
     return app
 
@@ -86,16 +89,6 @@ def _api() -> APIRouter:
     for part in (runs, reading, replay, comparing, files, jobs, uploads):
         api.include_router(part.router)
     return api
-
-
-def _health() -> APIRouter:
-    router = APIRouter(tags=["health"])
-
-    @router.get("/healthz", summary="Whether the service answers.")
-    async def healthz() -> dict[str, str]:
-        return {"status": "ok"}
-
-    return router
 
 
 @contextlib.asynccontextmanager
@@ -123,8 +116,10 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
             )
         )
         app.state.apart.prepare()
+        LOG.info("started", extra=settings.told())
         yield {}
         app.state.stopping.set()
+        LOG.info("stopping")
 
 
 def _uploaded(app: FastAPI, upload: Upload) -> None:

@@ -24,6 +24,7 @@ FRESH_SECONDS: Final = 1.0
 SHARE: Final = 20
 """One part in so many of the time is spent on looking."""
 NEVER: Final = float("-inf")
+NOTHING: Final = Version(-1, 0)
 
 
 class Catalogue:
@@ -37,7 +38,7 @@ class Catalogue:
         self._look: Future[None] | None = None
         self._asked = self._changed = self._looked = NEVER
         self._took = 0.0
-        self._file: int | None = None
+        self._seen = NOTHING
 
     def close(self) -> None:
         """Wait for the look that is under way, and begin none again."""
@@ -99,7 +100,8 @@ class Catalogue:
     def _is_known(self, now: Version) -> bool:
         """Return whether a look not long ago saw to it that the index agrees with the folders."""
         recent = time.monotonic() - self._looked < 3 * self._interval
-        return recent and self._looked > self._changed and now.file == self._file
+        same_file = now.file == self._seen.file and now.changes >= self._seen.changes
+        return recent and same_file and self._looked > self._changed
 
     @property
     def _interval(self) -> float:
@@ -120,8 +122,7 @@ class Catalogue:
     def _do_look(self) -> None:
         began = time.monotonic()
         look(self.roots, lambda _: None, self._tell)
-        now = version()
-        self._file = now.file if now else None
+        self._seen = version() or NOTHING
         self._looked, self._took = began, time.monotonic() - began
 
 

@@ -7,21 +7,22 @@ import time
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import urlencode
 
 from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.responses import RedirectResponse, Response
 
 from runner.errors import RunnerError
 from runner.service.problems import Refused, refusal, status_of, trouble_of
 from runner.service.security import (
     COOKIE,
-    READ,
     SAFE_METHODS,
     WRITE,
-    Failures,
-    Tokens,
+    Access,
     is_allowed_host,
     is_same_origin,
+    unauthorized,
 )
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
     from runner.service.settings import Settings
 
-OPEN_PATHS: Final = ("/healthz", "/readyz", "/login", "/static/")
+OPEN_PATHS: Final = ("/healthz", "/readyz", "/login", "/logout", "/static/")
 """What needs no token: these, and what is below those that end in a slash."""
 UPLOADS: Final = "/api/v1/uploads"
 """Below it what is sent by PATCH may be as long as a recording."""
@@ -53,9 +54,8 @@ _HEADERS: Final = {
 class Guard:
     """Refuses what may not be, before any route is looked for; so no route can forget to."""
 
-    def __init__(self, app: ASGIApp, settings: Settings) -> None:
-        self._app, self._settings = app, settings
-        self._tokens, self._failures = Tokens(settings.tokens), Failures(settings.limits)
+    def __init__(self, app: ASGIApp, settings: Settings, access: Access) -> None:
+        self._app, self._settings, self._access = app, settings, access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
@@ -66,8 +66,7 @@ class Guard:
         try:
             self._check(scope, headers)
         except RunnerError as error:
-            said = error.headers if isinstance(error, Refused) else None
-            await refusal(status_of(error), trouble_of(error), said)(scope, receive, _with_headers(send))
+            await _answer(error, scope, dict(headers))(scope, receive, _with_headers(send))
             return
         limits = self._settings.limits
         streamed = scope["method"] == "PATCH" and scope["path"].startswith(UPLOADS)
@@ -76,6 +75,11 @@ class Guard:
         await self._app(scope, body.receive, _with_headers(send))
 
     def _check(self, scope: Scope, listed: list[tuple[str, str]]) -> None:
+        """Refuse a request that names another host, lacks a token, or comes from another site.
+
+        Raises:
+            Refused: it does.
+        """
         headers = dict(listed)
         hosts = [value for name, value in listed if name == "host"]
         if len(hosts) != 1 or not is_allowed_host(hosts[0], self._settings.hosts):
@@ -85,18 +89,14 @@ class Guard:
                 "was allowed by --allow-host.",
             )
         reads = scope["method"] in SAFE_METHODS
-        if reads and is_open(scope["path"]):
-            return
-        scopes = self._scopes(scope, headers)
-        if "authorization" in headers and scopes:
-            if (READ if reads else WRITE) not in scopes and not (reads and WRITE in scopes):
+        if not is_open(scope["path"]):
+            scopes = self._scopes(scope, headers)
+            if scopes is not None and not reads and WRITE not in scopes:
                 raise Refused(HTTPStatus.FORBIDDEN, "token: found one for reading, expected one for writing.")
-            return
-        if self._settings.needs_token and not is_open(scope["path"]):
-            if scopes is None:
-                raise _unauthorized("token: found none, expected `Authorization: Bearer TOKEN`, or a login.")
-            if not reads and WRITE not in scopes:
-                raise Refused(HTTPStatus.FORBIDDEN, "token: found one for reading, expected one for writing.")
+            if scopes is None and self._settings.needs_token:
+                raise unauthorized("token: found none, expected `Authorization: Bearer TOKEN`, or a login.")
+            if "authorization" in headers:
+                return  # which no page of another site can make a browser send
         if not reads and not is_same_origin(headers):
             raise Refused(
                 HTTPStatus.FORBIDDEN,
@@ -111,23 +111,16 @@ class Guard:
             Refused: it is a wrong one, or there were too many of them from this address.
         """
         kind, _, secret = headers.get("authorization", "").partition(" ")
-        if kind and kind.lower() != "bearer":
-            raise _unauthorized(f"authorization: found {kind[:20]!r}, expected `Bearer TOKEN`.")
-        secret = secret.strip() or _cookie(headers)
-        if not secret:
-            return None
-        address = (scope.get("client") or ("",))[0]
-        if (seconds := self._failures.wait(address)) > 0:
-            raise Refused(
-                HTTPStatus.TOO_MANY_REQUESTS,
-                f"token: too many wrong ones from {address}; try again in {seconds} s.",
-                {"retry-after": str(seconds)},
-            )
-        scopes = self._tokens.scopes_of(secret)
-        if scopes is None:
-            self._failures.add(address)
-            raise _unauthorized("token: found one that is unknown, or was revoked.")
-        return scopes
+        if kind and (kind.lower() != "bearer" or not secret.strip()):
+            raise unauthorized(f"authorization: found {kind[:20]!r}, expected `Bearer TOKEN`.")
+        if not kind and self._settings.needs_token:
+            secret = _cookie(headers)
+        return self._access.scopes_of(secret.strip(), address_of(scope)) if secret else None
+
+
+def address_of(scope: Scope) -> str:
+    """Return the address of who asks."""
+    return str((scope.get("client") or ("",))[0])
 
 
 def is_open(path: str) -> bool:
@@ -172,8 +165,15 @@ class Body:
         return HTTPException(HTTPStatus.REQUEST_TIMEOUT, message, {"connection": "close"})
 
 
-def _unauthorized(message: str) -> Refused:
-    return Refused(HTTPStatus.UNAUTHORIZED, message, {"www-authenticate": "Bearer"})
+def _answer(error: RunnerError, scope: Scope, headers: dict[str, str]) -> Response:
+    """Return how a request is refused: who reads pages is led to the login."""
+    pages = "text/html" in headers.get("accept", "") and not scope["path"].startswith("/api/")
+    if pages and status_of(error) == HTTPStatus.UNAUTHORIZED and scope["method"] == "GET":
+        asked = scope["path"] + (
+            f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else ""
+        )
+        return RedirectResponse(f"/login?{urlencode({'next': asked})}", HTTPStatus.SEE_OTHER)
+    return refusal(status_of(error), trouble_of(error), error.headers if isinstance(error, Refused) else None)
 
 
 def _cookie(headers: dict[str, str]) -> str:

@@ -25,6 +25,9 @@ from runner.errors import (
     RunNotFound,
     StorageError,
 )
+from runner.service.refused import Refused
+
+__all__ = ["Refused", "answer_errors", "answers", "content", "refusal", "status_of", "trouble_of"]
 from runner.service.queue import NoSuchJob, NotPossibleNow, QueueFull
 from runner.service.upload import Conflict, TooLarge, TooMany
 
@@ -68,14 +71,6 @@ class ErrorAnswer(BaseModel):
     """The body of every answer that is an error."""
 
     error: Trouble
-
-
-class Refused(RunnerError):
-    """A request is refused with a status of its own."""
-
-    def __init__(self, status: HTTPStatus, message: str, headers: dict[str, str] | None = None) -> None:
-        super().__init__(message)
-        self.status, self.headers = status, headers or {}
 
 
 def answers(*statuses: HTTPStatus) -> dict[int | str, dict[str, Any]]:

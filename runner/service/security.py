@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runner.documents import read_object, write_whole
 from runner.errors import RunnerError, StorageError
+from runner.service.refused import Refused
 
 if TYPE_CHECKING:
     from runner.service.settings import Limits
@@ -174,6 +175,37 @@ class Failures:
             self._by_address.popitem(last=False)
 
 
+class Access:
+    """What tokens allow; who tries too many wrong ones must wait."""
+
+    def __init__(self, tokens: Path, limits: Limits) -> None:
+        self._tokens, self._failures = Tokens(tokens), Failures(limits)
+
+    def scopes_of(self, secret: str, address: str) -> tuple[str, ...]:
+        """Return what a token allows that came from an address.
+
+        Raises:
+            Refused: there is no such token, or there were too many wrong ones.
+            StorageError: the file of tokens cannot be read.
+        """
+        if (seconds := self._failures.wait(address)) > 0:
+            raise Refused(
+                HTTPStatus.TOO_MANY_REQUESTS,
+                f"token: too many wrong ones from {address}; try again in {seconds} s.",
+                {"retry-after": str(seconds)},
+            )
+        scopes = self._tokens.scopes_of(secret)
+        if scopes is None:
+            self._failures.add(address)
+            raise unauthorized("token: found one that is unknown, or was revoked.")
+        return scopes
+
+
+def unauthorized(message: str) -> Refused:
+    """Return the error that a token is missing or wrong."""
+    return Refused(HTTPStatus.UNAUTHORIZED, message, {"www-authenticate": "Bearer"})
+
+
 def is_allowed_host(header: str, hosts: tuple[str, ...]) -> bool:
     """Return whether a Host header names this service.
 
@@ -207,8 +239,3 @@ def is_same_origin(headers: dict[str, str]) -> bool:
         scheme, _, host = origin.partition("://")
         return scheme in ("http", "https") and host.lower() == headers.get("host", "").lower()
     return site == "same-origin"
-
-
-def refused_status(has_token: bool) -> HTTPStatus:
-    """Return the status of a request that its token, or the lack of one, does not allow."""
-    return HTTPStatus.FORBIDDEN if has_token else HTTPStatus.UNAUTHORIZED

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import struct
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 MOST_HEAD_BYTES: Final = 64 << 10
 """Of a request's address and headers."""
 BACKLOG: Final = 1024
+_AT_ONCE: Final = struct.pack("ii", 1, 0)
 
 
 def bind(settings: Settings) -> socket.socket:
@@ -45,13 +47,17 @@ def url_of(listening: socket.socket) -> str:
 
 
 def serve(app: FastAPI, settings: Settings, listening: socket.socket) -> None:
-    """Serve until the process is told to stop, then let what is under way come to its end."""
+    """Serve until the process is told to stop, then let what is under way come to its end.
+
+    Raises:
+        RunnerError: the service cannot begin: another one serves these recordings.
+    """
     config = uvicorn.Config(
         app,
         http=_protocol(settings.limits),
         loop="auto",
         ws="none",
-        lifespan="on",
+        lifespan="off",
         log_config=None,
         access_log=False,
         server_header=False,
@@ -61,7 +67,14 @@ def serve(app: FastAPI, settings: Settings, listening: socket.socket) -> None:
         proxy_headers=settings.proxies != "",
         forwarded_allow_ips=settings.proxies or None,
     )
-    _Server(config, app.state.stopping).run(sockets=[listening])
+    server = _Server(config, app.state.stopping)
+
+    async def run() -> None:
+        async with app.router.lifespan_context(app):
+            await server.serve(sockets=[listening])
+
+    with asyncio.Runner(loop_factory=config.get_loop_factory()) as loop:
+        loop.run(run())
 
 
 class _Server(uvicorn.Server):
@@ -73,6 +86,7 @@ class _Server(uvicorn.Server):
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         super().handle_exit(sig, frame)
+        self._captured_signals.clear()  # which would be raised again behind a stop that went well
         self._stopping.set()
 
 
@@ -134,17 +148,9 @@ def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
 
         def _cut_off(self) -> None:
             self._timer = None
+            connection = self.transport.get_extra_info("socket")
+            if connection is not None:  # so that the system does not go on sending what it has
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
             self.transport.abort()
 
     return Protocol
-
-
-def settings_as_json(settings: Settings) -> dict[str, Any]:
-    """Return what is logged of the settings when the service starts."""
-    return {
-        "recordings": [str(folder) for folder in settings.recordings],
-        "host": settings.host,
-        "port": settings.port,
-        "needs_token": settings.needs_token,
-        "workers": settings.workers,
-    }

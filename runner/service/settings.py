@@ -6,7 +6,7 @@ import ipaddress
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from runner.errors import RunnerError
 
@@ -90,3 +90,13 @@ class Settings:
     def needs_token(self) -> bool:
         """Whether reading needs a token."""
         return self.tokens_for_all or not self.is_loopback
+
+    def told(self) -> dict[str, Any]:
+        """Return what is logged of them when the service starts."""
+        return {
+            "recordings": [str(folder) for folder in self.recordings],
+            "host": self.host,
+            "port": self.port,
+            "needs_token": self.needs_token,
+            "workers": self.workers,
+        }

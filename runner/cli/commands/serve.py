@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import click
@@ -43,6 +44,12 @@ from runner.cli.output import say
     metavar="ADDRESS",
     help="Have jobs done by the cluster of Ray there, which sees the recordings under the same path.",
 )
+@click.option(
+    "--log",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="Append the log there, as JSON lines.  [default: stderr]",
+)
 def command(
     recordings: tuple[Path, ...],
     host: str,
@@ -52,6 +59,7 @@ def command(
     require_token: bool,
     workers: int,
     ray: str | None,
+    log: Path | None,
 ) -> None:
     """Open the runs to browsers and programs: list, replay, compare, upload, submit.
 
@@ -67,9 +75,10 @@ def command(
       dualtaxi serve --port 8080 --recordings /data/runs
       dualtaxi serve --host 0.0.0.0 --allow-host runs.example.org --proxy 10.0.0.2
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.errors import MissingExtra
+    from runner.errors import MissingExtra, StorageError
 
     try:
+        from runner.service import logs
         from runner.service.app import create_app
         from runner.service.queue import require_free
         from runner.service.server import bind, serve, url_of
@@ -91,9 +100,17 @@ def command(
         from runner.sweep.cluster import require_ray
 
         require_ray()
+    try:
+        settings.recordings[0].mkdir(parents=True, exist_ok=True)
+        stream = log.open("a", encoding="utf-8", buffering=1) if log else sys.stderr
+    except OSError as error:
+        raise StorageError(f"{error.filename}: cannot be written ({error.strerror}).") from error
+    logs.configure(stream, for_people=log is None and sys.stderr.isatty())
     require_free(settings.recordings[0])  # refused before anybody can ask for anything
     app = create_app(settings)
     listening = bind(settings)
     click.echo(url_of(listening))
-    say("Ctrl+C stops it.")
+    sys.stdout.flush()
+    if sys.stderr.isatty():
+        say("Ctrl+C stops it.")
     serve(app, settings, listening)

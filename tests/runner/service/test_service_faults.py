@@ -1,0 +1,192 @@
+"""What goes wrong around a service that runs: slow clients, a full disk, a lost index, a stop."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import errno
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import httpx2 as httpx
+import pytest
+from serving import serving
+
+from runner.catalogue.index import index_path
+from runner.service.app import create_app
+from runner.service.server import bind, serve
+from runner.service.settings import Limits
+
+
+@pytest.fixture
+def impatient(settings):
+    """Return the port of a service that waits half a second only."""
+    limits = Limits(header_seconds=0.5, idle_seconds=0.5, keep_alive_seconds=1, stop_seconds=1)
+    settings = dataclasses.replace(settings, port=0, limits=limits)
+    app, listening = create_app(settings), bind(settings)
+    ended = threading.Thread(target=serve, args=(app, settings, listening), daemon=True)
+    servers = []
+    with pytest.MonkeyPatch.context() as patch:
+        from runner.service import server
+
+        made = server._Server
+
+        def remembered(*args):
+            servers.append(made(*args))
+            return servers[0]
+
+        patch.setattr(server, "_Server", remembered)
+        ended.start()
+        yield listening.getsockname()[1]
+        servers[0].should_exit = True
+        ended.join(10)
+    assert not ended.is_alive()
+
+
+def _seconds_until_cut_off(connection):
+    began = time.monotonic()
+    connection.settimeout(5)
+    try:
+        while connection.recv(65536):
+            pass
+    except ConnectionResetError:
+        pass
+    return time.monotonic() - began
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"\r\n"])
+def test_who_does_not_ask_is_cut_off(impatient, sent):
+    with socket.create_connection(("localhost", impatient)) as connection:
+        connection.sendall(sent)
+        assert 0.2 < _seconds_until_cut_off(connection) < 3
+
+
+def test_who_sends_a_header_at_a_time_is_cut_off(impatient):
+    with socket.create_connection(("localhost", impatient)) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\n")
+        began = time.monotonic()
+        with contextlib.suppress(OSError):
+            while time.monotonic() - began < 5:
+                connection.sendall(b"X: 1\r\n")
+                time.sleep(0.1)
+        assert time.monotonic() - began < 3
+
+
+def test_a_body_that_does_not_come_is_refused(impatient):
+    with socket.create_connection(("localhost", impatient)) as connection:
+        origin = f"Origin: http://localhost:{impatient}\r\nHost: localhost:{impatient}\r\n"
+        head = f"PATCH /api/v1/runs/first HTTP/1.1\r\n{origin}Content-Type: application/json\r\n"
+        connection.sendall(f"{head}Content-Length: 100\r\n\r\n{{".encode())
+        connection.settimeout(5)
+        assert connection.recv(65536).startswith(b"HTTP/1.1 408")
+
+
+def test_a_head_without_end_is_refused(impatient):
+    with socket.create_connection(("localhost", impatient)) as connection:
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
+        sent = 0
+        with contextlib.suppress(OSError):
+            while sent < 1000:
+                connection.sendall(b"X-Long: " + b"x" * 8000 + b"\r\n")
+                sent += 1
+                time.sleep(0.001)
+        assert sent < 1000
+
+
+def test_who_does_not_read_is_cut_off(impatient, recordings):
+    large = next(recordings.glob("*/recording.mcap"))
+    with large.open("r+b") as stream:
+        stream.truncate(64 << 20)
+    run = large.parent.name
+    with socket.create_connection(("localhost", impatient)) as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        connection.sendall(f"GET /api/v1/runs/{run}/recording HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+        time.sleep(1.5)
+        received = 0
+        with contextlib.suppress(ConnectionResetError):
+            connection.settimeout(5)
+            while part := connection.recv(1 << 20):
+                received += len(part)
+        assert received < 32 << 20
+
+
+def test_many_slow_clients_do_not_keep_others_waiting(impatient):
+    slow = [socket.create_connection(("localhost", impatient)) for _ in range(200)]
+    try:
+        for connection in slow:
+            connection.sendall(b"GET / HTTP/1.1\r\nHost: loc")
+        assert httpx.get(f"http://localhost:{impatient}/healthz", timeout=2).status_code == 200
+    finally:
+        for connection in slow:
+            connection.close()
+
+
+def test_the_index_deleted_under_it_is_made_anew(client, recordings):
+    before = client.get("/api/v1/runs").json()
+    for damage in (index_path().unlink, lambda: index_path().write_bytes(b"no database" * 1000)):
+        damage()
+        assert client.get("/api/v1/runs", params={"sort": "id"}).json()["total"] == 2
+        after = client.get("/api/v1/runs").json()
+        assert after == before
+
+
+def test_a_run_that_appears_or_goes_is_told_soon(client, recordings):
+    import shutil
+
+    assert client.get("/api/v1/runs").json()["total"] == 2
+    shutil.rmtree(next(recordings.glob("*/recording.mcap")).parent)
+    deadline = time.monotonic() + 10
+    while client.get("/api/v1/runs").json()["total"] == 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+def test_a_full_disk_is_said(client, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("runner.labels.write_whole", full)
+    answer = client.patch("/api/v1/runs/first", json={"note": "x"})
+    assert answer.status_code == 507
+    assert "No space left" in answer.json()["error"]["message"]
+    assert client.get("/api/v1/runs").status_code == 200
+
+
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
+def test_a_stop_lets_an_answer_come_to_its_end(recordings, how):
+    large = next(recordings.glob("*/recording.mcap"))
+    with large.open("r+b") as stream:
+        stream.truncate(40 << 20)
+    with serving(recordings) as served:
+        address = f"{served.url}api/v1/runs/{large.parent.name}/recording"
+        with httpx.stream("GET", address) as answer:
+            parts = answer.iter_bytes()
+            received = len(next(parts))
+            served.process.send_signal(how)
+            time.sleep(0.3)
+            assert served.process.poll() is None
+            received += sum(map(len, parts))
+        assert received == 40 << 20
+        assert served.process.wait(10) == 0
+        assert served.process.stderr.read() == ""
+        events = [json.loads(line)["event"] for line in served.log.read_text().splitlines()]
+    assert events.count("stopping") == 1
+
+
+def test_a_port_that_is_taken_and_a_folder_that_is_served_are_said(recordings):
+    with serving(recordings) as served:
+        line = [sys.executable, "-m", "runner", "serve", "--recordings", str(recordings)]
+        taken = subprocess.run(
+            [*line, "--port", str(served.port)], capture_output=True, text=True, check=False
+        )
+        twice = subprocess.run([*line, "--port", "0"], capture_output=True, text=True, check=False)
+    assert (taken.returncode, twice.returncode) == (2, 2)
+    assert "cannot listen there" in taken.stderr
+    assert "served by another process" in twice.stderr
+    assert "Traceback" not in taken.stderr + twice.stderr

@@ -1,0 +1,225 @@
+"""Nobody reads or writes who may not: tokens, hosts, origins, rates, sizes; and nothing of it is logged."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+import stat
+
+import pytest
+
+from runner.errors import RunnerError
+from runner.service import logs
+from runner.service.app import create_app
+from runner.service.guard import POLICY
+from runner.service.security import READ, WRITE, Tokens, is_allowed_host, is_same_origin
+from runner.service.settings import Limits
+
+RUNS, RUN = "/api/v1/runs", "/api/v1/runs/first"
+OWN = {"Origin": "http://localhost"}
+
+
+@pytest.fixture
+def tokens(settings):
+    return Tokens(settings.tokens)
+
+
+@pytest.fixture
+def open_to_others(settings):
+    return dataclasses.replace(settings, host="0.0.0.0")
+
+
+def _bearer(secret):
+    return {"Authorization": f"Bearer {secret}"}
+
+
+def test_another_host_without_a_token_does_not_start(open_to_others, tokens):
+    with pytest.raises(RunnerError, match="dualtaxi token create"):
+        create_app(open_to_others)
+    tokens.create("laptop", (READ,))
+    create_app(open_to_others)
+
+
+def test_on_another_host_reading_needs_a_token_and_writing_one_that_may(connect, open_to_others, tokens):
+    _, reads = tokens.create("reader", (READ,))
+    _, writes = tokens.create("writer", (READ, WRITE))
+    client = connect(open_to_others)
+    assert client.get(RUNS).status_code == 401
+    assert client.get("/runs").status_code == 401
+    assert client.get(RUNS, headers=_bearer(reads)).status_code == 200
+    assert client.patch(RUN, json={}).status_code == 401
+    assert client.patch(RUN, json={}, headers=_bearer(reads)).status_code == 403
+    assert client.patch(RUN, json={}, headers=_bearer(writes)).status_code == 200
+    assert client.get("/healthz").status_code == 200
+
+
+def test_a_token_is_kept_hashed_in_a_file_of_the_owner_alone(tokens):
+    token, secret = tokens.create("laptop", (READ,))
+    text = tokens.path.read_text()
+    assert secret not in text
+    assert hashlib.sha256(secret.encode()).hexdigest() in text
+    assert stat.S_IMODE(tokens.path.stat().st_mode) == 0o600
+    assert "sha256" not in token.as_json()
+
+
+def test_a_revoked_token_is_refused_at_once(connect, open_to_others, tokens):
+    _, secret = tokens.create("laptop", (READ,))
+    tokens.create("other", (READ,))
+    client = connect(open_to_others)
+    assert client.get(RUNS, headers=_bearer(secret)).status_code == 200
+    tokens.revoke("laptop")
+    assert client.get(RUNS, headers=_bearer(secret)).status_code == 401
+
+
+def test_guessing_is_slowed_down(connect, open_to_others, tokens):
+    _, secret = tokens.create("laptop", (READ,))
+    limits = Limits(failures=3, failure_seconds=60)
+    client = connect(dataclasses.replace(open_to_others, limits=limits))
+    for _ in range(3):
+        assert client.get(RUNS, headers=_bearer("guess")).status_code == 401
+    answer = client.get(RUNS, headers=_bearer(secret))
+    assert answer.status_code == 429
+    assert 1 <= int(answer.headers["retry-after"]) <= 60
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "", "a b"]
+)
+def test_a_name_that_was_made_to_point_here_is_refused(client, host):
+    assert client.get(RUNS, headers={"Host": host}).status_code == 421
+
+
+@pytest.mark.parametrize("host", ["localhost", "LOCALHOST:8000", "127.0.0.1:1", "[::1]:8000", "10.0.0.1"])
+def test_addresses_and_localhost_are_ours(host):
+    assert is_allowed_host(host, ())
+
+
+def test_a_name_behind_a_proxy_is_ours_when_allowed(connect, settings):
+    client = connect(dataclasses.replace(settings, hosts=("runs.example.org",)))
+    assert client.get(RUNS, headers={"Host": "runs.example.org"}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"origin": "http://evil.example"},
+        {"origin": "null"},
+        {"origin": "http://localhost:9000"},
+        {"origin": "http://localhost.evil.example"},
+        {"sec-fetch-site": "cross-site", "origin": "http://localhost"},
+        {"sec-fetch-site": "same-site"},
+        {"sec-fetch-site": "none"},
+    ],
+)
+def test_no_other_site_can_write(connect, settings, headers, recordings):
+    client = connect(settings, **(headers or {"x-nothing": "1"}))
+    answer = client.patch(RUN, json={"note": "from elsewhere"})
+    assert answer.status_code == 403
+    assert client.get(RUN).json()["note"] == ""
+
+
+def test_a_page_of_the_service_can_write():
+    assert is_same_origin({"host": "localhost:8000", "origin": "http://localhost:8000"})
+    assert is_same_origin({"host": "a.org", "origin": "https://a.org", "sec-fetch-site": "same-origin"})
+    assert is_same_origin({"host": "localhost", "sec-fetch-site": "same-origin"})
+
+
+def test_a_token_writes_from_anywhere_on_loopback_too(connect, settings, tokens):
+    _, secret = tokens.create("writer", (READ, WRITE))
+    client = connect(settings, accept="*/*")
+    note = client.patch(RUN, json={"note": "by a program"}, headers=_bearer(secret))
+    assert note.json()["note"] == "by a program"
+    assert client.patch(RUN, json={"note": "x"}, headers=_bearer("wrong")).status_code == 401
+
+
+def test_a_login_is_kept_in_a_cookie_that_cannot_write_from_elsewhere(connect, open_to_others, tokens):
+    _, secret = tokens.create("writer", (READ, WRITE))
+    client = connect(open_to_others, accept="text/html")
+    asked = client.get("/runs?filter=x", follow_redirects=False)
+    assert asked.status_code == 303
+    assert asked.headers["location"] == "/login?next=%2Fruns%3Ffilter%3Dx"
+    form = {"token": secret, "next": "/runs"}
+    assert client.post("/login", data=form).status_code == 403
+    assert client.post("/login", data=form | {"token": "wrong"}, headers=OWN).status_code == 401
+    entered = client.post("/login", data=form, headers=OWN, follow_redirects=False)
+    assert (entered.status_code, entered.headers["location"]) == (303, "/runs")
+    cookie = entered.headers["set-cookie"]
+    assert "HttpOnly" in cookie
+    assert "SameSite=lax" in cookie
+    assert client.get(RUNS).status_code == 200
+    assert client.patch(RUN, json={"note": "x"}, headers={"Origin": "http://evil.example"}).status_code == 403
+    assert client.patch(RUN, json={"note": "x"}, headers=OWN).status_code == 200
+    client.post("/logout", headers=OWN)
+    assert client.get(RUNS).status_code == 401
+
+
+@pytest.mark.parametrize("where", ["//evil.example", "https://evil.example", "/\\evil.example", ""])
+def test_a_login_leads_nowhere_else(connect, open_to_others, tokens, where):
+    _, secret = tokens.create("writer", (READ, WRITE))
+    client = connect(open_to_others)
+    answer = client.post("/login", data={"token": secret, "next": where}, follow_redirects=False)
+    assert answer.headers["location"] == "/"
+
+
+@pytest.mark.parametrize("path", [RUNS, "/runs", "/healthz", "/nothing", "/api/v1/openapi.json"])
+def test_every_answer_carries_the_policy(client, path):
+    headers = client.get(path).headers
+    assert headers["content-security-policy"] == POLICY
+    assert "unsafe" not in POLICY
+    assert headers["x-content-type-options"] == "nosniff"
+    assert "access-control-allow-origin" not in headers
+
+
+def test_a_body_that_is_too_long_is_refused(connect, settings):
+    client = connect(dataclasses.replace(settings, limits=Limits(body_bytes=1000)))
+    answer = client.patch(RUN, json={"note": "x" * 2000})
+    assert answer.status_code == 413
+    assert "1,000 bytes" in answer.json()["error"]["message"]
+
+
+@pytest.mark.parametrize(
+    "name", ["..", "..%2f..%2fetc", "%2fetc%2fpasswd", "a%00b", "x.mcap", ".%2ffirst", "@", "%40latest%2f.."]
+)
+def test_no_path_names_a_run(client, name):
+    for address in (f"{RUNS}/{name}", f"{RUNS}/{name}/recording", f"{RUNS}/{name}/metrics"):
+        assert client.get(address).status_code == 404
+
+
+def test_a_note_and_tags_are_checked_as_by_the_commands(client):
+    for wrong in ({"name": "<script>"}, {"add_tags": ["a b"]}, {"note": "x" * 10_001}, {"name": "../x"}):
+        assert client.patch(RUN, json=wrong).status_code in (400, 422)
+    said = {"name": "renamed", "add_tags": ["keep", "a"], "note": "<script>alert(1)</script>"}
+    told = client.patch(RUN, json=said).json()
+    assert (told["name"], told["tags"], told["note"]) == ("renamed", ["a", "keep"], said["note"])
+    (row,) = client.get(RUNS, params={"filter": "tag:keep"}).json()["runs"]
+    assert row["name"] == "renamed"
+    back = client.patch(f"{RUNS}/renamed", json={"name": "", "remove_tags": ["a"], "note": ""}).json()
+    assert (back["name"], back["tags"], back["note"]) == ("first", ["keep"], "")
+
+
+def test_the_log_is_json_lines_without_secrets(connect, open_to_others, tokens):
+    _, secret = tokens.create("laptop", (READ,))
+    stream = io.StringIO()
+    logs.configure(stream)
+    client = connect(open_to_others)
+    client.get(RUNS, params={"filter": f"name:{secret}"}, headers=_bearer(secret))
+    client.get(f"{RUNS}/{secret}", headers=_bearer(secret))
+    lines = [json.loads(line) for line in stream.getvalue().splitlines()]
+    requests = [line for line in lines if line["event"] == "request"]
+    assert [line["status"] for line in requests] == [200, 404]
+    assert requests[1]["path"].startswith(RUNS)
+    assert {"time", "level", "client", "method", "seconds", "bytes"} <= set(requests[0])
+    assert secret not in stream.getvalue()
+    assert secret[10:] not in stream.getvalue()
+
+
+def test_ready_is_told_with_what_is_missing(client, recordings):
+    answer = client.get("/readyz")
+    assert (answer.status_code, answer.json()["ready"]) == (200, True)
+    recordings.rename(recordings.with_name("gone"))
+    answer = client.get("/readyz")
+    assert answer.status_code == 503
+    assert not answer.json()["checks"]["recordings_can_be_written"]
