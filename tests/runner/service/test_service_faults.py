@@ -181,11 +181,16 @@ def test_a_stop_lets_an_answer_come_to_its_end(recordings, how):
 
 def test_a_port_that_is_taken_and_a_folder_that_is_served_are_said(recordings):
     with serving(recordings) as served:
-        line = [sys.executable, "-m", "runner", "serve", "--recordings", str(recordings)]
-        taken = subprocess.run(
-            [*line, "--port", str(served.port)], capture_output=True, text=True, check=False
+        port, elsewhere = str(served.port), recordings.with_name("elsewhere")
+        taken, twice = (
+            subprocess.run(
+                [sys.executable, "-m", "runner", "serve", "--port", where, "--recordings", str(folder)],
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            for where, folder in ((port, elsewhere), ("0", recordings))
         )
-        twice = subprocess.run([*line, "--port", "0"], capture_output=True, text=True, check=False)
     assert (taken.returncode, twice.returncode) == (2, 2)
     assert "cannot listen there" in taken.stderr
     assert "served by another process" in twice.stderr
