@@ -54,7 +54,7 @@ def connect(address: str | None, processors: int | None = None) -> Any:
         raise RunnerError(
             f"--ray: no cluster at {address or 'this machine'} can be reached "
             f"({str(error).strip().splitlines()[0]}); `ray status` says whether one runs, and --ray "
-            "without an address starts one here."
+            "without an address starts one here. One that asks for a token wants it in RAY_AUTH_TOKEN."
         ) from error
     return ray
 

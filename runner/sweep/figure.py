@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -136,13 +137,18 @@ def draw_parallel(axes: Axes, picture: Picture) -> None:
         _label_column(axes, column, axis.values, axis.log, axis.choices)
     _label_column(axes, len(columns) - 1, picture.values, picture.log, ())
     names = [*(axis.path for axis in picture.axes), picture.objective]
-    axes.set_xticks(range(len(names)), ["\n".join(textwrap.wrap(name, 24)) for name in names])
+    axes.set_xticks(range(len(names)), [_folded(name) for name in names])
     axes.set_yticks([])
     axes.set_ylim(-0.05, 1.05)
     axes.set_xlim(-0.1, len(columns) - 0.75)
     axes.spines[["left", "bottom"]].set_visible(False)
     axes.tick_params(axis="x", length=0)
     axes.set_title("Each trial a line, the best one thick; dark lines are better than light ones")
+
+
+def _folded(name: str) -> str:
+    """Return a name over several lines if it is long, broken where its parts end."""
+    return re.sub(r"([.,]|_(?=\w{8}))\s*", r"\1\n", name) if len(name) > 24 else name
 
 
 def _unit(values: Values, log: bool, choices: tuple[str, ...]) -> Values:

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from runner.analysis.series import Group
 from runner.export.plots_figure import COLOURS, footnote, is_wide, panel_svg
 from runner.export.report import TEMPLATES, require_packages, templates
 from runner.sweep.figure import parallel_svg, parameter_svgs
@@ -41,8 +42,7 @@ def render_sweep(results: Results, recordings: Path) -> str:
             note=picture.footnote,
             best=results.best_yaml,
             legend=[
-                (i % len(COLOURS), COLOURS[i % len(COLOURS)], group.label.partition(",")[0], group.described)
-                for i, group in enumerate(groups)
+                (i % len(COLOURS), COLOURS[i % len(COLOURS)], *_told(group)) for i, group in enumerate(groups)
             ],
             panels=[{"svg": panel_svg(panel, len(groups)), "wide": is_wide(panel)} for panel in panels],
             footnote=footnote(groups),
@@ -51,6 +51,12 @@ def render_sweep(results: Results, recordings: Path) -> str:
             dark=(TEMPLATES / "report_dark.css").read_text("utf-8"),
         )
     )
+
+
+def _told(group: Group) -> tuple[str, str]:
+    """Return which trial a group's runs are of, and what there is to say of it."""
+    which, _, rest = group.described.partition(", ")
+    return which, rest
 
 
 def _section(section: Any) -> dict[str, Any]:
