@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.cache import EXPORTS, RESTORED, cache_folder
-from runner.labels import LABELS_FILE, LOCK_FILE
+from runner.labels import KEEP, LABELS_FILE, LOCK_FILE
 from runner.owning import OWNER_LOCK
 from runner.runs import RECORDING_FILE, RUN_FILE
 
@@ -108,6 +108,30 @@ def usages(rows: Sequence[dict[str, Any]]) -> list[Usage]:
     exports, restored = cached(EXPORTS), cached(RESTORED)
     found = [Usage(row, _contents(row), exports[row["id"]], restored[row["id"]]) for row in rows]
     return sorted(found, key=lambda usage: (-usage.total, usage.row["id"]))
+
+
+def totals(found: Sequence[Usage]) -> dict[str, int]:
+    """Return the bytes that runs use, by what they are."""
+    return {
+        "recording": sum(usage.contents.recording for usage in found),
+        "exports": sum(usage.exports for usage in found),
+        "restored": sum(usage.restored for usage in found),
+        "other": sum(usage.contents.other for usage in found),
+        "total": sum(usage.total for usage in found),
+    }
+
+
+def freeable_of(found: Sequence[Usage], recordings: Sequence[Path]) -> dict[str, int]:
+    """Return the bytes that could be freed, by what they are; not those of runs that are to stay."""
+    free = [u for u in found if KEEP not in u.row["tags"].split() and u.row["status"] != "running"]
+    cut_off = [contents_of(stray) for root in recordings for stray in strays(root)]
+    return {
+        "same_content": sum(u.contents.freed for u in free if u.row["same_as"]),
+        "unfinished": sum(u.contents.freed for u in free if u.row["status"] in ("interrupted", "failed")),
+        "left_over": sum(u.contents.left_over for u in free),
+        "cached": sum(u.exports + u.restored for u in found),
+        "half_removed": sum(contents.recording + contents.other for contents in cut_off),
+    }
 
 
 def strays(root: Path) -> list[Path]:

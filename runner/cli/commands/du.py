@@ -43,7 +43,7 @@ def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as
     from runner.catalogue.columns import with_originals
     from runner.catalogue.filters import parse
     from runner.catalogue.index import look
-    from runner.catalogue.usage import usages
+    from runner.catalogue.usage import freeable_of, totals, usages
 
     chosen = parse(" ".join(words))
 
@@ -51,10 +51,10 @@ def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as
         return with_originals(index.select(chosen), index)
 
     found = usages(look(recordings, work, say))
-    freeable = _freeable(found, recordings)
+    freeable = freeable_of(found, recordings)
     if as_json:
         print_json(
-            {"runs": [_as_json(usage) for usage in found], "total": _totals(found), "freeable": freeable}
+            {"runs": [_as_json(usage) for usage in found], "total": totals(found), "freeable": freeable}
         )
     elif found:
         _draw(found, freeable, limit or len(found))
@@ -63,39 +63,17 @@ def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as
 
 
 def _as_json(usage: Usage) -> dict[str, Any]:
+    from runner.catalogue.usage import totals
+
     row = usage.row
     told = {key: row[key] for key in ("name", "status", "same_as")}
     path = str(Path(row["root"], row["entry"]))
-    return {"run_id": row["id"], **told, "path": path, **_totals([usage])}
-
-
-def _totals(found: Sequence[Usage]) -> dict[str, int]:
-    return {
-        "recording": sum(usage.contents.recording for usage in found),
-        "exports": sum(usage.exports for usage in found),
-        "restored": sum(usage.restored for usage in found),
-        "other": sum(usage.contents.other for usage in found),
-        "total": sum(usage.total for usage in found),
-    }
-
-
-def _freeable(found: Sequence[Usage], recordings: Sequence[Path]) -> dict[str, int]:
-    """Return the bytes that could be freed, by what they are; not those of runs that are to stay."""
-    from runner.catalogue.usage import contents_of, strays
-    from runner.labels import KEEP
-
-    free = [u for u in found if KEEP not in u.row["tags"].split() and u.row["status"] != "running"]
-    cut_off = [contents_of(stray) for root in recordings for stray in strays(root)]
-    return {
-        "same_content": sum(u.contents.freed for u in free if u.row["same_as"]),
-        "unfinished": sum(u.contents.freed for u in free if u.row["status"] in ("interrupted", "failed")),
-        "left_over": sum(u.contents.left_over for u in free),
-        "cached": sum(u.exports + u.restored for u in found),
-        "half_removed": sum(contents.recording + contents.other for contents in cut_off),
-    }
+    return {"run_id": row["id"], **told, "path": path, **totals([usage])}
 
 
 def _draw(found: Sequence[Usage], freeable: dict[str, int], limit: int) -> None:
+    from runner.catalogue.usage import totals
+
     kinds = ("recording", "exports", "restored", "other", "total")
     drawn = table(
         "id",
@@ -108,12 +86,12 @@ def _draw(found: Sequence[Usage], freeable: dict[str, int], limit: int) -> None:
     )
     for usage in found[:limit]:
         row = usage.row
-        bytes_of = [_bytes(number) for number in _totals([usage]).values()]
+        bytes_of = [_bytes(number) for number in totals([usage]).values()]
         drawn.add_row(row["id"], row["name"], row["status"], *bytes_of, row["same_as"] or "")
     if found[limit:]:
-        others = [_bytes(number) for number in _totals(found[limit:]).values()]
+        others = [_bytes(number) for number in totals(found[limit:]).values()]
         drawn.add_row(f"{len(found) - limit:,} more", "", "", *others, "")
-    drawn.add_row("all", "", "", *[_bytes(number) for number in _totals(found).values()], "", style="bold")
+    drawn.add_row("all", "", "", *[_bytes(number) for number in totals(found).values()], "", style="bold")
     draw(drawn)
     told = {
         _FREED_BY[kind][0]: f"{size(number)}  {_FREED_BY[kind][1]}"

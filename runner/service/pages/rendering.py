@@ -44,6 +44,8 @@ def templates() -> jinja2.Environment:
         "age": _age,
         "count": lambda value: amounts.UNKNOWN if value is None else f"{value:,}",
         "sentence": lambda text: f"{text[:1].upper()}{text[1:]}{'' if text[-1:] in '.:' else '.'}",
+        "with_name": lambda value, name: (name, value),
+        "with_prefix": lambda value, prefix: f"{prefix}{value}",
         "query": lambda values: urlencode(list(values), doseq=True),
     }
     environment.globals |= {"static": static.address, "sections": SECTIONS}

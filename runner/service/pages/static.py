@@ -31,7 +31,10 @@ _TYPES: Final = {
     "LICENSE": "text/plain",
 }
 _FOREVER: Final = "public, max-age=31536000, immutable"
-_OWN: Final = ("charts.js", "live.js", "rerun.css", "rerun.js", "run.js", "table.js")
+_OWN: Final = (
+    *("charts.js", "job.js", "live.js", "rerun.css", "rerun.js", "run.js"),
+    *("stepping.js", "submit.js", "table.js"),
+)
 _OTHERS: Final = ("icon.svg", f"{UPLOT}/uPlot.iife.min.js", f"{UPLOT}/LICENSE")
 
 

@@ -1,0 +1,223 @@
+"""Runs against each other: what differs, where they part, both replays in step, their Q-tables."""
+
+from __future__ import annotations
+
+import base64
+import json
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Query, Request, Response
+
+from runner import amounts
+from runner.analysis.series import flat_config
+from runner.errors import RunnerError
+from runner.runs import Run
+from runner.service import played
+from runner.service.api.comparing import found_runs
+from runner.service.api.replay import LONG
+from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, state_of
+from runner.service.pages.rendering import link, page
+from runner.service.pages.run import head_of, parse_spot
+
+router = APIRouter(prefix="/compare", include_in_schema=False)
+
+TABS: Final = (
+    ("", "Overview"),
+    ("/divergence", "Where they part"),
+    ("/replay", "Replays in step"),
+    ("/tables", "Q-tables"),
+)
+MOST: Final = 12
+"""Runs that a page compares."""
+Names = Annotated[list[str] | None, Query(max_length=100)]
+
+
+@router.get("")
+async def overview(request: Request, catalogue: CatalogueOf, run: Names = None) -> Response:
+    """Show what differs between runs, and their curves over each other."""
+    found = await _chosen(catalogue, run)
+    settings = [{"seed": str(each.seed), **_flat(each)} for each in found]
+    keys = list(dict.fromkeys(key for each in settings for key in each))
+    told = [(key, [each.get(key, amounts.UNKNOWN) for each in settings]) for key in keys]
+    return page(
+        request,
+        "compare_overview.html",
+        **_head(found, ""),
+        differing=[(key, values) for key, values in told if len(set(values)) > 1],
+        results=_results(found),
+        same=_same_content(found),
+    )
+
+
+@router.get("/divergence")
+async def divergence(
+    request: Request, catalogue: CatalogueOf, kept: KeptOf, apart: ApartOf, run: Names = None
+) -> Response:
+    """Show the first step at which two runs differ, and why."""
+    found = _two(await _chosen(catalogue, run))
+    told = await _difference(found, kept, apart)
+    return page(request, "compare_divergence.html", **_head(found, "/divergence"), told=told, spot=_spot_text)
+
+
+@router.get("/tables")
+async def tables(
+    request: Request, catalogue: CatalogueOf, kept: KeptOf, apart: ApartOf, run: Names = None
+) -> Response:
+    """Show how far the Q-tables of two runs are apart."""
+    found = _two(await _chosen(catalogue, run))
+    told = (await _difference(found, kept, apart))["tables"]
+    for figure in told["figures"]:
+        if "high" not in figure:  # Matplotlib writes styles into its elements, which the policy forbids here
+            data = base64.b64encode(_standing_alone(figure["svg"]).encode()).decode()
+            figure["address"] = f"data:image/svg+xml;base64,{data}"
+    return page(request, "compare_tables.html", **_head(found, "/tables"), told=told)
+
+
+@router.get("/replay")
+async def replay(
+    request: Request,
+    catalogue: CatalogueOf,
+    kept: KeptOf,
+    apart: ApartOf,
+    run: Names = None,
+    at: Annotated[str, Query(max_length=60)] = "",
+) -> Response:
+    """Show an episode of two runs, in step; the one in which they part unless another is asked for."""
+    found = _two(await _chosen(catalogue, run))
+    spot = parse_spot(at)
+    if not spot:
+        partings = (await _difference(found, kept, apart))["partings"]
+        spot = tuple(partings[0]["spot"]) if partings else (0, 0)
+    phase = "train" if len(spot) == 2 else "eval"
+    place = "/".join(map(str, spot[:-1]))
+    around = [_replay_link(found, spot, by) for by in (-1, 1)]
+    return page(
+        request,
+        "compare_replay.html",
+        **_head(found, "/replay"),
+        sources=[f"/api/v1/runs/{each.run_id}/replay/{phase}/{place}" for each in found],
+        episode=_episode_in_words(spot),
+        spot=spot,
+        before=around[0],
+        after=around[1],
+        scenes=[_still(each) for each in found],
+        base=link("/compare/replay", {"run": [each.run_id for each in found]}),
+        prefix=":".join(["eval"] * (phase == "eval") + [str(part) for part in spot[:-1]]),
+    )
+
+
+# --- inside -------------------------------------------------------------------------------------------
+
+
+async def _chosen(catalogue: CatalogueOf, names: list[str] | None) -> list[Run]:
+    """Return the runs that are compared.
+
+    Raises:
+        RunnerError: there are fewer than two of them, or too many.
+    """
+    names = list(dict.fromkeys(names or []))
+    if not 2 <= len(names) <= MOST:
+        raise RunnerError(f"found {len(names)} runs, expected 2 to {MOST}: select them in the table of runs.")
+    return await found_runs(catalogue, names)
+
+
+def _two(found: list[Run]) -> list[Run]:
+    if len(found) != 2:
+        raise RunnerError(f"found {len(found)} runs, expected two: only two are compared step by step.")
+    return found
+
+
+async def _difference(found: list[Run], kept: KeptOf, apart: ApartOf) -> dict[str, Any]:
+    """Return in what two runs differ, as `played.difference` has it."""
+    key = ("difference", *map(state_of, found))
+    paths = [each.recording for each in found]
+    told: dict[str, Any] = json.loads(await kept.awaited(key, lambda: apart(played.difference, paths), LONG))
+    return told
+
+
+def _head(found: list[Run], here: str) -> dict[str, Any]:
+    names = [each.run_id for each in found]
+    return {
+        "runs": [
+            {**head_of(each), "letter": _letter(i), "number": i % 7, "label": f"{_letter(i)}: {each.name}"}
+            for i, each in enumerate(found)
+        ],
+        "tabs": [(tab, name, link(f"/compare{tab}", {"run": names})) for tab, name in TABS]
+        if len(found) == 2
+        else [],
+        "here": here,
+    }
+
+
+def _letter(number: int) -> str:
+    return chr(ord("A") + number)
+
+
+def _flat(run: Run) -> dict[str, str]:
+    return {key: str(value) for key, value in flat_config(run.facts.get("config", {}))}
+
+
+def _results(found: list[Run]) -> list[tuple[str, list[str]]]:
+    """Return what came of runs, a row a measure."""
+    last = [each.summary.get("last_evaluation") or {} for each in found]
+    return [
+        ("Status", [each.status for each in found]),
+        ("Success in the last evaluation, %", [amounts.number(each.get("finish_percent")) for each in last]),
+        ("Mean length of its trials", [amounts.number(each.get("mean_length")) for each in last]),
+        ("Penalties a trial", [amounts.number(each.get("mean_penalties")) for each in last]),
+        ("Training episodes", [_count(each.summary.get("episodes")) for each in found]),
+        ("Steps of training", [_count(each.summary.get("train_steps")) for each in found]),
+        (
+            "Content digest",
+            [str(each.summary.get("content_digest") or amounts.UNKNOWN)[:16] for each in found],
+        ),
+    ]
+
+
+def _count(value: int | None) -> str:
+    return amounts.UNKNOWN if value is None else f"{value:,}"
+
+
+def _same_content(found: list[Run]) -> bool:
+    digests = {each.summary.get("content_digest") for each in found}
+    return len(digests) == 1 and None not in digests
+
+
+def _spot_text(spot: list[int]) -> str:
+    return ":".join(map(str, spot if len(spot) == 2 else ["eval", *spot]))
+
+
+def _replay_link(found: list[Run], spot: tuple[int, ...], by: int) -> str:
+    """Return the address of the episode before or after one; nothing before the first."""
+    if spot[-2] + by < 0:
+        return ""
+    other = [*spot[:-2], spot[-2] + by, 0]
+    return link("/compare/replay", {"run": [each.run_id for each in found], "at": _spot_text(other)})
+
+
+def _episode_in_words(spot: tuple[int, ...]) -> str:
+    if len(spot) == 2:
+        return f"Training episode {spot[0]:,}"
+    return f"Trial {spot[1]} of the evaluation after {spot[0]:,} episodes"
+
+
+def _still(run: Run) -> str:
+    """Return the picture of a run's grid with everything at its first cell; the script moves it."""
+    import numpy as np
+
+    from runner.export import svg
+    from runner.recording.reader import open_recording
+
+    with open_recording(run.recording) as recording:
+        scene = recording.environment.get("scene")
+    if scene is None:
+        return ""
+    nowhere = np.zeros((len(scene["things"]), 3), np.int16)
+    picture = svg.Drawing(scene).frame(nowhere, f"The grid of {run.name}", style="")
+    return picture.replace("<style></style>", "")
+
+
+def _standing_alone(picture: str) -> str:
+    """Return an SVG of a page as a file of its own, which has no variables of the page's to look up."""
+    space = "" if "xmlns=" in picture[:300] else ' xmlns="http://www.w3.org/2000/svg"'
+    return picture.replace("<svg", f"<svg{space}", 1)
