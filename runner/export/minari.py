@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import MissingExtra, RecordingError
+from runner.export.minari_loops import Episode, loop_episodes, space_of
 from runner.recording import schema
 from runner.recording.reader import Recording
 
@@ -62,8 +63,9 @@ def write_dataset(
 ) -> Written:
     """Write whole episodes into the folder of a dataset.
 
-    An observation is a state, an action the joint action, a reward the sum over the learners; where there
-    are several, `infos["rewards"]` has theirs, [steps + 1, learners], the first row 0 as of a reset.
+    Of a job an observation is a state, an action the joint action; of a loop both are what they were. A
+    reward is the sum over the learners; where there are several, `infos["rewards"]` has theirs,
+    [steps + 1, learners], the first row 0 as of a reset, and in a loop `infos["acted"]` who took part.
 
     Args:
         recording: whose.
@@ -73,36 +75,69 @@ def write_dataset(
         report: called with the episodes written so far.
 
     Raises:
-        RecordingError: there is no such episode, or the recording is damaged.
+        RecordingError: there is no such episode, Minari cannot store it, or the recording is damaged.
         OSError: the folder cannot be written.
     """
     import minari
-    from gymnasium.spaces import Discrete
     from minari.dataset.minari_storage import MinariStorage
 
-    mdp, folder = recording.mdp, folder.absolute()  # Minari looks for a relative one within itself
+    folder = folder.absolute()  # Minari looks for a relative one within itself
     wanted = _checked(recording, phase, ranges)
-    observations, actions = Discrete(mdp.states), Discrete(mdp.joint_actions)
-    spec, notes = _spec(recording, observations, actions)
+    observations, actions, spec, notes = _spaces(recording)
     (folder / "data").mkdir()
-    storage = MinariStorage.new(folder / "data", observations, actions, spec, data_format="hdf5")
+    storage = MinariStorage.new(
+        folder / "data", observations, actions, spec, data_format="hdf5", jpeg_encoding=False
+    )
     told = {"dataset_id": dataset_id(recording), "minari_version": minari.__version__}
     storage.update_metadata(told | _told(recording, phase))
-    counts = [0, 0]
+    counts = [0, 0, 0]
 
     def buffers() -> Iterator[Any]:
-        for steps in episodes_of(recording, phase, wanted):
+        for buffer, abandoned in _buffers(recording, phase, wanted):
             counts[0] += 1
-            counts[1] += len(steps)
+            counts[1] += len(buffer.rewards)
+            counts[2] += abandoned
             report(counts[0])
-            yield _buffer(steps, counts[0] - 1)
+            yield replace(buffer, id=counts[0] - 1)
 
     made = buffers()
     for first in made:  # so many at a time: what HDF5 keeps of a file goes when it is closed
-        storage.update_episodes(chain([first], islice(made, _AT_ONCE - 1)))
-    if phase == "train" and recording.count(schema.TRAIN_STEP) > _ended_steps(recording) and not ranges:
-        notes.append("The last training episode never ended; it is left out.")
-    return Written(counts[0], counts[1], tuple(notes))
+        try:
+            storage.update_episodes(chain([first], islice(made, _AT_ONCE - 1)))
+        except (TypeError, ValueError) as error:
+            raise RecordingError(
+                f"{recording.path}: {phase} episode {counts[0] - 1} cannot be stored by Minari ({error})."
+            ) from error
+    return Written(counts[0], counts[1], (*notes, *_missing(recording, phase, ranges, counts)))
+
+
+def _buffers(recording: Recording, phase: str, ranges: Ranges) -> Iterator[tuple[Any, bool]]:
+    """Yield each episode as Minari takes it, and whether it was reset before its end."""
+    if recording.kind == "job":
+        yield from ((_buffer(steps), False) for steps in episodes_of(recording, phase, ranges))
+        return
+    yield from (
+        (_loop_buffer(episode), episode.abandoned) for episode in loop_episodes(recording, phase, ranges)
+    )
+
+
+def _missing(recording: Recording, phase: str, ranges: Ranges, counts: Sequence[int]) -> list[str]:
+    """Return what is not in a dataset, or otherwise than recorded, a sentence each."""
+    said = []
+    ended, steps = (recording.count(recording.topic(f"/{phase}/{name}")) for name in ("episode", "step"))
+    if counts[2]:
+        said.append(
+            f"{counts[2]:,} episodes were reset before their end; their last step is marked as truncated."
+        )
+    if not ranges and counts[0] < ended:
+        said.append(f"{ended - counts[0]:,} episodes are left out, as steps or resets of them are missing.")
+    elif not ranges and counts[1] < steps and recording.environments == 1:
+        said.append(
+            f"The last {'training' if phase == 'train' else 'eval'} episode never ended; it is left out."
+        )
+    elif not ranges and recording.environments > 1:
+        said.append("Episodes that never ended are left out.")
+    return said
 
 
 def episodes_of(recording: Recording, phase: str, ranges: Ranges) -> Iterator[NDArray[np.void]]:
@@ -117,7 +152,9 @@ def episodes_of(recording: Recording, phase: str, ranges: Ranges) -> Iterator[ND
 
 
 def _checked(recording: Recording, phase: str, ranges: Ranges) -> Ranges:
-    ended = recording.count(schema.PHASES[phase][1])
+    ended = recording.count(recording.topic(f"/{phase}/episode"))
+    if not ended:
+        raise RecordingError(f"{recording.path}: found no {phase} episode that ended, expected one at least.")
     for start, stop in ranges:
         if not start < (ended if stop is None else stop) <= ended:
             raise RecordingError(
@@ -127,30 +164,71 @@ def _checked(recording: Recording, phase: str, ranges: Ranges) -> Ranges:
     return ranges or ((0, None),)
 
 
-def _buffer(steps: NDArray[np.void], number: int) -> Any:
+def _buffer(steps: NDArray[np.void]) -> Any:
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
     rewards = steps["rewards"]
-    own = np.concatenate([np.zeros((1, rewards.shape[1])), rewards])
     return EpisodeBuffer(
-        id=number,
         observations=np.append(steps["state"], steps["next_state"][-1:]).astype(np.int64),
         actions=steps["action"].astype(np.int64),
         rewards=rewards.sum(axis=1),
         terminations=steps["terminated"].copy(),
         truncations=steps["truncated"].copy(),
-        infos={"rewards": own} if rewards.shape[1] > 1 else None,
+        infos={"rewards": _after_reset(rewards)} if rewards.shape[1] > 1 else None,
     )
 
 
+def _loop_buffer(episode: Episode) -> Any:
+    from minari.data_collector.episode_buffer import EpisodeBuffer
+
+    truncated = episode.truncated.copy()
+    truncated[-1] |= episode.abandoned
+    several = episode.rewards.shape[1] > 1
+    own = {"rewards": _after_reset(episode.rewards), "acted": _after_reset(episode.acted)}
+    return EpisodeBuffer(
+        seed=episode.seed,
+        observations=episode.observations,
+        actions=episode.actions,
+        rewards=episode.rewards.sum(axis=1),
+        terminations=episode.terminated,
+        truncations=truncated,
+        infos=own if several else None,
+    )
+
+
+def _after_reset(values: NDArray[Any]) -> NDArray[Any]:
+    """Return what came of steps behind the nothing that came of the reset."""
+    return np.concatenate([np.zeros_like(values[:1]), values])
+
+
 def _told(recording: Recording, phase: str) -> dict[str, Any]:
-    run = recording.run
+    run, config = recording.run, recording.config
     digest = recording.result.get("content_digest", "none: it was interrupted")
-    return {
-        "algorithm_name": str(recording.config["algorithm"]),
+    job = recording.kind == "job"
+    what = "Observations are states, actions joint actions." if job else "Recorded from a loop."
+    told = {
         "description": f"The {phase} episodes of the dualtaxi run {run['run_id']} ({run['name']}, seed "
-        f"{run['seed']}), content digest {digest}. Observations are states, actions joint actions.",
+        f"{run['seed']}), content digest {digest}. {what}",
     }
+    return told | ({"algorithm_name": str(config["algorithm"])} if job else {})
+
+
+def _spaces(recording: Recording) -> tuple[Any, Any, Any, list[str]]:
+    """Return both spaces, what makes the environment again, if that can be done, and what to say."""
+    from gymnasium.spaces import Discrete
+
+    if recording.kind == "job":
+        observations: Any = Discrete(recording.mdp.states)
+        actions: Any = Discrete(recording.mdp.joint_actions)
+    else:
+        try:
+            observations, actions = (space_of(recording.spaces[name]) for name in ("observation", "action"))
+        except (AssertionError, KeyError, TypeError, ValueError, OverflowError) as error:
+            raise RecordingError(
+                f"{recording.path}: describes spaces that Gymnasium has not ({error})."
+            ) from error
+    spec, notes = _spec(recording, observations, actions)
+    return observations, actions, spec, notes
 
 
 def _spec(
@@ -173,9 +251,3 @@ def _spec(
             "the dataset does not specify it."
         ]
     return made.spec, []
-
-
-def _ended_steps(recording: Recording) -> int:
-    ended = recording.count(schema.TRAIN_EPISODE)
-    last = recording.episodes("train", max(ended - 1, 0), ended)
-    return int(last[0]["last_step"]) + 1 if len(last) else 0

@@ -117,7 +117,8 @@ def record_vector(
             f'found metadata["autoreset_mode"] {mode!r}, expected one of gymnasium.vector.AutoresetMode: '
             "without it nobody knows which steps are resets."
         )
-    described = describe(envs, envs.single_observation_space, envs.single_action_space)
+    first = envs if envs.spec is not None else next(iter(getattr(envs.unwrapped, "envs", ())), envs)
+    described = describe(first, envs.single_observation_space, envs.single_action_space)
     described = replace(described, environments=envs.num_envs, mdp=None, agents=("agent",))
     plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
     loop = Loop(described, plan, lambda recorder, phase: VectorRows(recorder, described, phase))

@@ -46,7 +46,7 @@ def command(
     """Export the episodes of RUN as a Minari dataset: observations, actions, rewards, how each ended.
 
     An observation is a state, an action a joint action, a reward the sum over the learners; where there are
-    several, the infos have theirs.
+    several, the infos have theirs. Of your own loop, observations and actions are as they were.
 
     \b
     Examples:
@@ -55,14 +55,13 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     from runner.export.minari import OURS, dataset_id, require_packages, write_dataset
     from runner.export.places import new_folder, require_steps, shortcomings
-    from runner.recording import schema
     from runner.recording.reader import open_recording
 
     require_packages()
     with open_recording(find_recorded(run_name, recordings).recording) as recording:
         require_steps(recording)
         path = output / dataset_id(recording)
-        total = recording.count(schema.PHASES[phase][1])
+        total = recording.count(recording.topic(f"/{phase}/episode"))
         with new_folder(path, force, OURS) as folder, counting("episodes", total) as report:
             written = write_dataset(recording, folder, phase, episodes or (), report)
         for note in (*shortcomings(recording), *written.notes):
