@@ -76,6 +76,7 @@ def create_app(settings: Settings) -> FastAPI:
 
 def _api() -> APIRouter:
     general = answers(
+        HTTPStatus.BAD_REQUEST,
         HTTPStatus.UNAUTHORIZED,
         HTTPStatus.FORBIDDEN,
         HTTPStatus.REQUEST_TIMEOUT,

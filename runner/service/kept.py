@@ -13,6 +13,8 @@ from starlette.concurrency import run_in_threadpool
 
 SECONDS: Final = 5.0
 """An answer is kept no longer: what it tells may depend on the time of day."""
+ALWAYS: Final = float("inf")
+"""For answers that depend on nothing but their key."""
 
 
 @dataclass(frozen=True)

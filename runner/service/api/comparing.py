@@ -11,6 +11,7 @@ from runner.runs import Run
 from runner.service import computed
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, recorded_run, state_of
+from runner.service.kept import ALWAYS
 from runner.service.problems import answers
 
 router = APIRouter(
@@ -43,7 +44,7 @@ async def diff(
     left, right = await found_runs(catalogue, [a, b])
     key = ("diff", state_of(left), state_of(right), request.url.query)
     asked = (left.recording, right.recording, ignore or [], first, target or [])
-    body = await kept.awaited(key, lambda: apart(computed.difference, *asked))
+    body = await kept.awaited(key, lambda: apart(computed.difference, *asked), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 
 
@@ -65,7 +66,7 @@ async def compare(
     runs = await found_runs(catalogue, run, several=True)
     key = ("compare", *map(state_of, runs), request.url.query)
     asked = ([found.recording for found in runs], by, metric or [], at, target)
-    body = await kept.awaited(key, lambda: apart(computed.comparison, *asked))
+    body = await kept.awaited(key, lambda: apart(computed.comparison, *asked), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 
 

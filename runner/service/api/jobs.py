@@ -11,11 +11,11 @@ from typing import Annotated, Any, Final
 
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
-from fastapi.responses import PlainTextResponse, StreamingResponse
+from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 
 from runner.service.dependencies import JobsOf
-from runner.service.problems import Refused, answers
+from runner.service.problems import Refused, answers, content
 from runner.service.queue import Job, Kind, NoSuchJob, State
 from runner.service.work import SOURCE, Jobs, Standing
 
@@ -174,13 +174,13 @@ def one(jobs: JobsOf, number: Number) -> JobTold:
 
 @router.get(
     "/jobs/{number}/submitted",
-    response_class=PlainTextResponse,
-    responses=answers(HTTPStatus.NOT_FOUND),
+    response_class=Response,
+    responses=content("text/plain") | answers(HTTPStatus.NOT_FOUND),
     summary="The text of a job, as it was submitted.",
 )
-def submitted(jobs: JobsOf, number: Number) -> str:
+def submitted(jobs: JobsOf, number: Number) -> Response:
     """Return the YAML that was submitted."""
-    return jobs.queue.submitted(number)
+    return Response(jobs.queue.submitted(number), media_type="text/plain")
 
 
 @router.post(

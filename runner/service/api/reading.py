@@ -12,6 +12,7 @@ from runner.frames import Phase, episode_columns, evaluation_records, step_colum
 from runner.recording.reader import Recording
 from runner.service import computed
 from runner.service.dependencies import ApartOf, KeptOf, OpenRecording, RecordedRun, SettingsOf, state_of
+from runner.service.kept import ALWAYS
 from runner.service.problems import Refused, answers, content
 
 if TYPE_CHECKING:
@@ -103,7 +104,9 @@ async def metrics(
     """
     key = ("metrics", state_of(run), request.url.query)
     wanted = tuple(metric or ())
-    body = await kept.awaited(key, lambda: apart(computed.curves, run.recording, wanted, start, stop, points))
+    body = await kept.awaited(
+        key, lambda: apart(computed.curves, run.recording, wanted, start, stop, points), ALWAYS
+    )
     return Response(body, media_type="application/json")
 
 
@@ -229,7 +232,7 @@ async def plot(
 ) -> Response:
     """Return the figure that `dualtaxi plot` draws."""
     key = ("plot", state_of(run), form)
-    body = await kept.awaited(key, lambda: apart(computed.plot, [run.recording], form))
+    body = await kept.awaited(key, lambda: apart(computed.plot, [run.recording], form), ALWAYS)
     return Response(body, media_type=MEDIA[form])
 
 
@@ -240,7 +243,7 @@ async def _q_table(
         raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "query: found step and episode, expected one of them.")
     key = ("qtable", state_of(run), request.url.query, form)
     found: bytes = await kept.awaited(
-        key, lambda: apart(computed.q_table, run.recording, step, episode, state, form)
+        key, lambda: apart(computed.q_table, run.recording, step, episode, state, form), ALWAYS
     )
     return found
 

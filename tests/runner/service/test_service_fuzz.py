@@ -1,0 +1,90 @@
+"""The service against its own description: no answer that is not documented, and none that is its fault."""
+
+from __future__ import annotations
+
+import shutil
+import time
+import traceback
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from hypothesis import strategies as st
+from schemathesis.checks import not_a_server_error
+from schemathesis.core.failures import FailureGroup
+from schemathesis.generation import GenerationMode
+from schemathesis.specs.openapi.checks import (
+    content_type_conformance,
+    response_schema_conformance,
+    status_code_conformance,
+)
+from serving import serving
+
+CHECKS = [
+    not_a_server_error,
+    status_code_conformance,
+    content_type_conformance,
+    response_schema_conformance,
+]
+EXAMPLES = 30
+SHARE = 0.7
+"""Requests to each route, and seconds after which it has had enough of them."""
+
+
+@pytest.fixture(scope="module")
+def served(recorded, tmp_path_factory):
+    recordings = shutil.copytree(recorded, tmp_path_factory.mktemp("fuzz") / "recordings")
+    with serving(recordings) as found:
+        yield found
+
+
+def test_every_answer_is_documented_and_none_is_a_fault(served):
+    schema = schemathesis.openapi.from_url(f"{served.url}api/v1/openapi.json")
+    failed, tried = {}, 0
+    for result in schema.get_all_operations():
+        operation = result.ok()
+        if "text/event-stream" in str(operation.definition.raw):
+            continue  # it ends when the job does
+        try:
+            _fuzz(operation, served)
+        except (Exception, FailureGroup) as error:  # told at the end, with all others
+            failed[operation.label] = "".join(traceback.format_exception_only(error))[:2000]
+        tried += 1
+    assert tried > 20
+    assert not failed, "\n\n".join(f"{label}: {told}" for label, told in failed.items())
+
+
+def _cases(operation):
+    """Return requests that fit the description, and such that do not."""
+    return st.one_of(*(operation.as_strategy(generation_mode=mode) for mode in GenerationMode))
+
+
+def _fuzz(operation, served):
+    began = time.monotonic()
+
+    @seed(0)
+    @settings(
+        max_examples=EXAMPLES,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(case=_cases(operation), name=st.sampled_from(["first", "second", "@latest", None]))
+    def check(case, name):
+        if time.monotonic() - began > SHARE:
+            return
+        if name is not None:
+            _name_runs(case, name)
+        case.call_and_validate(checks=CHECKS, headers=served.origin, timeout=60)
+
+    check()
+
+
+def _name_runs(case, name):
+    """Have a request ask for runs that there are."""
+    if "run" in (case.path_parameters or {}):
+        case.path_parameters["run"] = name
+    for key, value in (("a", "first"), ("b", name), ("run", ["first", name])):
+        if key in (case.query or {}):
+            case.query[key] = value
