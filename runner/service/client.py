@@ -24,6 +24,8 @@ from blake3 import blake3
 
 from runner.errors import MissingExtra, RunnerError
 from runner.runs import Run
+from runner.service import watching
+from runner.service.watching import Happened, JobThere
 
 if TYPE_CHECKING:
     import httpx2
@@ -143,6 +145,51 @@ class Client:
 
     def __exit__(self, *raised: object) -> None:
         self.close()
+
+    # --- jobs -----------------------------------------------------------------------------------------
+
+    def submit(self, text: str, source: str = "job.yaml") -> JobThere:
+        """Submit the text of a configuration or a sweep; `source` is the file's name, for messages.
+
+        Raises:
+            ServerError: it was refused, each mistake with its line; or the server is away.
+        """
+        return JobThere.of(self.ask("POST", "/jobs", params={"source": source}, content=text.encode()).json())
+
+    def job(self, number: int) -> JobThere:
+        """Return how a job stands; errors as of `ask`."""
+        return JobThere.of(self.ask("GET", f"/jobs/{number}").json())
+
+    def jobs(self, limit: int = 50, offset: int = 0) -> list[JobThere]:
+        """Return jobs, the newest first; errors as of `ask`."""
+        told = self.ask("GET", "/jobs", params={"limit": limit, "offset": offset}).json()
+        return [JobThere.of(job) for job in told["jobs"]]
+
+    def watch(self, number: int) -> Iterator[Happened]:
+        """Yield what happens to a job until it is over, as `watching.watch` does; it says what is raised."""
+        return watching.watch(self, number, self._patience)
+
+    def cancel(self, number: int) -> JobThere:
+        """Have a job not be done, or stopped; what it has recorded is kept. Errors as of `ask`."""
+        return JobThere.of(self.ask("POST", f"/jobs/{number}/cancel").json())
+
+    def resume(self, number: int, accept_changes: bool = False) -> JobThere:
+        """Have a job that failed or was cancelled go on; errors as of `ask`."""
+        params = {"accept_changes": accept_changes}
+        return JobThere.of(self.ask("POST", f"/jobs/{number}/resume", params=params).json())
+
+    @contextlib.contextmanager
+    def stream(self, path: str, headers: Mapping[str, str]) -> Iterator[httpx2.Response]:
+        """Give an answer that is read as it comes; errors as of `ask`, also while it is read."""
+        try:
+            with self._http.stream("GET", path, headers=dict(headers)) as answer:
+                if not answer.is_success:
+                    answer.read()
+                    kind = ServerAway if answer.status_code in _PASSING else ServerError
+                    raise kind(f"{self.url}: {_message(answer)}", answer.status_code)
+                yield answer
+        except self._errors as error:
+            raise ServerAway(f"{self.url}: does not answer ({error or type(error).__name__}).") from error
 
     # --- pushing --------------------------------------------------------------------------------------
 

@@ -22,17 +22,20 @@ class Served:
 
     def __init__(self, recordings: Path, *options: str) -> None:
         self.recordings, self.options = recordings, options
+        self.log = recordings.with_name(f"{recordings.name}.log")
         self.start()
 
-    def start(self) -> None:
+    def start(self, port: str = "0") -> None:
         """Start it, and wait until it can be asked."""
-        words = ["-m", "runner", "serve", "--port", "0", "--recordings", str(self.recordings), *self.options]
-        self.process = subprocess.Popen(
-            [sys.executable, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        words = ["-m", "runner", "serve", "--port", port, "--recordings", str(self.recordings), *self.options]
+        # Its log goes to a file: a pipe that nobody empties would stop it after 64 KiB.
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, *words], stdout=subprocess.PIPE, stderr=log, text=True
+            )
         assert self.process.stdout is not None
         self.url = self.process.stdout.readline().strip()
-        assert self.url, self.process.stderr and self.process.stderr.read()
+        assert self.url, self.log.read_text()
         self.client = httpx2.Client(
             base_url=f"{self.url}api/v1", headers={"Origin": self.url.rstrip("/")}, timeout=60
         )
@@ -61,9 +64,8 @@ class Served:
     def _forget(self) -> None:
         self.process.wait(60)
         self.client.close()
-        for stream in (self.process.stdout, self.process.stderr):
-            if stream is not None:
-                stream.close()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
 
     def get(self, path: str) -> Any:
         """Return what is at a path."""

@@ -1,0 +1,80 @@
+"""The client's calls for jobs."""
+
+from __future__ import annotations
+
+import json
+import threading
+
+import pytest
+from served import served
+
+from runner.errors import RunnerError
+from runner.runs import list_runs
+from runner.service.client import Client, ServerError
+from runner.service.watching import Happened, JobThere, events_in
+
+CONFIG = {"name": "quick", "episodes": 600, "mode": "cooperative", "evaluation": {"every": 50, "trials": 400}}
+ENDLESS = {"episodes": 10**7, "evaluation": None, "recording": {"steps": "none"}}
+TINY = {"name": "icy", "env": {"id": "FrozenLake-v1"}, "episodes": 20, "seeds": [0, 1]}
+
+
+def test_a_watcher_sees_everything_once_though_the_server_is_killed_meanwhile(tmp_path):
+    with served(tmp_path) as server:
+        seen = []
+        with Client(server.url) as client:
+            number = client.submit(json.dumps(CONFIG)).number
+        port = server.url.rstrip("/").rpartition(":")[2]
+
+        def watch():
+            with Client(server.url) as client:
+                seen.extend(client.watch(number))
+
+        watcher = threading.Thread(target=watch)
+        watcher.start()
+        server.until(lambda jobs: (jobs[number]["progress"] or {}).get("episode", 0) > 0)
+        server.kill()
+        server.start(port)
+        watcher.join(60)
+        assert not watcher.is_alive()
+    states = [happened.data["state"] for happened in seen if happened.kind == "state"]
+    assert states[0] == "queued"
+    assert states.count("finished") == 1
+    assert states[-1] == "finished"
+    said = [happened.data["text"] for happened in seen if happened.kind == "log"]
+    told = [text for text in said if text.startswith("evaluation")]
+    assert len(told) == len(set(told)) > 3
+    places = [int(happened.place) for happened in seen if happened.place]
+    assert places == sorted(set(places))
+    assert seen[-2].kind == "progress" or seen[-1].kind == "state"
+
+
+def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
+    with served(tmp_path, "--workers", "1") as server, Client(server.url) as client:
+        first = client.submit(json.dumps(CONFIG | ENDLESS))
+        second = client.submit(json.dumps(TINY), "tiny.yaml")
+        assert (second.name, second.state, second.runs) == ("icy", "queued", 2)
+        assert [job.number for job in client.jobs()] == [second.number, first.number]
+        assert client.cancel(first.number).is_over
+        *_, last = client.watch(second.number)
+        assert last == Happened("state", last.data, last.place)
+        assert last.data["state"] == "finished"
+        done = client.job(second.number)
+        assert sorted(done.begun.values()) == sorted(
+            run.run_id for run in list_runs(tmp_path) if run.status == "finished"
+        )
+        assert client.resume(first.number).state == "queued"
+        with pytest.raises(ServerError, match=r"bad\.yaml:1:1: episodes: found 'many'"):
+            client.submit("episodes: many", "bad.yaml")
+        with pytest.raises(ServerError, match="no job 99"):
+            list(client.watch(99))
+
+
+def test_events_are_read_and_one_that_was_cut_off_is_left_out():
+    lines = ["retry: 1000", "", ": still here", "", "id: 7", "event: log", 'data: {"text": "a: b"}', ""]
+    cut_off = ["id: 9", "event: state", 'data: {"sta']
+    assert list(events_in([*lines, *cut_off])) == [Happened("log", {"text": "a: b"}, "7")]
+
+
+def test_another_answer_than_that_of_a_job_is_told():
+    with pytest.raises(RunnerError, match="found another answer"):
+        JobThere.of({"number": 1})
