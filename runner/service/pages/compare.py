@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Sequence
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
@@ -56,7 +57,14 @@ async def divergence(
     """Show the first step at which two runs differ, and why."""
     found = _two(await _chosen(catalogue, run))
     told = await _difference(found, kept, apart)
-    return page(request, "compare_divergence.html", **_head(found, "/divergence"), told=told, spot=_spot_text)
+    return page(
+        request,
+        "compare_divergence.html",
+        **_head(found, "/divergence"),
+        told=told,
+        spot=_spot_text,
+        after=after_step,
+    )
 
 
 @router.get("/tables")
@@ -87,7 +95,7 @@ async def replay(
     spot = parse_spot(at)
     if not spot:
         partings = (await _difference(found, kept, apart))["partings"]
-        spot = tuple(partings[0]["spot"]) if partings else (0, 0)
+        spot = after_step(partings[0]["spot"]) if partings else (0, 0)
     phase = "train" if len(spot) == 2 else "eval"
     place = "/".join(map(str, spot[:-1]))
     around = [_replay_link(found, spot, by) for by in (-1, 1)]
@@ -183,8 +191,13 @@ def _same_content(found: list[Run]) -> bool:
     return len(digests) == 1 and None not in digests
 
 
-def _spot_text(spot: list[int]) -> str:
+def _spot_text(spot: Sequence[int]) -> str:
     return ":".join(map(str, spot if len(spot) == 2 else ["eval", *spot]))
+
+
+def after_step(spot: list[int]) -> tuple[int, ...]:
+    """Return the place of the frame after a step: the first that shows what differs in it."""
+    return (*spot[:-1], spot[-1] + 1)
 
 
 def _replay_link(found: list[Run], spot: tuple[int, ...], by: int) -> str:

@@ -45,7 +45,7 @@ base:
 parameters:
   discount: [0.9, 0.95, 0.99]
 strategy: grid
-seeds: 2
+seeds: [0, 1]
 """
 
 
@@ -143,6 +143,8 @@ def _kind(options: list[Mapping[str, Any]]) -> str:
 def _bounds(option: Mapping[str, Any]) -> str:
     low = option.get("minimum", option.get("exclusiveMinimum"))
     high = option.get("maximum", option.get("exclusiveMaximum"))
+    if high is not None and high > _UNTOLD:
+        high = None
     if low is None and high is None:
         return ""
     if high is None:
@@ -150,6 +152,8 @@ def _bounds(option: Mapping[str, Any]) -> str:
     return f" {'' if low is None else low} to {high}"
 
 
+_UNTOLD: Final = 10**9
+"""A greatest value beyond this says nothing to people."""
 _WORDS: Final = {
     "integer": "whole number",
     "number": "number",

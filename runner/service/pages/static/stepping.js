@@ -19,7 +19,6 @@ async function begun(root) {
   return replay;
 }
 
-// The frame after a step shows what differs in it, so the step at which runs part is shown as done.
 const roots = [...document.querySelectorAll("[data-source]")];
 const replays = (await Promise.all(roots.map((root) => begun(root).catch((error) => {
   root.querySelector(".description").textContent = error.message;

@@ -1,0 +1,284 @@
+"""The pages in a browser: a configuration submitted, watched, replayed, compared, and opened in Rerun."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+from selenium import webdriver
+from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import WebDriverWait
+
+from runner.export.svg import Drawing, transform
+from runner.recording.reader import open_recording
+from runner.runs import find_run
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+CHROMEDRIVER = shutil.which("chromedriver")
+ASKED = """\
+name: asked
+mode: cooperative
+episodes: {episodes}
+env: {{kwargs: {{max_episode_steps: 60}}}}
+seed: 7
+evaluation: {{every: 60, trials: 4}}
+"""
+PAGES = (
+    "/runs",
+    "/runs/first",
+    "/runs/first/replay",
+    "/runs/first/episodes",
+    "/runs/first/evaluations",
+    "/runs/first/learned",
+    "/runs/first/config",
+    "/compare?run=first&run=second",
+    "/compare/divergence?run=first&run=second",
+    "/compare/replay?run=first&run=second",
+    "/compare/tables?run=first&run=second",
+    "/sweeps",
+    "/queue",
+    "/submit",
+    "/disk",
+)
+
+
+@pytest.fixture(scope="module")
+def folder(recorded, tmp_path_factory):
+    return shutil.copytree(recorded, tmp_path_factory.mktemp("served") / "recordings")
+
+
+@pytest.fixture(scope="module")
+def served(folder, tmp_path_factory):
+    """Return the address of a service in a process of its own."""
+    path = tmp_path_factory.mktemp("log") / "serve.log"
+    arguments = [sys.executable, "-m", "runner", "serve", "--port", "0", "--recordings", folder]
+    with (
+        path.open("w") as log,
+        subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=log, text=True) as process,
+    ):
+        address = process.stdout.readline().strip().rstrip("/")
+        assert address.startswith("http://127.0.0.1:"), path.read_text()
+        yield address
+        process.terminate()
+        process.wait(60)
+    assert "Traceback" not in path.read_text()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if (CHROMIUM is None or CHROMEDRIVER is None) and "DUALTAXI_CI" not in os.environ:
+        pytest.skip("needs Debian's chromium and chromium-driver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    drawing = ("--enable-unsafe-swiftshader", "--use-angle=swiftshader")
+    for argument in (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-dev-shm-usage",
+        "--window-size=1300,1000",
+        *drawing,
+    ):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    driver = webdriver.Chrome(options=options, service=Service(CHROMEDRIVER))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture
+def page(browser, served):
+    """Return a function that opens a page; afterwards nothing must have gone wrong."""
+    browser.get_log("browser")
+
+    def open_page(address):
+        browser.get(served + address)
+        return browser
+
+    yield open_page
+    wrong = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+    assert [message for message in wrong if " 422 " not in message] == []
+    asked = re.findall(
+        r'"url":"(\w+://[^"/]+)', " ".join(e["message"] for e in browser.get_log("performance"))
+    )
+    assert {address for address in asked if address.startswith(("http", "ws"))} <= {served}
+
+
+def wait(browser, done, seconds=60):
+    return WebDriverWait(browser, seconds, poll_frequency=0.1).until(lambda _: done())
+
+
+def text_of(browser, selector):
+    return browser.find_element(By.CSS_SELECTOR, selector).text
+
+
+def test_a_mistake_is_told_at_its_line_then_a_job_is_submitted_and_watched_to_its_end(page, folder):
+    browser = page("/submit")
+    field = browser.find_element(By.ID, "text")
+    field.clear()
+    field.send_keys(ASKED.format(episodes="-5"))
+    wait(browser, lambda: "Line 3" in text_of(browser, "#problems"))
+    assert "episodes: -5" in text_of(browser, "#problems pre")
+    browser.find_element(By.CSS_SELECTOR, "#problems a").click()
+    selected = browser.execute_script(
+        "let t = arguments[0]; return t.value.slice(t.selectionStart, t.selectionEnd)", field
+    )
+    assert selected == "episodes: -5"
+    field.clear()
+    field.send_keys(ASKED.format(episodes=180))
+    wait(browser, lambda: "1 run" in text_of(browser, "#fine"))
+    browser.find_element(By.CSS_SELECTOR, "button[value=submit]").click()
+    wait(browser, lambda: "/queue/" in browser.current_url)
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "[data-state].finished"))
+    browser.find_element(By.CSS_SELECTOR, "[data-runs] a").click()
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "#standing"))
+    assert find_run("asked", folder).run_id in browser.current_url
+    assert "180" in text_of(browser, "#standing")
+
+
+def test_metrics_are_drawn_and_zoomed_and_the_address_says_so(page):
+    browser = page("/runs/first")
+    wait(browser, lambda: len(browser.find_elements(By.CSS_SELECTOR, ".uplot canvas")) > 3)
+    assert "Every recorded point" in text_of(browser, "[data-said]")
+    browser.find_element(By.NAME, "from").send_keys("10")
+    browser.find_element(By.NAME, "to").send_keys("40" + Keys.ENTER)
+    wait(browser, lambda: "from=10&to=40" in browser.current_url)
+    browser.refresh()
+    assert browser.find_element(By.NAME, "to").get_attribute("value") == "40"
+
+
+@pytest.mark.parametrize(("address", "phase", "number"), [("train/7", "train", 7), ("train/59", "train", 59)])
+def test_any_episode_is_scrubbed_and_each_step_has_an_address(page, folder, address, phase, number):
+    browser = page(f"/runs/first/replay/{address}?t=2")
+    with open_recording(find_run("first", folder).recording) as recording:
+        mdp = recording.mdp
+        steps = recording.episode_steps(phase, number)
+    states = np.append(steps["state"], steps["next_state"][-1])
+    places = Drawing(mdp.scene).places(mdp, states)
+    slider = browser.find_element(By.CSS_SELECTOR, ".step")
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".choice ol"))
+
+    def shown():
+        groups = browser.find_elements(By.CSS_SELECTOR, "[data-thing]")
+        return {int(group.get_attribute("data-thing")): group.get_attribute("transform") for group in groups}
+
+    def drawn(k):
+        return {thing: transform(place) for thing, place in enumerate(places[k])}
+
+    assert shown() == drawn(2)
+    for key, k in (
+        (Keys.ARROW_RIGHT, 3),
+        (Keys.PAGE_DOWN, 13),
+        (Keys.END, len(steps)),
+        (Keys.HOME, 0),
+        (Keys.ARROW_RIGHT, 1),
+    ):
+        slider.send_keys(key)
+        wait(browser, lambda k=k: shown() == drawn(min(k, len(steps))))
+    wait(browser, lambda: browser.current_url.endswith("?t=1"))
+
+
+def test_a_step_is_shown_without_scripts(served):
+    with urllib.request.urlopen(f"{served}/runs/first/replay/train/7?t=2") as answer:
+        html = answer.read().decode()
+    assert 'data-thing="0"' in html
+    assert '<a href="?t=3">' in html
+
+
+def test_two_runs_are_chosen_in_the_table_and_replayed_in_step(page):
+    browser = page("/runs?filter=name:first OR name:second")
+    for box in browser.find_elements(By.NAME, "run"):
+        box.click()
+    browser.find_element(By.CSS_SELECTOR, "[data-compare]").click()
+    wait(browser, lambda: "/compare?" in browser.current_url)
+    assert "seed" in text_of(browser, "[aria-label='Settings that differ']")
+    browser.find_element(By.LINK_TEXT, "Replays in step").click()
+    wait(browser, lambda: len(browser.find_elements(By.CSS_SELECTOR, ".choice ol")) == 2)
+    slider = browser.find_element(By.CSS_SELECTOR, ".both")
+    before = slider.get_attribute("value")
+    slider.send_keys(Keys.ARROW_RIGHT)
+    wait(browser, lambda: slider.get_attribute("value") == str(int(before) + 1))
+    assert f"step {int(before) + 1} of" in text_of(browser, ".both-count")
+
+
+def test_a_step_is_opened_in_rerun(page, folder):
+    pytest.importorskip("rerun")
+    browser = page("/runs/first/replay/train/7?t=3")
+    wait(
+        browser,
+        lambda: "at=7:2" in browser.find_element(By.CSS_SELECTOR, "[data-to-rerun]").get_attribute("href"),
+    )
+    browser.find_element(By.CSS_SELECTOR, "[data-to-rerun]").click()
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "iframe.viewer"))
+    browser.switch_to.frame(browser.find_element(By.CSS_SELECTOR, "iframe.viewer"))
+    wait(browser, lambda: browser.execute_script("return document.body.dataset.opened"), 240)
+    with open_recording(find_run("first", folder).recording) as recording:
+        step = recording.episode_steps("train", 7)[2]
+    opened = browser.execute_script(
+        "return [document.body.dataset.opened, document.getElementById('said').hidden]"
+    )
+    assert opened == [str(int(step["log_time"]) // 100_000_000), True]
+    browser.switch_to.default_content()
+
+
+@pytest.mark.parametrize("width", [400, 1400])
+def test_nothing_sticks_out_of_any_page(page, width):
+    for address in PAGES:
+        browser = page(address)
+        size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        browser.refresh()
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width, address
+    browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_everything_has_a_name_and_text_stands_out(page, scheme):
+    """Names for screen readers; contrast of at least 4.5 to 1, as WCAG 2 wants it (level AA)."""
+    for address in PAGES:
+        browser = page(address)
+        features = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", features)
+        tree = browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+        for node in tree:
+            if not node.get("ignored") and node["role"]["value"] in (
+                "button",
+                "link",
+                "slider",
+                "textbox",
+                "combobox",
+                "checkbox",
+                "table",
+            ):
+                named = node.get("name", {}).get("value") or node["role"]["value"] == "table"
+                assert named, (address, node["role"]["value"], node.get("properties"))
+        for selector in ("body", ".soft", ".hint", ".bar nav a", ".tabs a", "button", "dt", ".status"):
+            for colours in browser.execute_script(COLOURS, selector):
+                light, dark = sorted((luminance(colour) for colour in colours[:2]), reverse=True)
+                assert (light + 0.05) / (dark + 0.05) >= 4.5, (address, selector, colours)
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+COLOURS = """
+const shown = [...document.querySelectorAll(arguments[0])].filter((e) => e.offsetParent && !e.disabled);
+return shown.slice(0, 5).map((e) => {
+  const ink = getComputedStyle(e).color;
+  let ground;
+  do { ground = getComputedStyle(e).backgroundColor; e = e.parentElement }
+  while (e && ground === 'rgba(0, 0, 0, 0)');
+  return [ink, ground];
+});
+"""
+
+
+def luminance(colour):
+    parts = [int(part) / 255 for part in re.findall(r"\d+", colour)[:3]]
+    linear = [p / 12.92 if p <= 0.03928 else ((p + 0.055) / 1.055) ** 2.4 for p in parts]
+    return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
