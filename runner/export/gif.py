@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from runner.errors import MissingExtra
+from runner.errors import MissingExtra, RecordingError
 from runner.export import svg
 from runner.export.plots_figure import matplotlib_of
 from runner.export.report_replay import Episode, deeds_in_words
@@ -83,6 +83,20 @@ def require_packages() -> None:
             named = {"resvg_py": "resvg-py", "PIL": "pillow"}[package]
             raise MissingExtra(named, "plots", "a film") from error
     matplotlib_of("a film")
+
+
+def require_states(recording: Recording) -> None:
+    """Refuse a loop over an environment whose states are not told, so that there is nothing to draw.
+
+    Raises:
+        RecordingError: it is one.
+    """
+    if not recording.tabular:
+        raise RecordingError(
+            f"{recording.path}: found a loop over {recording.environment.get('env_id')}, expected a tabular "
+            "environment, whose states can be drawn; `dualtaxi view` shows the numbers and pictures that it "
+            "recorded."
+        )
 
 
 def pictures(recording: Recording, episode: Episode, width: int = WIDTH) -> list[str]:

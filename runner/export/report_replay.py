@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.tables import TableReplay, tables_at
+from runner.analysis.tables import TableReplay, check_steps, tables_at
 from runner.errors import RecordingError
 from runner.export.report_runs import require_steps
 from runner.frames import agents_of
@@ -39,7 +39,7 @@ class Episode:
     total: float
     """What the rewards of all of them sum to."""
     ended: str
-    """How it ended: `success`, `terminated`, `truncated`, or `cut off` with the recording."""
+    """How it ended: `success`, `terminated`, `truncated`, `reset` before its end, or `cut off`."""
     states: NDArray[np.int64]
     actions: NDArray[np.int64]
     rewards: NDArray[np.float64]
@@ -81,6 +81,7 @@ class Episode:
     def outcome(self) -> str:
         """Length, end and return in words."""
         words = {"success": "ended in success", "terminated": "ended", "truncated": "ended by the step limit"}
+        words["reset"] = "reset before its end"
         ended = words.get(self.ended, "cut off with the recording")
         return f"{self.length:,} steps, {ended}. Rewards sum to {self.total:g}."
 
@@ -230,6 +231,7 @@ def _episode(
             f"{recording.path}: {title} has {len(steps):,} steps, from 0; found no step {part.start:,}."
         )
     mdp = recording.mdp
+    check_steps(shown, mdp, str(recording.path))
     return Episode(
         title=title,
         phase=phase,
@@ -250,7 +252,7 @@ def _episode(
 
 def _end(recording: Recording, phase: str, number: int, last: np.void) -> str:
     if not (last["terminated"] or last["truncated"]):
-        return "cut off"
+        return "reset" if number < recording.count(recording.topic(f"/{phase}/episode")) else "cut off"
     record = recording.episodes(phase, number, number + 1)
     if len(record) and record[0]["success"]:
         return "success"
@@ -277,6 +279,8 @@ def _values(
     recording: Recording, steps: NDArray[np.void], table_step: int
 ) -> tuple[NDArray[np.float64], ...]:
     """Return each learner's Q-values in the states of steps; none where the tables cannot be had."""
+    if recording.kind != "job":
+        return ()  # what somebody's own loop learned is not known
     try:
         if table_step >= 0:
             tables = tables_at(recording, table_step)

@@ -69,7 +69,7 @@ def command(
 
     Each frame has step, actions, rewards and events written below it. Without a choice it is the typical
     trial of the last evaluation: the median by success, return and length; in a run that has no whole
-    evaluation, the last training episode.
+    evaluation, such as your own loop over a tabular environment, the last training episode.
 
     \b
     Examples:
@@ -79,7 +79,7 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     if episode is not None and chosen is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
-    from runner.export.gif import require_packages, write_gif
+    from runner.export.gif import require_packages, require_states, write_gif
     from runner.export.report_replay import (
         last_episode,
         last_whole_evaluation,
@@ -93,6 +93,7 @@ def command(
     require_packages()
     said: list[int] = []
     with open_recording(find_recorded(run_name, recordings).recording) as recording:
+        require_states(recording)
         if episode is None and chosen is None and last_whole_evaluation(recording) is None:
             episode = last_episode(recording)
             say(f"There is no whole evaluation: this is the last training episode, {episode:,}.")

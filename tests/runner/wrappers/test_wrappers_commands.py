@@ -127,6 +127,14 @@ def test_what_a_loop_has_not_is_refused_in_a_sentence(folder, words):
     assert "loop" in done.output
 
 
+def test_the_grid_of_a_loop_becomes_a_film(folder, tmp_path):
+    done = dualtaxi(folder, "export", "gif", "lake", "--episode", "2", "-o", str(tmp_path / "film.gif"))
+    assert done.exit_code == 0, done.output
+    with open_recording(runner.find_run("lake", folder).recording) as recording:
+        steps = len(recording.episode_steps("train", 2))
+    assert f"training episode 2, {steps + 1} frames" in done.stdout
+
+
 def test_the_grid_of_a_loop_is_played(folder):
     done = dualtaxi(folder, "play", "lake", "--episode", "2")
     assert done.exit_code == 0
