@@ -13,6 +13,7 @@ from gymnasium import spaces
 from runner.errors import EnvironmentNotUsable
 from runner.mdp import Mdp, mdp_of
 from runner.recording.spaces import MAX_VALUE_BYTES
+from runner.scene import is_text
 
 Keys = tuple[str | int, ...]
 _RECORDABLE: Final = "Discrete, MultiDiscrete, MultiBinary, Box, Text, and Tuple and Dict of these"
@@ -113,9 +114,9 @@ def parts_of(space: spaces.Space[Any], where: str) -> list[Part]:
 def _parts(space: spaces.Space[Any], where: str, keys: Keys, fields: tuple[str, ...]) -> Iterator[Part]:
     if isinstance(space, spaces.Dict):
         for key, part in space.spaces.items():
-            if not str(key):
+            if not is_text(str(key)):
                 raise EnvironmentNotUsable(
-                    f"{where}: found a part without a name, expected each to have one."
+                    f"{where}: found a part called {str(key)[:40]!r}, expected a short, printable name."
                 )
             yield from _parts(part, where, (*keys, key), (*fields, str(key)))
     elif isinstance(space, spaces.Tuple):

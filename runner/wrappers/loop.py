@@ -77,6 +77,7 @@ class Plan:
 
     def _check(self) -> None:
         expectations = (
+            ("name", "text", self.name is None or isinstance(self.name, str)),
             ("seed", "a whole number from 0", _is_whole(self.seed, 0, 2**64 - 1)),
             ("config", "a mapping", isinstance(self.config, Mapping)),
             ("info", "names of fields", all(isinstance(name, str) for name in self.info)),
@@ -157,6 +158,7 @@ class Loop(Generic[R]):
             sizes=sizes_of(facts, str(path)),
         )
         self.closed = False
+        self._process = os.getpid()
         self._stop = threading.Event()
         self._flusher = threading.Thread(target=self._keep_flushing, name="recording-flush", daemon=True)
         self._flusher.start()
@@ -230,8 +232,10 @@ class Loop(Generic[R]):
         Raises:
             ConfigError: it is neither, or the name is none.
         """
-        if not isinstance(name, str) or not name:
-            raise ConfigError(f"log: found the name {name!r}, expected text")
+        if not _is_text(name) or not name or (isinstance(value, str) and not _is_text(value)):
+            raise ConfigError(
+                f"log: found the name {name!r} for {value!r}, expected text that is valid Unicode"
+            )
         with self.lock:
             position = self._moment()
             if isinstance(value, str):
@@ -240,10 +244,10 @@ class Loop(Generic[R]):
                 return
             try:
                 number = float(value)
-            except (TypeError, ValueError) as error:
+            except (TypeError, ValueError, OverflowError) as error:
                 raise ConfigError(
-                    f"log: found {type(value).__name__} for {name!r}, expected a number or text; "
-                    "an array is recorded by snapshot()."
+                    f"log: found {type(value).__name__} for {name!r}, expected a number that a "
+                    "float64 holds, or text; an array is recorded by snapshot()."
                 ) from error
             step, episode = self.rows(phase).place
             fields = {"name": name, "value": number, "phase": phase, "step": step, "episode": episode}
@@ -255,8 +259,11 @@ class Loop(Generic[R]):
         Raises:
             ConfigError: it holds something else, or is too large.
         """
-        values = np.ascontiguousarray(array)
-        if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8 or not isinstance(name, str):
+        try:
+            values = np.asarray(array, order="C")
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"snapshot: found no array of numbers for {name!r} ({error})") from error
+        if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8 or not _is_text(name):
             raise ConfigError(
                 f"snapshot: found {values.dtype} for {name!r}, expected an array of numbers and a name."
             )
@@ -328,9 +335,13 @@ class Loop(Generic[R]):
     def close(self, status: str = "finished", error: str = "") -> Run:
         """Write everything, and say how it ended; return the run as it then is. The second time, only that.
 
+        A process that was forked from the one that records only returns the run: the file is not its own.
+
         Raises:
             StorageError: the disk is full or failing; what was written is kept.
         """
+        if os.getpid() != self._process:
+            return self.run
         self._stop.set()
         with self.lock:
             if self.closed:
@@ -415,6 +426,11 @@ def _write_environment(file: RecordingFile, described: Described, mdp: Mdp | Non
 
 def _result(status: str, result: Mapping[str, Any]) -> dict[str, str]:
     return {"json": json.dumps({"status": status, **result}, sort_keys=True)}
+
+
+def _is_text(value: Any) -> bool:
+    """Return whether a value is text that UTF-8 can hold: without lone surrogates."""
+    return isinstance(value, str) and value == value.encode("utf-8", "ignore").decode()
 
 
 def _is_whole(value: Any, low: int, high: int) -> bool:

@@ -111,6 +111,10 @@ def record_vector(
         ConfigError: an argument cannot be used.
         StorageError: the recordings folder cannot be written.
     """
+    if not isinstance(envs, VectorEnv):
+        raise ConfigError(
+            f"found {type(envs).__name__}, expected a vector environment, such as gymnasium.make_vec gives"
+        )
     mode = envs.metadata.get("autoreset_mode")
     if not isinstance(mode, AutoresetMode):
         raise EnvironmentNotUsable(
@@ -120,6 +124,7 @@ def record_vector(
     first = envs if envs.spec is not None else next(iter(getattr(envs.unwrapped, "envs", ())), envs)
     described = describe(first, envs.single_observation_space, envs.single_action_space)
     described = replace(described, environments=envs.num_envs, mdp=None, agents=("agent",))
+    _require_fixed(described)
     plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
     loop = Loop(described, plan, lambda recorder, phase: VectorRows(recorder, described, phase))
     return RecordedVector(envs, loop, mode)
@@ -219,9 +224,23 @@ def record_parallel(
             f"found {type(env).__name__}, expected a PettingZoo ParallelEnv with possible_agents"
         )
     described = _game(env)
+    _require_fixed(described)
     plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
     loop = Loop(described, plan, lambda recorder, phase: AgentRows(recorder, described, phase))
     return RecordedParallel(env, loop)
+
+
+def _require_fixed(described: Described) -> None:
+    """Refuse spaces whose values vary in size, before there is a run.
+
+    Raises:
+        EnvironmentNotUsable: there is one.
+    """
+    if described.kind == "variable":
+        raise EnvironmentNotUsable(
+            "found a Text space, whose values vary in size; of several environments or agents at once "
+            "only spaces of fixed size can be recorded."
+        )
 
 
 def _game(env: Any) -> Described:

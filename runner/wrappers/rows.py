@@ -19,7 +19,7 @@ from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
 from runner.wrappers.described import Described, parts_of
 from runner.wrappers.judge import Judge
-from runner.wrappers.values import check_value, filler, value_bytes, whole_number
+from runner.wrappers.values import check_value, filler, lone_number, value_bytes, whole_number
 
 _DISCRETE: Final = struct.Struct("<qqd??")
 _DISCRETE_DTYPE: Final = np.dtype(
@@ -256,7 +256,10 @@ class DiscreteRows(BlockRows):
         """Put down a step."""
         if self._state is None and not self._reset_rows:
             raise ResetNeeded("the recording has seen no reset of this environment yet: call reset() first")
-        reward = float(reward)
+        try:
+            reward = float(reward)
+        except (TypeError, ValueError):
+            reward = lone_number(reward, "reward")
         at = self.filled * 26
         try:
             _DISCRETE.pack_into(self._bytes, at, action, observation, reward, terminated, truncated)
@@ -319,7 +322,13 @@ class ArrayRows(BlockRows):
 
     def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
         """Put down a step."""
-        row, reward = self.filled, float(reward)
+        row = self.filled
+        try:
+            reward = float(reward)
+        except (TypeError, ValueError):
+            reward = lone_number(reward, "reward")
+        if row == 0:
+            check_value(self._action_parts, action, "action", 4)
         self._action(row, action)
         self._next(row, observation)
         _ENDING.pack_into(self._bytes, row * 10, reward, terminated, truncated)
@@ -356,7 +365,7 @@ class VariableRows(Rows):
 
     def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
         """Put down a step."""
-        row, reward = self.filled, float(reward)
+        row, reward = self.filled, lone_number(reward, "reward")
         step, episode = self.place[0], self._coming
         began = row if self._fresh else self._begins[-1] if self._begins else -self._t
         payload = encode(

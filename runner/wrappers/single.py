@@ -9,11 +9,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Generic, Literal, Self
 
 import gymnasium
+import numpy as np
 
 from runner.errors import ConfigError
 from runner.runs import Run
 from runner.wrappers.described import describe
-from runner.wrappers.loop import Loop, Plan, R
+from runner.wrappers.loop import PHASES, Loop, Plan, R
 from runner.wrappers.rows import ROWS, Rows
 
 
@@ -202,7 +203,18 @@ def record(
         ConfigError: an argument cannot be used.
         StorageError: the recordings folder cannot be written.
     """
+    if not isinstance(env, gymnasium.Env):
+        raise ConfigError(
+            f"found {type(env).__name__}, expected a Gymnasium environment, such as gymnasium.make gives; "
+            "record_vector is for vector environments, record_parallel for PettingZoo's."
+        )
+    if phase not in PHASES:
+        raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(PHASES)}")
     if into is not None:
+        if recordings is not None or name is not None or config or info or frames_every or packing:
+            raise ConfigError(
+                "into: found more arguments than phase, expected none: the run has them already"
+            )
         return _beside(env, into, phase)
     described = describe(env, env.observation_space, env.action_space)
     plan = plan_of(recordings, name, seed, config, info, frames_every, frame_format, packing)
@@ -219,6 +231,8 @@ def record(
 
 def _beside(env: gymnasium.Env[Any, Any], into: RecordedEnv, phase: str) -> RecordedEnv:
     """Return an environment recorded into the run of another one."""
+    if not isinstance(into, RecordedEnv):
+        raise ConfigError(f"into: found {type(into).__name__}, expected what runner.record returned")
     loop = into._loop
     spaces = loop.described.observation, loop.described.action
     if (env.observation_space, env.action_space) != spaces:
@@ -243,6 +257,7 @@ def plan_of(
     Raises:
         ConfigError: there is no such argument, or Pillow is missing for frames.
     """
+    given: Any = seed
     known = ("compression", "level", "index", "chunk_steps")
     if unknown := set(packing) - set(known):
         raise ConfigError(f"found the argument {sorted(unknown)[0]!r}, expected one of {', '.join(known)}")
@@ -255,7 +270,7 @@ def plan_of(
     return Plan(
         recordings=recordings,
         name=name,
-        seed=seed,
+        seed=given.item() if isinstance(given, np.integer) else given,
         config=config or {},
         info=tuple(info),
         frames_every=frames_every,

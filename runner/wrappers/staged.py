@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from runner.errors import EnvironmentNotUsable, RecordingError
+from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
@@ -32,11 +32,6 @@ class StagedRows:
     filled = 0
 
     def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
-        if described.kind == "variable":
-            raise EnvironmentNotUsable(
-                "found a Text space, whose values vary in size; of several environments or agents at once "
-                "only spaces of fixed size can be recorded."
-            )
         topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
         self._recorder = recorder
         self._phase = phase

@@ -27,7 +27,7 @@ def filler(parts: Sequence[Part], column: NDArray[Any], what: str) -> Callable[[
     def put_one(row: int, value: Any) -> None:
         try:
             only[row] = value
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise _no_value(what, error) from error
 
     def put(row: int, value: Any) -> None:
@@ -37,7 +37,7 @@ def filler(parts: Sequence[Part], column: NDArray[Any], what: str) -> Callable[[
                 for key in keys:
                     inside = inside[key]
                 own[row] = inside
-        except (TypeError, ValueError, LookupError) as error:
+        except (TypeError, ValueError, LookupError, OverflowError) as error:
             raise _no_value(what, error) from error
 
     if len(columns) == 1 and not columns[0][0]:
@@ -56,8 +56,14 @@ def _no_value(what: str, error: Exception) -> RecordingError:
     return RecordingError(f"found an {what} that is not of the environment's {what} space ({error}).")
 
 
-def check_value(parts: Sequence[Part], value: Any) -> None:
+def check_value(parts: Sequence[Part], value: Any, what: str = "observation", level: int = 6) -> None:
     """Refuse a value of another shape; warn of numbers that the space's dtype cannot hold exactly.
+
+    Args:
+        parts: of its space.
+        value: the value.
+        what: `observation`, or `action`, of which the environment alone knows what shape it takes.
+        level: of the warning: how many calls away the loop is.
 
     Raises:
         RecordingError: it is one.
@@ -68,23 +74,25 @@ def check_value(parts: Sequence[Part], value: Any) -> None:
             for key in part.keys:
                 inside = inside[key]
         except (TypeError, LookupError) as error:
-            raise _no_value("observation", error) from error
+            raise _no_value(what, error) from error
         if part.dtype is None:
             continue
         found, expected = np.asarray(inside), part.dtype
         name = "".join(f"[{key!r}]" for key in part.keys)
+        if found.dtype.kind not in "biuf" or (what == "action" and found.shape != expected.shape):
+            continue
         if found.shape != expected.shape:
             raise RecordingError(
-                f"found observation{name} of shape {found.shape}, expected {expected.shape} by its space."
+                f"found {what}{name} of shape {found.shape}, expected {expected.shape} by its space."
             )
         with np.errstate(all="ignore"):
             kept = found.astype(expected.base)
         if not np.array_equal(kept, found, equal_nan=found.dtype.kind == "f"):
             warnings.warn(
-                f"observation{name} comes as {found.dtype} and is recorded, rounded, as the {expected.base} "
+                f"{what}{name} comes as {found.dtype} and is recorded, rounded, as the {expected.base} "
                 "of its space",
                 RuntimeWarning,
-                stacklevel=6,
+                stacklevel=level,
             )
 
 
@@ -106,9 +114,21 @@ def value_bytes(parts: Sequence[Part], value: Any) -> bytes:
                 array = np.empty(part.dtype.shape, part.dtype.base)
                 array[...] = inside
                 pieces.append(array.tobytes())
-    except (TypeError, ValueError, LookupError, AttributeError) as error:
+    except (TypeError, ValueError, LookupError, AttributeError, OverflowError) as error:
         raise _no_value("observation or action", error) from error
     return b"".join(pieces)
+
+
+def lone_number(value: Any, what: str) -> float:
+    """Return a number that may stand in an array of one.
+
+    Raises:
+        RecordingError: it is none.
+    """
+    array = np.asarray(value)
+    if array.size != 1 or array.dtype.kind not in "iubf":
+        raise RecordingError(f"found the {what} {value!r}, expected a number.")
+    return float(array.reshape(()))
 
 
 def whole_number(value: Any, what: str) -> int:
