@@ -145,7 +145,10 @@ def room(limits: Limits, plan: Plan, recordings: Path, before: int) -> Callable[
         if limits.seconds is not None and standing.seconds >= limits.seconds:
             return f"limits.seconds: {limits.seconds:g} s are over"
         if limits.disk is not None and standing.bytes + under_way > limits.disk:
-            return f"limits.disk: {standing.bytes:,} of {limits.disk:,} bytes are used"
+            return (
+                f"limits.disk: {standing.bytes:,} of {limits.disk:,} bytes are used, and a run needs about "
+                f"{plan.bytes_a_run:,}"
+            )
         if free_bytes(recordings) < under_way:
             return f"the disk of {recordings} is full: a run needs about {plan.bytes_a_run:,} bytes"
         return ""

@@ -82,7 +82,7 @@ def begin(sweep: Sweep, recordings: Path, resume: bool, accept_changes: bool) ->
         accept_changes: whether it may have been another then.
 
     Raises:
-        RunnerError: there is one of this name already, or there is none, or it was another.
+        RunnerError: there is one of this name already, or it was another.
         StorageError: the folder cannot be written.
     """
     there = sweep.name in sweeps_in(recordings)

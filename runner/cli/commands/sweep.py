@@ -32,8 +32,10 @@ class _StartsUnlessTold(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command that is meant."""
-        if args[0] in self.commands:
+        """Find the command that is meant; a word that is no file is told as one that is misspelt."""
+        word = args[0]
+        misspelt = not word.startswith("-") and not Path(word).suffix and not Path(word).exists()
+        if word in self.commands or misspelt:
             return super().resolve_command(ctx, args)
         return START, self.commands[START], args
 
