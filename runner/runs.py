@@ -112,9 +112,11 @@ class Run:
         `archived` if its recording is in an archive alone, and not at hand.
         """
         said = str(self.facts["status"])
-        if said == "running" and not lives(self.facts.get("owner", {}), self.folder / RUN_FILE):
-            return "interrupted"
-        return "archived" if self.archive and not self.recording.exists() else said
+        if said == "running" and lives(self.facts.get("owner", {}), self.folder / RUN_FILE):
+            return said
+        if self.archive and not self.recording.exists():
+            return "archived"
+        return "interrupted" if said == "running" else said
 
     @property
     def archive(self) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import socket
 
 import pytest
 from click.testing import CliRunner
@@ -179,6 +180,26 @@ def test_a_damaged_recording_is_refused_and_repair_is_named(run, recordings, com
     assert result.exit_code == 2
     assert result.output.count("`dualtaxi repair") == 1
     assert not (recordings.parent / "archive" / run.run_id).exists()
+
+
+def test_a_killed_run_is_archived_and_restored(run, recordings, command):
+    """Its `run.json` says for ever that it is running, by a process that is gone."""
+    folder = recordings / run.run_id
+    with open_recording(folder / "recording.mcap") as recording:
+        chunks = recording._index.chunks
+        cut = sum(chunks[len(chunks) - 6][:2])
+    left = (folder / "recording.mcap").read_bytes()[: cut + 11]
+    (folder / "recording.mcap").write_bytes(left)
+    said = json.loads((folder / "run.json").read_text())
+    owner = {"host": socket.gethostname(), "boot_id": "another", "pid": 1, "process_started": 0.0}
+    (folder / "run.json").write_text(json.dumps(said | {"status": "running", "owner": owner}))
+    done(command("archive", run.run_id, "--remove"))
+    assert [row["status"] for row in json.loads(done(command("ls", "--json")))] == ["archived"]
+    done(command("show", run.run_id))
+    done(command("restore", run.run_id))
+    back = find_run(run.run_id, recordings)
+    assert back.status == "interrupted"
+    assert back.recording.exists()
 
 
 def test_another_archive_of_the_same_id_is_left_alone(run, recordings, command):
