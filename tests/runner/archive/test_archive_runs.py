@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import socket
 
 import pytest
 from click.testing import CliRunner
@@ -12,6 +11,7 @@ from click.testing import CliRunner
 from runner.archive import layout, writing
 from runner.archive.manifest import Entry, Manifest
 from runner.cli import cli
+from runner.owner import owner as this_process
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.runs import create_run, find_run, list_runs
@@ -191,7 +191,7 @@ def test_a_killed_run_is_archived_and_restored(run, recordings, command):
     left = (folder / "recording.mcap").read_bytes()[: cut + 11]
     (folder / "recording.mcap").write_bytes(left)
     said = json.loads((folder / "run.json").read_text())
-    owner = {"host": socket.gethostname(), "boot_id": "another", "pid": 1, "process_started": 0.0}
+    owner = {**this_process(), "process_started": -1.0}
     (folder / "run.json").write_text(json.dumps(said | {"status": "running", "owner": owner}))
     done(command("archive", run.run_id, "--remove"))
     assert [row["status"] for row in json.loads(done(command("ls", "--json")))] == ["archived"]
