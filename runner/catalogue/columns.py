@@ -45,7 +45,7 @@ def columns_of(text: str) -> list[str]:
 
 def with_originals(rows: list[dict[str, Any]], index: Index) -> list[dict[str, Any]]:
     """Return rows with `same_as`: the id of another run that recorded the same content first, or None."""
-    originals = index.originals()
+    originals = index.originals([row["digest"] for row in rows if row["digest"]])
     for row in rows:
         first = originals.get(row["digest"])
         elsewhere = first is not None and first[:2] != (row["root"], row["entry"])

@@ -33,11 +33,13 @@ Tell = Callable[[str], None]
 
 INDEX_FILE: Final = "catalogue.sqlite"
 _APPLICATION: Final = 0x44546178  # "DTax"
-_VERSION: Final = zlib.crc32(",".join(["1", *Row._meta.sorted_field_names]).encode()) >> 1
+_VERSION: Final = zlib.crc32(",".join(["2", *Row._meta.sorted_field_names]).encode()) >> 1
 """Of the columns, and of what is put in them (the number before them); another one is thrown away."""
 _HEAD_BYTES: Final = 100
 """Of an SQLite file; at 24 stands how often it was changed."""
 _BUSY_SECONDS: Final = 60
+_FEW: Final = 1000
+"""Values that one query may name."""
 _SETTLED_NS: Final = 2 * 10**9
 """Files that changed so recently may change again without a trace: they are read again next time."""
 _RUN_FILES: Final = (RUN_FILE, LABELS_FILE, RECORDING_FILE)
@@ -119,15 +121,37 @@ class Index:
         (counted,) = self._tuples(self._of(chosen, fn.COUNT(Row.entry)))
         return int(counted[0])
 
+    def page(
+        self, chosen: Filter, *order: Any, limit: int, offset: int = 0
+    ) -> tuple[list[dict[str, Any]], int]:
+        """Return some of the rows that pass a filter, as `select` does, and how many do, in one pass."""
+        self._check_settings(chosen)
+        known = self._of(chosen, Row.root, Row.entry).order_by(*order, Row.created.desc(), Row.id, Row.root)
+        places = list(self._tuples(known))
+        shown = places[offset : offset + limit]
+        rows: dict[tuple[str, str], dict[str, Any]] = {}
+        for root in {root for root, _ in shown}:
+            entries = [entry for there, entry in shown if there == root]
+            for some in chunked(entries, 500):
+                found: Any = Row.select().where((Row.root == root) & Row.entry.in_(some)).dicts()
+                rows |= {(root, row["entry"]): row for row in found.bind(self._database)}
+        return [rows[place] for place in shown], len(places)
+
     def names(self) -> list[tuple[Any, ...]]:
         """Return root, entry, id, name, seed and creation (ms) of every run, the newest first."""
         columns = (Row.root, Row.entry, Row.id, Row.name, Row.seed, Row.created)
         query = self._of(Filter(None), *columns).order_by(Row.created.desc(), Row.id.desc())
         return list(query.tuples().bind(self._database))
 
-    def originals(self) -> dict[str, tuple[str, str, str]]:
-        """Return root, entry and id of the run that was first, for each content recorded twice or more."""
+    def originals(self, digests: Sequence[str] | None = None) -> dict[str, tuple[str, str, str]]:
+        """Return root, entry and id of the run that was first, for each content recorded twice or more.
+
+        Args:
+            digests: of these contents; of all unless given, or if they are very many.
+        """
         recorded = Row.select(Row.digest).where(Row.digest.is_null(False) & Row.root.in_(self.roots))
+        if digests is not None and len(digests) <= _FEW:
+            recorded = recorded.where(Row.digest.in_(digests))
         several = recorded.group_by(Row.digest).having(fn.COUNT(Row.entry) > 1)
         if not list(self._tuples(several.limit(1))):
             return {}

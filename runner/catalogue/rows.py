@@ -83,7 +83,11 @@ class Row(Model):
         table_name = "runs"
         primary_key = CompositeKey("root", "entry")
         without_rowid = True
-        indexes = ((("root", "entry", "fingerprint", "settled", "status"), False), (("digest",), False))
+        indexes = (
+            (("root", "entry", "fingerprint", "settled", "status"), False),
+            (("digest",), False),
+            (("root", "created", "id"), False),
+        )
 
 
 def row_of(run: Run, size: int | None) -> dict[str, Any]:

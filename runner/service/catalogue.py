@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 Found = TypeVar("Found")
 
 FRESH_SECONDS: Final = 1.0
-"""Folders that were looked at so recently are not looked at again; longer where that takes long."""
+"""Folders that were looked at so recently are not looked at again; up to five, where that takes long."""
 SHARE: Final = 20
 """One part in so many of the time is spent on looking."""
+MOST_SECONDS: Final = 5.0
 NEVER: Final = float("-inf")
 NOTHING: Final = Version(-1, 0)
 
@@ -105,7 +106,7 @@ class Catalogue:
 
     @property
     def _interval(self) -> float:
-        return max(FRESH_SECONDS, SHARE * self._took)
+        return min(max(FRESH_SECONDS, SHARE * self._took), MOST_SECONDS)
 
     def _look_if_due(self) -> None:
         if time.monotonic() - self._asked > self._interval:

@@ -68,9 +68,9 @@ async def list_runs(
         shown = columns_of(columns) if columns else PROGRAMS
 
         def work(index: Index) -> dict[str, Any]:
-            rows = with_originals(index.select(chosen, *order, limit=limit, offset=offset), index)
-            runs = [row_as_json(row, shown) for row in rows]
-            return {"runs": runs, "total": index.count(chosen), "offset": offset, "limit": limit}
+            rows, total = index.page(chosen, *order, limit=limit, offset=offset)
+            runs = [row_as_json(row, shown) for row in with_originals(rows, index)]
+            return {"runs": runs, "total": total, "offset": offset, "limit": limit}
 
         return json.dumps(catalogue.read(work), ensure_ascii=False).encode()
 

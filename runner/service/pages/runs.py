@@ -78,8 +78,7 @@ def _page(catalogue: Catalogue, text: str, sort: str, columns: str, number: int)
     shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
 
     def work(index: Index) -> tuple[list[dict[str, Any]], int, int]:
-        found = index.select(chosen, *order, limit=ROWS, offset=(number - 1) * ROWS)
-        total = index.count(chosen)
+        found, total = index.page(chosen, *order, limit=ROWS, offset=(number - 1) * ROWS)
         return with_originals(found, index), total, index.count(Filter(None)) if text else total
 
     rows, total, everything = catalogue.read(work)

@@ -1,0 +1,64 @@
+"""How long the service takes to tell of ten thousand runs, to twenty who ask at the same time."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import tempfile
+from pathlib import Path
+from typing import Final
+
+from benchmarks.bench_catalogue import LISTED, many, one_run
+from benchmarks.figures import Figure
+from benchmarks.serving import Service, asked, memory_of, percentile, serving
+from runner.cache import CACHE_VARIABLE
+
+CLIENTS: Final = 20
+MEDIAN: Final = (60, 20)
+NINETY_NINTH: Final = (300, 100)
+"""Milliseconds: at least, and aim."""
+SEARCHES: Final = [
+    f"/api/v1/runs?filter=name:experiment{k}%20config.discount:%3E0.{k}&sort=-finish_percent"
+    for k in range(1, 38)
+]
+"""Each found in ten thousand runs anew: an answer is kept for five seconds."""
+
+
+def measure(quick: bool) -> list[Figure]:
+    """Return milliseconds until an answer is there whole, as clients see it."""
+    seconds = 2 if quick else 8
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {CACHE_VARIABLE: f"{folder}/cache"}
+        recordings = many(one_run(Path(folder, "one")), Path(folder, "many"), LISTED, recordings=False)
+        with serving(recordings, environment=environment) as service:
+            asked(service, ["/api/v1/runs"], clients=1, seconds=1)
+            found = [
+                each for what, paths in ASKED.items() for each in _figures(service, what, paths, seconds)
+            ]
+            memory = memory_of(service.process)
+    note = "with the processes it keeps ready; what they share is counted once"
+    search = dataclasses.replace(alone, at_least=None, aim=None)
+    return [*found, search, Figure("memory of the service then", memory, "MB", 400, 250, False, detail=note)]
+
+
+def _figures(service: Service, what: str, paths: list[str], clients: int, seconds: float) -> list[Figure]:
+    times = [1000 * taken for taken in asked(service, paths, clients, seconds)]
+    rate = len(times) / seconds
+    detail = (
+        f"{LISTED:,} runs; {clients} clients, who ask again as soon as answered, {rate:,.0f} answers a second"
+    )
+    spread = (min(times), max(times))
+    return [
+        Figure(
+            f"{what}, median",
+            percentile(times, 50),
+            "ms",
+            *MEDIAN,
+            higher_is_better=False,
+            spread=spread,
+            detail=detail,
+        ),
+        Figure(
+            f"{what}, 99th percentile", percentile(times, 99), "ms", *NINETY_NINTH, higher_is_better=False
+        ),
+    ]
