@@ -32,9 +32,9 @@ def measure(quick: bool) -> list[Figure]:
         recordings = many(one_run(Path(folder, "one")), Path(folder, "many"), LISTED, recordings=False)
         with serving(recordings, environment=environment) as service:
             asked(service, ["/api/v1/runs"], clients=1, seconds=1)
-            found = [
-                each for what, paths in ASKED.items() for each in _figures(service, what, paths, seconds)
-            ]
+            found = _figures(service, "API list", ["/api/v1/runs"], CLIENTS, seconds)
+            found += _figures(service, "runs page", ["/runs"], CLIENTS, seconds)
+            alone, _ = _figures(service, "a search, one client", SEARCHES, 1, seconds)
             memory = memory_of(service.process)
     note = "with the processes it keeps ready; what they share is counted once"
     search = dataclasses.replace(alone, at_least=None, aim=None)
