@@ -20,7 +20,6 @@ from runner.job import identity_of
 from runner.runs import Run, list_runs
 from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep
-from runner.sweep.task import is_over
 
 FOLDER: Final = ".sweeps"
 FILE: Final = "sweep.yaml"
@@ -29,6 +28,10 @@ MAX_FAILED_BYTES: Final = 8 << 20
 LOCK: Final = "owner.lock"
 FREE: Final = ("limits",)
 """What may change when a sweep is gone on with: what is done follows from the rest."""
+
+
+PRUNED: Final = "pruned"
+"""The tag of a run that was given up."""
 
 
 class SweepBusy(RunnerError):
@@ -137,6 +140,11 @@ def held(name: str, recordings: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def is_over(run: Run) -> bool:
+    """Return whether there is nothing left to do for a run of a sweep."""
+    return run.status == "finished" or PRUNED in run.tags
 
 
 def runs_of(name: str, recordings: Path) -> dict[str, Run]:

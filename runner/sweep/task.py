@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 from runner.config import from_mapping
 from runner.errors import RunnerError
@@ -23,9 +23,7 @@ from runner.resume import resume
 from runner.runs import Run, create_run, find_run, list_runs, unless_empty
 from runner.sweep.model import Objective
 from runner.sweep.readings import Curve, curve_of, hopeless, readings
-
-PRUNED: Final = "pruned"
-"""The tag of a run that was given up."""
+from runner.sweep.state import PRUNED, is_over
 
 
 @dataclass(frozen=True)
@@ -127,11 +125,6 @@ def result_of(run: Run, objective: Objective) -> Result:
         size,
         float(run.summary.get("seconds", 0.0)),
     )
-
-
-def is_over(run: Run) -> bool:
-    """Return whether there is nothing left to do for a run."""
-    return run.status == "finished" or PRUNED in run.tags
 
 
 def _run(task: Task, stop: Callable[[], bool]) -> Run:

@@ -21,7 +21,8 @@ from runner.sweep.local import Workers
 from runner.sweep.model import Sweep
 from runner.sweep.readings import Curve, value_of
 from runner.sweep.search import Search, bounds
-from runner.sweep.task import Result, Task, is_over, result_of
+from runner.sweep.state import is_over
+from runner.sweep.task import Result, Task, result_of
 
 INTERRUPTED: Final = "interrupted"
 WAIT_SECONDS: Final = 0.2

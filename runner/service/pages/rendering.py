@@ -14,7 +14,6 @@ import jinja2
 from fastapi import Request, Response
 
 from runner import amounts
-from runner.export.report import TEMPLATES as REPORT
 from runner.service.pages import static
 
 TEMPLATES: Final = files("runner.service.pages") / "templates"
@@ -76,7 +75,7 @@ def link(path: str, values: Mapping[str, Any]) -> str:
 
 
 def _source(name: str) -> str | None:
-    for folder in (TEMPLATES, REPORT):
+    for folder in (TEMPLATES, static.REPORT):
         if (folder / name).is_file():
             return (folder / name).read_text("utf-8")
     return None

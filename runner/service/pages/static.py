@@ -18,11 +18,12 @@ from fastapi import APIRouter, Request, Response
 
 from runner.errors import RunnerError
 from runner.export import svg, svg_maps
-from runner.export.report import TEMPLATES as REPORT
 
 router = APIRouter(include_in_schema=False)
 
 FOLDER: Final = files("runner.service.pages") / "static"
+REPORT: Final = files("runner.export") / "templates"
+"""Of reports, whose code is not imported for it: it brings Numba along, and its memory."""
 UPLOT: Final = "vendor/uplot-1.6.32"
 _TYPES: Final = {
     "css": "text/css",
