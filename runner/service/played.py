@@ -105,13 +105,24 @@ def spot(run: Any, at: tuple[int, ...]) -> bytes:
 
 
 def sweep(name: str, recordings: Path) -> bytes:
-    """Return what came of a sweep, as JSON: sections as `dualtaxi sweep show` prints them, and the trials."""
+    """Return what came of a sweep, as JSON: sections as `dualtaxi sweep show` prints them, pictures, runs."""
+    from runner.errors import RunnerError
+    from runner.sweep.figure import parallel_svg, parameter_svgs
+    from runner.sweep.plots import picture_of
     from runner.sweep.results import results_of, sections
     from runner.sweep.state import read_sweep
 
     results = results_of(read_sweep(name, recordings), recordings)
+    pictures, note = [], ""
+    try:
+        picture = picture_of(results)
+        pictures, note = [*parameter_svgs(picture), parallel_svg(picture)], picture.footnote
+    except RunnerError:  # no trial is finished yet, as the sections say
+        pass
     told = {
         "sections": [asdict(section) for section in sections(results, None)],
+        "pictures": pictures,
+        "note": note,
         "runs": {entry.number: list(entry.runs.values()) for entry in results.ranking},
         "best": results.best_yaml,
         "parameters": list(results.sweep.file.parameters),

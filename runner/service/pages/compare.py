@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Sequence
 from typing import Annotated, Any, Final
@@ -17,7 +16,7 @@ from runner.service import played
 from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
 from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, state_of
-from runner.service.pages.rendering import link, page
+from runner.service.pages.rendering import link, page, picture_address
 from runner.service.pages.run import head_of, parse_spot
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
@@ -76,8 +75,7 @@ async def tables(
     told = (await _difference(found, kept, apart))["tables"]
     for figure in told["figures"]:
         if "high" not in figure:  # Matplotlib writes styles into its elements, which the policy forbids here
-            data = base64.b64encode(_standing_alone(figure["svg"]).encode()).decode()
-            figure["address"] = f"data:image/svg+xml;base64,{data}"
+            figure["address"] = picture_address(figure["svg"])
     return page(request, "compare_tables.html", **_head(found, "/tables"), told=told)
 
 
@@ -228,9 +226,3 @@ def _still(run: Run) -> str:
     nowhere = np.zeros((len(scene["things"]), 3), np.int16)
     picture = svg.Drawing(scene).frame(nowhere, f"The grid of {run.name}", style="")
     return picture.replace("<style></style>", "")
-
-
-def _standing_alone(picture: str) -> str:
-    """Return an SVG of a page as a file of its own, which has no variables of the page's to look up."""
-    space = "" if "xmlns=" in picture[:300] else ' xmlns="http://www.w3.org/2000/svg"'
-    return picture.replace("<svg", f"<svg{space}", 1)

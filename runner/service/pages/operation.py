@@ -18,7 +18,7 @@ from runner.errors import RunnerError, RunNotFound
 from runner.service import played
 from runner.service.api.jobs import Number, queue_told, told
 from runner.service.dependencies import ApartOf, CatalogueOf, JobsOf, KeptOf, SettingsOf
-from runner.service.pages.rendering import page
+from runner.service.pages.rendering import page, picture_address
 from runner.sweep.state import read_sweep, sweeps_in, tag_of
 
 if TYPE_CHECKING:
@@ -129,7 +129,10 @@ async def sweep(
     key = ("sweep", name, folder)
     body = await kept.awaited(key, lambda: apart(played.sweep, name, folder), SWEEP_SECONDS)
     made_by = [job.number for job in jobs.queue.jobs() if job.kind == "sweep" and job.name == name]
-    return page(request, "sweep.html", name=name, told=json.loads(body), jobs=made_by[-1:], tag=tag_of(name))
+    found = json.loads(body)
+    pictures = [picture_address(picture) for picture in found["pictures"]]
+    shown = {"told": found, "pictures": pictures, "jobs": made_by[-1:], "tag": tag_of(name)}
+    return page(request, "sweep.html", name=name, **shown)
 
 
 @router.get("/disk")

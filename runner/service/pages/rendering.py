@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import functools
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -72,6 +73,13 @@ def link(path: str, values: Mapping[str, Any]) -> str:
     """Return an address with these values, without those that are empty."""
     kept = [(key, value) for key, value in values.items() if value not in ("", None, [], ())]
     return f"{path}?{urlencode(kept, doseq=True)}" if kept else path
+
+
+def picture_address(picture: str) -> str:
+    """Return an SVG of a page as the address of a picture, in which styles are its own."""
+    space = "" if "xmlns=" in picture[:300] else ' xmlns="http://www.w3.org/2000/svg"'
+    body = picture.replace("<svg", f"<svg{space}", 1).encode()
+    return f"data:image/svg+xml;base64,{base64.b64encode(body).decode()}"
 
 
 def _source(name: str) -> str | None:

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
+import runner
 from runner.export.svg import Drawing, transform
 from runner.recording.reader import open_recording
 from runner.runs import find_run
@@ -111,7 +113,7 @@ def page(browser, served):
     assert {address for address in asked if address.startswith(("http", "ws"))} <= {served}
 
 
-def wait(browser, done, seconds=60):
+def wait(browser, done, seconds=180):
     return WebDriverWait(browser, seconds, poll_frequency=0.1).until(lambda _: done())
 
 
@@ -152,6 +154,24 @@ def test_metrics_are_drawn_and_zoomed_and_the_address_says_so(page):
     wait(browser, lambda: "from=10&to=40" in browser.current_url)
     browser.refresh()
     assert browser.find_element(By.NAME, "to").get_attribute("value") == "40"
+
+
+def test_thinned_curves_say_so_and_are_read_again_where_one_zooms(page, folder):
+    runner.run(
+        {"name": "long", "episodes": 400, "log": {"every_steps": 20}, "evaluation": {"every": 0}},
+        recordings=folder,
+    )
+    browser = page("/runs/long")
+    wait(browser, lambda: "Thinned: of up to" in text_of(browser, "[data-said]"))
+    assert "thinned" in text_of(browser, ".plots figcaption")
+    plot = browser.find_element(By.CSS_SELECTOR, ".u-over")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", plot)
+    drag = ActionChains(browser).move_to_element_with_offset(plot, -40, 0).click_and_hold()
+    drag.move_by_offset(2, 0).move_by_offset(10, 0).release().perform()
+    wait(browser, lambda: "Every recorded point" in text_of(browser, "[data-said]"))
+    assert "from=" in browser.current_url
+    ActionChains(browser).double_click(browser.find_element(By.CSS_SELECTOR, ".u-over")).perform()
+    wait(browser, lambda: "Thinned" in text_of(browser, "[data-said]"))
 
 
 @pytest.mark.parametrize(("address", "phase", "number"), [("train/7", "train", 7), ("train/59", "train", 59)])

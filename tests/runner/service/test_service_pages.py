@@ -6,6 +6,9 @@ import re
 
 import pytest
 
+from runner.recording.reader import open_recording
+from runner.runs import find_run
+from runner.words import states_in_words
 from tests.runner.export.outline import Outline
 
 SAYS_HTML = {"Accept": "text/html"}
@@ -13,14 +16,15 @@ SAYS_HTML = {"Accept": "text/html"}
 
 def page_of(client, address, status=200):
     answer = client.get(address, headers=SAYS_HTML)
-    assert answer.status_code == status, answer.text
+    assert answer.status_code == status, (address, answer.text)
     assert answer.headers["content-type"].startswith("text/html")
     outline = Outline()
     outline.feed(answer.text)
     assert outline.open == []
     assert len(outline.ids) == len(set(outline.ids))
     assert not re.search(r"<style|\sstyle=|\son\w+=|<script(?![^>]*\ssrc=)|javascript:", answer.text)
-    assert all(address[:1] in ("/", "#", "?") for address in outline.addresses), outline.addresses
+    own = ("/", "#", "?", "data:image/svg+xml;base64,")
+    assert [other for other in outline.addresses if not other.startswith(own)] == [], address
     return answer.text
 
 
@@ -65,3 +69,116 @@ def test_a_runs_name_cannot_break_out(client, recordings):
     page = page_of(client, "/runs?columns=id,name,note")
     assert "&lt;script&gt;alert(1)" in page
     assert "<img src=x" not in page
+
+
+PAGES = (
+    "/runs/first",
+    "/runs/first/replay",
+    "/runs/first/replay/train/3?t=5",
+    "/runs/first/replay/eval/60/2",
+    "/runs/first/episodes",
+    "/runs/first/episodes?phase=eval&page=2",
+    "/runs/first/evaluations",
+    "/runs/first/learned",
+    "/runs/first/config",
+    "/runs/first/rerun?at=3:2",
+    "/runs/first/rerun/frame?at=3:2",
+    "/compare?run=first&run=second",
+    "/compare/divergence?run=first&run=second",
+    "/compare/replay?run=first&run=second",
+    "/compare/replay?run=first&run=second&at=eval:60:0:1",
+    "/compare/tables?run=first&run=second",
+    "/sweeps",
+    "/queue",
+    "/submit",
+    "/submit?from=first",
+    "/submit?sweep=true",
+    "/disk",
+)
+
+
+def test_every_page_is_well_formed_and_says_nothing_inline(client):
+    for address in PAGES:
+        page_of(client, address)
+
+
+MISSING = [
+    ("/runs/nothing", 404, "no run"),
+    ("/runs/first/replay/train/60", 404, "there are 60, from 0"),
+    ("/runs/first/replay/eval/7/0", 404, "the nearest after 10"),
+    ("/runs/first/rerun?at=1", 400, "expected EPISODE:T"),
+    ("/compare?run=first", 400, "expected 2 to 12"),
+    ("/compare/replay?run=first&run=second&at=eval:60", 400, "expected EPISODE:T"),
+    ("/sweeps/nothing", 404, "no sweep"),
+    ("/queue/9", 404, "no job 9"),
+]
+
+
+def test_what_is_not_there_is_told(client):
+    for address, status, told in MISSING:
+        assert told in page_of(client, address, status)
+
+
+def test_only_the_frame_of_the_viewer_may_compile(client):
+    assert "wasm" not in client.get("/runs/first").headers["content-security-policy"]
+    policy = client.get("/runs/first/rerun/frame").headers["content-security-policy"]
+    assert "script-src 'self' 'wasm-unsafe-eval';" in policy
+    assert "unsafe-inline" not in policy
+
+
+def test_the_parts_of_an_episode_are_the_recorded_steps(client, recordings):
+    with open_recording(find_run("first", recordings).recording) as recording:
+        steps = recording.episode_steps("train", 2)
+        words = states_in_words(recording.mdp)
+    whole = client.get("/api/v1/runs/first/replay/train/2?steps=2000").json()["episode"]
+    assert whole["length"] == len(steps)
+    assert whole["action"] == steps["action"].tolist()
+    for start in (0, 1, len(steps) // 2, len(steps) - 3):
+        part = client.get(f"/api/v1/runs/first/replay/train/2?start={start}&steps=101").json()["episode"]
+        first = max(0, start - 1)
+        assert part["first"] == first
+        assert part["before"] == (steps["rewards"][:first].sum(axis=0).tolist() if first else [])
+        assert part["action"] == whole["action"][first : first + 101]
+        assert part["values"][0]["taken"] == whole["values"][0]["taken"][first : first + 101]
+        told = [part["states"][i] for i in part["state"]][:-1]
+        assert told == words[steps["state"][first : first + 101]].tolist()
+
+
+def test_labels_are_changed_by_a_form(client):
+    fields = {"name": "renamed", "tags": "keep good", "note": "<b>bold</b>\r\nand more"}
+    assert client.post("/runs/first/labels", data=fields, follow_redirects=False).status_code == 303
+    page = page_of(client, "/runs/renamed")
+    assert "&lt;b&gt;bold&lt;/b&gt;\nand more" in page
+    assert "filter=tag:keep" in page
+    assert client.get("/api/v1/runs/renamed").json()["tags"] == ["good", "keep"]
+    answer = client.post("/runs/renamed/labels", data=fields | {"tags": "$$"}, headers=SAYS_HTML)
+    assert answer.status_code == 400
+    assert "expected 1 to 64 letters" in answer.text
+
+
+def test_mistakes_are_told_at_their_lines(client):
+    text = "name: mistaken\nepisodes: many\nepisode: 3\n"
+    answer = client.post("/submit", data={"text": text, "action": "submit"}, headers=SAYS_HTML)
+    assert answer.status_code == 422
+    assert 'data-line="2"' in answer.text
+    assert "<pre>episodes: many</pre>" in answer.text
+    assert 'data-line="3"' in answer.text
+    assert "episodes: many\nepisode: 3" in answer.text
+    assert client.get("/api/v1/jobs").json()["total"] == 0
+
+
+def test_a_form_of_another_site_is_refused(client):
+    for address in ("/submit", "/runs/first/labels", "/queue/1/cancel"):
+        answer = client.post(address, data={"text": "name: x"}, headers={"Origin": "http://evil.example"})
+        assert answer.status_code == 403
+
+
+def test_a_job_is_shown_and_cancelled(client):
+    text = "name: shown\nmode: cooperative\nepisodes: 1000000\n"
+    answer = client.post("/submit", data={"text": text}, headers=SAYS_HTML, follow_redirects=False)
+    assert answer.headers["location"] == "/queue/1"
+    assert "episodes: 1000000" in page_of(client, "/queue/1")
+    assert 'class="status' in page_of(client, "/queue")
+    assert client.post("/queue/1/cancel", follow_redirects=False).status_code == 303
+    assert "cancelled" in page_of(client, "/queue/1")
+    assert client.post("/queue/1/cancel", headers=SAYS_HTML).status_code == 409
