@@ -159,7 +159,7 @@ def environment_of(description: dict[str, Any], attachment: Callable[[str], byte
     if not names:
         raise RecordingError(
             f"{path}: has no transition table of {description.get('env_id')}, which is not tabular: it was "
-            "recorded from a loop over it."
+            "recorded from a loop over it; `dualtaxi view` shows what was recorded."
         )
     arrays: dict[str, NDArray[Any]] = {}
     for name in names:

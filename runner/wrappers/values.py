@@ -125,10 +125,7 @@ def lone_number(value: Any, what: str) -> float:
     Raises:
         RecordingError: it is none.
     """
-    array = np.asarray(value)
-    if array.size != 1 or array.dtype.kind not in "iubf":
-        raise RecordingError(f"found the {what} {value!r}, expected a number.")
-    return float(array.reshape(()))
+    return float(_lone(value, what, "iubf", "a number"))
 
 
 def whole_number(value: Any, what: str) -> int:
@@ -137,7 +134,11 @@ def whole_number(value: Any, what: str) -> int:
     Raises:
         RecordingError: it is none.
     """
+    return int(_lone(value, what, "iub", "a whole number of its Discrete space"))
+
+
+def _lone(value: Any, what: str, kinds: str, expected: str) -> Any:
     array = np.asarray(value)
-    if array.size != 1 or array.dtype.kind not in "iub":
-        raise RecordingError(f"found the {what} {value!r}, expected a whole number of its Discrete space.")
-    return int(array.reshape(()))
+    if array.size != 1 or array.dtype.kind not in kinds:
+        raise RecordingError(f"found the {what} {value!r}, expected {expected}.")
+    return array.reshape(())
