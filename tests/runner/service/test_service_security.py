@@ -8,14 +8,18 @@ import io
 import json
 import stat
 
+import httpx2
 import pytest
+from click.testing import CliRunner
+from serving import serving
 
+from runner.cli import cli
 from runner.errors import RunnerError
 from runner.service import logs
 from runner.service.app import create_app
 from runner.service.guard import POLICY
 from runner.service.security import READ, WRITE, Tokens, is_allowed_host, is_same_origin
-from runner.service.settings import Limits
+from runner.service.settings import Limits, tokens_file
 
 RUNS, RUN = "/api/v1/runs", "/api/v1/runs/first"
 OWN = {"Origin": "http://localhost"}
@@ -223,3 +227,39 @@ def test_ready_is_told_with_what_is_missing(client, recordings):
     answer = client.get("/readyz")
     assert answer.status_code == 503
     assert not answer.json()["checks"]["recordings_can_be_written"]
+
+
+def test_tokens_are_made_listed_and_revoked_by_the_command(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+
+    def said(*words):
+        return CliRunner().invoke(cli, ["token", *words])
+
+    secret = said("create", "laptop").stdout.strip()
+    writes = json.loads(said("create", "pusher", "--scope", "write", "--json").stdout)
+    kept = Tokens(tokens_file())
+    assert kept.scopes_of(secret) == (READ,)
+    assert kept.scopes_of(writes["token"]) == (READ, WRITE)
+    listed = json.loads(said("ls", "--json").stdout)
+    assert [token["name"] for token in listed] == ["laptop", "pusher"]
+    assert secret not in said("ls").stdout
+    assert said("revoke", "nobody").exit_code == 2
+    assert said("revoke", "laptop").exit_code == 0
+    assert kept.scopes_of(secret) is None
+
+
+def test_a_proxy_that_is_believed_tells_who_asks_and_how(recordings, tmp_path):
+    tokens = Tokens(tmp_path / "dualtaxi" / "tokens.json")
+    _, secret = tokens.create("laptop", (READ,))
+    words = ("--require-token", "--allow-host", "Runs.example.org", "--proxy", "127.0.0.1")
+    said = {"Host": "runs.example.org", "Origin": "https://runs.example.org"}
+    said |= {"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.7"}
+    with serving(recordings, *words, environment={"XDG_CONFIG_HOME": str(tmp_path)}) as served:
+        assert httpx2.get(f"{served.url}api/v1/runs").status_code == 401
+        entered = httpx2.post(f"{served.url}login", data={"token": secret}, headers=said)
+        for _ in range(10):
+            httpx2.get(f"{served.url}api/v1/runs", headers=said | _bearer("wrong"))
+        assert httpx2.get(f"{served.url}api/v1/runs", headers=said | _bearer(secret)).status_code == 429
+        assert httpx2.get(f"{served.url}api/v1/runs", headers=_bearer(secret)).status_code == 200
+    assert entered.status_code == 303
+    assert "Secure" in entered.headers["set-cookie"]
