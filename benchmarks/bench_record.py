@@ -111,6 +111,7 @@ def _times(work: Callable[[], object]) -> tuple[float, float]:
 def _against_minari(name: str, kind: str, folder: Path, steps: int, repetitions: int) -> list[Figure]:
     """Return how many times less recording costs than Minari's collector, to the file's end."""
     try:
+        import jax.tree_util  # noqa: F401 - the collector imports it with its first step
         import minari
     except ImportError:
         return []
