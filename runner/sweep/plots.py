@@ -11,6 +11,7 @@ from typing import Any
 
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.series import Group, read_series
+from runner.archive.places import at_hand
 from runner.errors import RunnerError
 from runner.export.plots import Panel, panels_of
 from runner.recording.reader import open_recording
@@ -111,7 +112,7 @@ def panel_of(objective: str, panels: Sequence[Panel]) -> Panel:
 def _group(told: str, entry: Ranked, recordings: Path) -> Group:
     series = []
     for run_id in entry.runs.values():
-        with open_recording(find_run(run_id, recordings).recording) as recording:
+        with open_recording(at_hand(find_run(run_id, recordings)).recording) as recording:
             series.append(read_series(recording))
     values = ", ".join(f"{path} {spoken(value)}" for path, value in entry.values.items())
     return Group(f"{told}, trial {entry.number}: {values}", tuple(series))

@@ -143,8 +143,8 @@ def held(name: str, recordings: Path) -> Iterator[None]:
 
 
 def is_over(run: Run) -> bool:
-    """Return whether there is nothing left to do for a run of a sweep."""
-    return run.status == "finished" or PRUNED in run.tags
+    """Return whether there is nothing left to do for a run of a sweep; it may be archived."""
+    return run.facts["status"] == "finished" or PRUNED in run.tags
 
 
 def runs_of(name: str, recordings: Path) -> dict[str, Run]:

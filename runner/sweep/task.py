@@ -12,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
+from runner.archive.places import at_hand
 from runner.config import from_mapping
 from runner.errors import RunnerError
 from runner.execution import Progress, run_job
@@ -114,7 +115,7 @@ def result_of(run: Run, objective: Objective) -> Result:
     Raises:
         RunnerError: its recording cannot be read, or the objective was never recorded.
     """
-    with open_recording(run.recording) as recording:
+    with open_recording(at_hand(run).recording) as recording:
         curve = curve_of(recording, objective.metric)
         size = recording.size
     return Result(

@@ -195,6 +195,8 @@ def show(
         )
     else:
         print_sections(sections(results, None if every else SHOWN), as_markdown)
+        if best is None and results.best is not None:
+            say(f"--best FILE writes the configuration of trial {results.best.number}, ready to run.")
     if best is not None:
         if results.best_yaml is None:
             raise RunnerError(f"the sweep {name!r} has no finished trial yet, so there is no best one.")

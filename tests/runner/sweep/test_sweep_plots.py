@@ -6,11 +6,13 @@ import re
 
 import pytest
 from click.testing import CliRunner
-from sweeping import described, digests, swept
+from sweeping import Here, described, digests, swept
 
+from runner.archive.runs import archive_run
 from runner.cli import cli
 from runner.config import from_mapping
 from runner.errors import RunnerError
+from runner.runs import list_runs
 from runner.sweep import state
 from runner.sweep.loading import from_values
 from runner.sweep.plots import learning, panel_of, picture_of
@@ -116,3 +118,18 @@ def test_a_level_never_reached_is_left_out_of_the_picture(tmp_path):
     assert len(digests(trials)) == 3
     with pytest.raises(RunnerError, match="nothing to draw"):
         picture_of(results_of(sweep, tmp_path))
+
+
+def test_a_sweep_whose_runs_are_archived_is_still_all_there(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    sweep, folder = from_values(described(strategy="random", trials=2, seeds=[0])), tmp_path / "runs"
+    before, _ = swept(folder, sweep)
+    for run in list_runs(folder):
+        archive_run(run, str(tmp_path / "archive"), remove=True)
+    assert {run.status for run in list_runs(folder)} == {"archived"}
+    results = results_of(sweep, folder)
+    assert results.best.value == before.best().value
+    assert len(learning(results, folder)[0]) == 2
+    nobody = Here()
+    again, _ = swept(folder, sweep, nobody)
+    assert (nobody.done, digests(again)) == (0, digests(before))
