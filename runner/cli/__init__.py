@@ -64,6 +64,8 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Hand on": {
         "pack": ("runner.cli.commands.pack", "Put a run into one file, to hand to a colleague."),
         "unpack": ("runner.cli.commands.unpack", "Take a run out of the file that `pack` wrote."),
+        "push": ("runner.cli.commands.push", "Send runs to a server."),
+        "pull": ("runner.cli.commands.pull", "Bring a run from a server."),
     },
     "Serve": {
         "serve": ("runner.cli.commands.serve", "Open the runs to browsers and programs, over HTTP."),

@@ -86,6 +86,26 @@ set_option: Final = click.option(
 )
 
 
+token_option: Final = click.option(
+    "--token", metavar="TOKEN", help="Lets one in.  [default: $DUALTAXI_TOKEN, or of $DUALTAXI_TOKEN_FILE]"
+)
+
+token_file_option: Final = click.option(
+    "--token-file",
+    type=click.Path(dir_okay=False, path_type=Path),
+    metavar="FILE",
+    help="A file with the token; unlike --token, no other user can see it.",
+)
+
+
+server_option: Final = click.option(
+    "--server",
+    metavar="URL",
+    envvar="DUALTAXI_SERVER",
+    help="The server, such as http://localhost:8000.  [default: $DUALTAXI_SERVER]",
+)
+
+
 def find(name: str, recordings: Path | None) -> Any:
     """Return the run of a name, or of a path, in the chosen folder."""
     from runner.catalogue.finding import find_run

@@ -97,6 +97,29 @@ def facts_in_words(progress: Progress, speed: float | None) -> str:
 
 
 @contextlib.contextmanager
+def bytes_line(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Give what is told the bytes done and their number: a line of them, where there is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda _, __: None
+        return
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    columns = (
+        rich_progress.TextColumn(label, markup=False),
+        rich_progress.BarColumn(bar_width=BAR_WIDTH),
+        rich_progress.DownloadColumn(),
+        rich_progress.TransferSpeedColumn(),
+        rich_progress.TimeRemainingColumn(compact=True),
+    )
+    with rich_progress.Progress(
+        *columns, console=Console(stderr=True), transient=True, refresh_per_second=REDRAWS_A_SECOND
+    ) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+@contextlib.contextmanager
 def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """Give what is called with how many are done: it keeps a line up to date, where there is a terminal."""
     if not sys.stderr.isatty():

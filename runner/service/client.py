@@ -11,10 +11,8 @@ What was sent before a connection broke is not sent again; the same run pushed t
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
@@ -25,18 +23,19 @@ from blake3 import blake3
 from runner.errors import MissingExtra, RunnerError
 from runner.runs import Run
 from runner.service import watching
+from runner.service.address import checked_url
+from runner.service.parcel import Parcel, Sent, ServerAway, ServerError
 from runner.service.watching import Happened, JobThere
 
 if TYPE_CHECKING:
     import httpx2
 
-TOKEN_VARIABLE: Final = "DUALTAXI_TOKEN"
-TOKEN_FILE_VARIABLE: Final = "DUALTAXI_TOKEN_FILE"
+    from runner.packing.admission import Admitted
+
 API: Final = "/api/v1"
 PIECE: Final = 32 << 20
 """So much is sent in one request; a proxy in front of the server must let it pass."""
 _READ: Final = 1 << 20
-_MAX_TOKEN_FILE: Final = 4096
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 5.0
 _WAIT_SECONDS: Final = 20
 _PASSING: Final = (408, 429, 500, 502, 503, 504, 507)
@@ -44,67 +43,6 @@ _PASSING: Final = (408, 429, 500, 502, 503, 504, 507)
 
 Report = Callable[[int, int], object]
 """Told how many bytes of how many are there."""
-
-
-class ServerError(RunnerError):
-    """A server refuses what was asked of it; its own words stand in the message."""
-
-    exit_code = 1
-
-    def __init__(self, message: str, status: int = 0) -> None:
-        super().__init__(message)
-        self.status = status
-
-
-class ServerAway(ServerError):
-    """A server does not answer, or cannot do what was asked at present."""
-
-
-@dataclass(frozen=True)
-class Parcel:
-    """What is sent: a file, and what its sender says of the run in it."""
-
-    path: Path
-    name: str = ""
-    run_id: str = ""
-    content_digest: str | None = None
-    run: Mapping[str, Any] = field(default_factory=dict)
-    labels: Mapping[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, run: Run) -> Parcel:
-        """Return a run that is over, to be sent.
-
-        Raises:
-            RunnerError: it is running, or in an archive alone.
-        """
-        if run.status not in ("finished", "interrupted", "failed"):
-            raise RunnerError(
-                f"run {run.run_id} is {run.status}; only one that is over and here can be pushed."
-            )
-        summary, labels = run.summary, run.labels
-        told = {"name": str(run.facts["name"]), "status": run.status, "proof": run.facts.get("proof")}
-        told |= {key: summary.get(key) for key in ("seconds", "error")}
-        return cls(
-            run.recording,
-            run.name,
-            run.run_id,
-            summary.get("content_digest"),
-            {key: value for key, value in told.items() if value is not None},
-            {"name": labels.name, "tags": list(labels.tags), "note": labels.note},
-        )
-
-
-@dataclass(frozen=True)
-class Sent:
-    """An upload as the server says it stands."""
-
-    id: str
-    state: str
-    offset: int
-    run_id: str = ""
-    already: bool = False
-    problem: str = ""
 
 
 class Client:
@@ -122,7 +60,7 @@ class Client:
 
     def __init__(self, url: str, token: str | None = None, patience: float = 60.0) -> None:
         self.url = checked_url(url)
-        self._patience = patience
+        self.patience = patience
         try:
             import httpx2
         except ImportError as error:
@@ -167,7 +105,7 @@ class Client:
 
     def watch(self, number: int) -> Iterator[Happened]:
         """Yield what happens to a job until it is over, as `watching.watch` does; it says what is raised."""
-        return watching.watch(self, number, self._patience)
+        return watching.watch(self, number, self.patience)
 
     def cancel(self, number: int) -> JobThere:
         """Have a job not be done, or stopped; what it has recorded is kept. Errors as of `ask`."""
@@ -185,8 +123,7 @@ class Client:
             with self._http.stream("GET", path, headers=dict(headers)) as answer:
                 if not answer.is_success:
                     answer.read()
-                    kind = ServerAway if answer.status_code in _PASSING else ServerError
-                    raise kind(f"{self.url}: {_message(answer)}", answer.status_code)
+                self._check(answer)
                 yield answer
         except self._errors as error:
             raise ServerAway(f"{self.url}: does not answer ({error or type(error).__name__}).") from error
@@ -209,9 +146,9 @@ class Client:
         if isinstance(parcel, Run):
             parcel = Parcel.of(parcel)
         size, digest = _size_and_digest(parcel.path)
-        sent = _Delivery(self, parcel, size, digest, report, begun).done(self._patience)
+        sent = _Delivery(self, parcel, size, digest, report, begun).done(self.patience)
         if sent.state == "refused" and begun is not None:  # the file has become another since it began
-            sent = _Delivery(self, parcel, size, digest, report, None).done(self._patience)
+            sent = _Delivery(self, parcel, size, digest, report, None).done(self.patience)
         if sent.state == "refused":
             raise ServerError(f"{self.url}: refused the run {parcel.run_id}: {sent.problem}")
         return sent
@@ -259,6 +196,43 @@ class Client:
         told = {"digest": digest, "size": size, "run": dict(parcel.run), "labels": dict(parcel.labels)}
         return _sent(self.ask("POST", f"/uploads/{sent.id}/complete", json=told))
 
+    def give_up(self, sent: Sent) -> None:
+        """Have an upload forgotten.
+
+        Raises:
+            ServerError: the server refuses, or is away.
+        """
+        self.ask("DELETE", f"/uploads/{sent.id}")
+
+    # --- pulling --------------------------------------------------------------------------------------
+
+    def pull(self, name: str, recordings: Path, report: Report = lambda *_: None) -> Admitted:
+        """Bring a run into a folder of runs, as `pulling.pull` does; it says what is raised."""
+        from runner.service.pulling import pull
+
+        return pull(self, name, recordings, report)
+
+    def download(self, path: str, tag: str, offset: int, size: int) -> Iterator[bytes]:
+        """Yield what a file has behind an offset.
+
+        Args:
+            path: where it is.
+            tag: its ETag.
+            offset: where to begin.
+            size: its bytes, all of them.
+
+        Raises:
+            ServerError: it is another file by now, or the server is away.
+        """
+        headers = {"Range": f"bytes={offset}-", "If-Range": tag, "Accept-Encoding": "identity"}
+        with self.stream(path, headers) as answer:
+            begins = f"bytes {offset}-{size - 1}/{size}"
+            if answer.headers.get("content-range") != begins:
+                raise ServerError(f"{self.url}: the recording has become another meanwhile; pull it again.")
+            yield from answer.iter_raw(_READ)
+
+    # --- both -----------------------------------------------------------------------------------------
+
     def ask(self, method: str, path: str, **request: Any) -> httpx2.Response:
         """Return the answer to a request, which is no error.
 
@@ -269,10 +243,37 @@ class Client:
             answer = self._http.request(method, path, **request)
         except self._errors as error:
             raise ServerAway(f"{self.url}: does not answer ({error or type(error).__name__}).") from error
+        self._check(answer)
+        return answer
+
+    def _check(self, answer: httpx2.Response) -> None:
         if answer.is_success:
-            return answer
+            return
         kind = ServerAway if answer.status_code in _PASSING else ServerError
         raise kind(f"{self.url}: {_message(answer)}", answer.status_code)
+
+
+class Patience:
+    """Waits ever longer while nothing moves, and has an end.
+
+    Args:
+        seconds: how long nothing may move.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self.moved()
+
+    def moved(self) -> None:
+        """Say that something moved."""
+        self._moved, self._pause = time.monotonic(), _FIRST_PAUSE
+
+    def wait(self, error: ServerError) -> None:
+        """Wait a while after an error; raise it when there was enough of that."""
+        if time.monotonic() + self._pause > self._moved + self._seconds:
+            raise error
+        time.sleep(self._pause)
+        self._pause = min(2 * self._pause, _LONGEST_PAUSE)
 
 
 class _Delivery:
@@ -292,23 +293,23 @@ class _Delivery:
         Raises:
             ServerError: the server refuses the request, or was away for longer than the patience.
         """
-        furthest, moved, pause = -1, time.monotonic(), _FIRST_PAUSE
+        furthest, patient = -1, Patience(patience)
         while True:
             try:
                 sent = self._sent = self._step()
                 self._is_stale = False
             except ServerError as error:
-                if not _may_pass(error) or time.monotonic() + pause > moved + patience:
+                if not _may_pass(error):
                     raise
+                patient.wait(error)
                 self._sent = None if error.status == HTTPStatus.NOT_FOUND else self._sent
                 self._is_stale = True
-                time.sleep(pause)
-                pause = min(2 * pause, _LONGEST_PAUSE)
                 continue
             if sent.state in ("stored", "refused"):
                 return sent
             if sent.offset > furthest:
-                furthest, moved, pause = sent.offset, time.monotonic(), _FIRST_PAUSE
+                furthest = sent.offset
+                patient.moved()
             self._report(sent.offset, self._size)
 
     def _step(self) -> Sent:
@@ -320,6 +321,9 @@ class _Delivery:
             return client.standing(sent)
         if sent.state == "verifying":
             return self._verified(client.standing(sent, _WAIT_SECONDS))
+        if sent.offset > self._size:  # the file became shorter, as one does whose disk was full
+            client.give_up(sent)
+            return client.begin(digest=self._digest, size=self._size)
         if sent.offset < self._size:
             return client.append(sent, parcel.path, self._size)
         return client.complete(sent, parcel, self._size, self._digest)
@@ -333,52 +337,6 @@ class _Delivery:
 
 def _may_pass(error: ServerError) -> bool:
     return isinstance(error, ServerAway) or error.status in (HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
-
-
-def checked_url(url: str) -> str:
-    """Return the address of a server, without a slash at its end.
-
-    Raises:
-        RunnerError: it is none.
-    """
-    parts = urlsplit(url)
-    if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
-        raise RunnerError(f"server: found {url!r}, expected an address such as http://localhost:8000.")
-    if parts.username is not None or parts.password is not None:
-        raise RunnerError(
-            f"server: found a name or password in the address of {parts.hostname}, expected none: a token is "
-            f"given by --token, ${TOKEN_VARIABLE} or a file named by ${TOKEN_FILE_VARIABLE}."
-        )
-    return url.rstrip("/")
-
-
-def found_token(said: str | None = None, file: Path | None = None) -> str | None:
-    """Return a token: what is said, or in a file; else what the variables say; None if there is none.
-
-    Raises:
-        RunnerError: it is none, or its file cannot be read.
-    """
-    if said is None and file is None:
-        said, named = os.environ.get(TOKEN_VARIABLE), os.environ.get(TOKEN_FILE_VARIABLE)
-        file = Path(named) if named else None
-    if said:
-        return _checked_token(said, "token")
-    return None if file is None else _checked_token(_beginning_of(file), os.fspath(file))
-
-
-def _beginning_of(file: Path) -> str:
-    try:
-        with file.open(encoding="utf-8") as stream:
-            return stream.read(_MAX_TOKEN_FILE)
-    except (OSError, ValueError) as error:
-        raise RunnerError(f"{file}: cannot be read, expected a file with a token.") from error
-
-
-def _checked_token(text: str, where: str) -> str:
-    token = text.strip()
-    if not token or not token.isascii() or not token.isprintable() or " " in token:
-        raise RunnerError(f"{where}: found no token, expected one line of letters and digits.")
-    return token
 
 
 def _size_and_digest(path: Path) -> tuple[int, str]:

@@ -139,7 +139,8 @@ class Uploads:
                 self._forget_old()
             known = self._known(owner, announced)
             if known is not None:
-                return known, False
+                stored = known.state == "stored"
+                return known.model_copy(update={"already": True}) if stored else known, False
             run_id = self._stored_as(announced)
             if not run_id:
                 self._check_room(announced.size)

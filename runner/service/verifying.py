@@ -190,7 +190,7 @@ def _bound() -> None:
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
-        os.nice(10)
+        os.nice(5)
         resource.setrlimit(resource.RLIMIT_DATA, (MOST_MEMORY, MOST_MEMORY))
 
 

@@ -10,6 +10,7 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import RunnerError
+from runner.service.parcel import ServerAway
 from runner.service.queue import OVER
 
 if TYPE_CHECKING:
@@ -77,8 +78,6 @@ def watch(client: Client, number: int, patience: float) -> Iterator[Happened]:
         ServerError: there is no such job, or the server refuses.
         ServerAway: the server did not answer for too long.
     """
-    from runner.service.client import ServerAway
-
     place, pause, away = "", _FIRST_PAUSE, 0.0
     while True:
         try:

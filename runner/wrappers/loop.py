@@ -28,6 +28,7 @@ from runner.recording.recorder import FLUSH_SECONDS, Recorder, storage_error
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.writer import RecordingFile
 from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder
+from runner.service.outbox import Follower, connected, is_server, outbox_folder
 from runner.wrappers.described import Described, as_json
 
 MADE_BY: Final = "runner.record"
@@ -132,6 +133,8 @@ class Loop(Generic[R]):
 
         config = plan.mapping(described)
         checked_name(plan.name)
+        client = connected(str(plan.recordings)) if is_server(plan.recordings) else None
+        folder = outbox_folder() if client else recordings_folder(plan.recordings)
         self._started = time.monotonic()
         self._make_rows = rows
         self._rows: dict[str, R] = {}
@@ -140,7 +143,7 @@ class Loop(Generic[R]):
         self.described = described
         self.plan = plan
         self.lock = threading.RLock()
-        self.run = new_run(recordings_folder(plan.recordings), config, plan.seed, config["name"])
+        self.run = new_run(folder, config, plan.seed, config["name"])
         self._topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
         path = self.run.folder / RECORDING_FILE
         try:
@@ -157,6 +160,7 @@ class Loop(Generic[R]):
             beat=self.run.beat,
             sizes=sizes_of(facts, str(path)),
         )
+        self._follower = Follower(client, self.run, lambda: self._file.size) if client else None
         self.closed = False
         self._process = os.getpid()
         self._stop = threading.Event()
@@ -354,11 +358,15 @@ class Loop(Generic[R]):
                     self._file.finish("result", _result("failed", {"error": str(failure)}))
                 with contextlib.suppress(StorageError):
                     self.run = self.run.update(status="failed", summary={"error": str(failure)})
+                if self._follower:
+                    self._follower.stop()
                 raise
             finally:
                 self.closed, self.active = True, None
                 self._file.close()
             self.run = self.run.update(status=status, summary=summary)
+        if self._follower:
+            self._follower.finish(self.run)
         return self.run
 
     def _finish(self, status: str, error: str) -> dict[str, Any]:

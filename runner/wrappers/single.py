@@ -186,7 +186,8 @@ def record(
 
     Args:
         env: a Gymnasium environment, wrapped or not; recorded is what passes here.
-        recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, unless given.
+        recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, unless given; or a server
+            (`http://localhost:8000`), to which the run is pushed while it is recorded and at its end.
         name: what the run is called; the environment's name unless given.
         seed: what the run is listed with; the seeds of resets are recorded beside.
         config: your own settings, to be shown, compared and searched by: what JSON can hold.

@@ -107,7 +107,8 @@ def test_the_same_bytes_are_the_same_upload_and_the_same_run(uploads, lake, tmp_
     assert uploads.begin(ANNA, announced(data)) == (first, False)
     assert uploads.begin(BEN, announced(data))[1], "another's upload is not handed out"
     done = send(uploads, data)
-    assert uploads.begin(ANNA, announced(data)) == (done, False)
+    known, new = uploads.begin(ANNA, announced(data))
+    assert (known.upload_id, known.already, new) == (done.upload_id, True, False)
     again = uploads.complete(done.upload_id, ANNA, completion(data))
     assert again == done
     others = send(uploads, data, BEN)

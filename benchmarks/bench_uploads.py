@@ -1,0 +1,177 @@
+"""Uploads into the service, over loopback: how quick, beside a plain copy; how much memory the server takes.
+
+Each repetition uploads the same bytes and copies the file, in turn, each until `fsync` has returned. The
+verification that follows is told by itself. For the memory, a large recording is uploaded, verified and read
+back while processes record loops and push them, all at once; every digest is compared at the end.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+from blake3 import blake3
+
+from benchmarks.figures import Figure, figure, seconds
+from benchmarks.processes import run, run_command
+from runner.runs import find_run
+from runner.service.client import Client
+from runner.service.parcel import Parcel
+from runner.verify import verify
+
+LOOP = """
+import sys, gymnasium, runner
+with runner.record(gymnasium.make("Taxi-v4"), sys.argv[1], name="loop", seed=int(sys.argv[2])) as rec:
+    rec.action_space.seed(int(sys.argv[2]))
+    rec.reset(seed=int(sys.argv[2]))
+    for _ in range(int(sys.argv[3])):
+        _, _, terminated, truncated, _ = rec.step(rec.action_space.sample())
+        if terminated or truncated:
+            rec.reset()
+print(rec.run.run_id, rec.run.summary["content_digest"])
+"""
+PROCESSES = 20
+
+
+def measure(quick: bool) -> list[Figure]:
+    """Return the speed of an upload, and the server's memory under load."""
+    megabytes, repetitions, steps = (100, 2, 20_000) if quick else (1000, 3, 100_000)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        recording = _large_recording(folder / "mine", megabytes)
+        with _served(folder / "theirs") as (url, server):
+            figures = _speed(recording, folder, url, repetitions)
+            return [*figures, *_memory(recording, folder, url, server, steps)]
+
+
+def _large_recording(folder: Path, megabytes: int) -> Parcel:
+    """Return a run that takes so much on disk: uncompressed, of steps at random."""
+    sets = ["recording.compression=none", f"episodes={megabytes * 30}", "epsilon=1"]
+    sets += ["evaluation.every=1000000", "snapshots.every=1000000"]
+    run(run_command("quick", str(folder), *sets))
+    return Parcel.of(find_run("@latest", folder))
+
+
+@contextlib.contextmanager
+def _served(recordings: Path) -> Iterator[tuple[str, psutil.Process]]:
+    """Give the address of a service and its process."""
+    command = [sys.executable, "-m", "runner", "serve", "--port", "0", "--recordings", str(recordings)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield process.stdout.readline().strip().rstrip("/"), psutil.Process(process.pid)
+        finally:
+            process.terminate()
+
+
+def _speed(parcel: Parcel, folder: Path, url: str, repetitions: int) -> list[Figure]:
+    size, uploaded, copied = parcel.path.stat().st_size, [], []
+    digest, begin = _digest(parcel.path), 0.0
+    with Client(url) as client:
+        for number in range(repetitions):
+            copied.append(size / seconds(lambda: _copy(parcel.path, folder / "copy")) / 1e6)
+            (folder / "copy").unlink()
+            begin = time.perf_counter()
+            sent = client.begin(size=size)
+            while sent.offset < size:
+                sent = client.append(sent, parcel.path, size)
+            last = number == repetitions - 1
+            sent = client.complete(sent, parcel, size, digest if last else "0" * 64)
+            uploaded.append(size / (time.perf_counter() - begin) / 1e6)
+            begin = time.perf_counter()
+            while sent.state == "verifying":
+                sent = client.standing(sent, 20)
+        assert sent.state == "stored", sent.problem
+    checked = size / (time.perf_counter() - begin) / 1e6
+    return [
+        figure(
+            f"upload until the last byte is stored, {size / 1e6:,.0f} MB",
+            uploaded,
+            "MB/s",
+            (100, 300),
+            detail="one client, on loopback; all but the last are then refused, for a wrong digest",
+        ),
+        figure("  a plain copy with fsync", copied, "MB/s"),
+        figure("  its verification, by another process", [checked], "MB/s"),
+    ]
+
+
+def _copy(source: Path, target: Path) -> None:
+    with source.open("rb") as reading, target.open("xb") as writing:
+        shutil.copyfileobj(reading, writing, 1 << 20)
+        writing.flush()
+        os.fsync(writing.fileno())
+
+
+def _digest(path: Path) -> str:
+    return blake3().update_mmap(path).hexdigest()
+
+
+def _memory(parcel: Parcel, folder: Path, url: str, server: psutil.Process, steps: int) -> list[Figure]:
+    """Return the server's memory while much is asked of it, and see that nothing was lost."""
+    shutil.rmtree(folder / "theirs" / parcel.run_id)
+    own, children, over = [], [], threading.Event()
+
+    def watch() -> None:
+        while not over.wait(0.1):
+            own.append(server.memory_info().rss / 1e6)
+            with contextlib.suppress(psutil.NoSuchProcess):
+                children.append(sum(child.memory_info().rss for child in server.children(True)) / 1e6)
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    begin = time.perf_counter()
+    told = _load(parcel, folder, url, steps)
+    took = time.perf_counter() - begin
+    over.set()
+    watcher.join()
+    for run_id, digest in told:
+        stored = find_run(run_id, folder / "theirs")
+        assert verify(stored.recording).content_digest == digest == stored.summary["content_digest"], run_id
+    early, late = max(own[: len(own) // 2]), max(own[len(own) // 2 :])
+    return [
+        figure(
+            f"server's memory, {PROCESSES} processes pushing",
+            [max(own)],
+            "MB",
+            (400, 250),
+            higher_is_better=False,
+            detail=f"with {parcel.path.stat().st_size / 1e6:,.0f} MB uploaded and read; {took:.0f} s; "
+            f"at most {early:.0f} MB in the first half and {late:.0f} MB in the second; "
+            f"its other processes at most {max(children):.0f} MB",
+        ),
+        figure("  runs recorded and pushed, digests equal", [len(told)], f"of {PROCESSES}"),
+    ]
+
+
+def _load(parcel: Parcel, folder: Path, url: str, steps: int) -> list[tuple[str, str]]:
+    """Record and push by many processes, upload and read a large recording; return the digests."""
+    with contextlib.ExitStack() as stack:
+        environment = os.environ | {"XDG_STATE_HOME": str(folder / "state")}
+        loops = [
+            stack.enter_context(
+                subprocess.Popen(
+                    [sys.executable, "-c", LOOP, url, str(seed), str(steps)],
+                    stdout=subprocess.PIPE,
+                    text=True,
+                    env=environment,
+                )
+            )
+            for seed in range(PROCESSES)
+        ]
+        with Client(url, patience=600) as client:
+            client.push(parcel)
+            pulled = client.pull(parcel.run_id, folder / "back")
+        assert pulled.content_digest == parcel.content_digest
+        told = [loop.communicate()[0].split() for loop in loops]
+    assert not list((folder / "state").rglob("recording.mcap")), "a run was left in the outbox"
+    return [(run_id, digest) for run_id, digest in told]

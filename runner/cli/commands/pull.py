@@ -1,0 +1,73 @@
+"""`dualtaxi pull`: a run from a server."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.options import (
+    json_option,
+    recordings_option,
+    server_option,
+    token_file_option,
+    token_option,
+)
+from runner.cli.output import draw, facts, print_json, say, size
+
+
+@click.command("pull")
+@click.argument("run_name", metavar="RUN")
+@server_option
+@token_option
+@token_file_option
+@recordings_option
+@json_option
+def command(
+    run_name: str,
+    server: str | None,
+    token: str | None,
+    token_file: Path | None,
+    recordings: Path | None,
+    as_json: bool,
+) -> None:
+    """Bring RUN from a server into the folder of runs, with its tags and note.
+
+    RUN is named as the server knows it: its id, the beginning of one, its name, or @latest. Every byte is
+    checked before the run appears; a run that is here already with the same content is left as it is.
+
+    \b
+    Examples:
+      dualtaxi pull @latest --server http://localhost:8000
+      dualtaxi pull k3v9m2xq --server https://runs.example.org --token-file ~/.dualtaxi-token
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.progress import bytes_line
+    from runner.runs import recordings_folder
+    from runner.service.address import found_token
+    from runner.service.client import Client
+
+    if not server:
+        raise click.UsageError("missing option '--server', such as --server http://localhost:8000.")
+    with (
+        Client(server, found_token(token, token_file)) as client,
+        bytes_line(f"pulling {run_name}") as report,
+    ):
+        pulled = client.pull(run_name, recordings_folder(recordings), report)
+    run = pulled.run
+    if pulled.already:
+        say(f"Run {run.run_id} is there already with this content; nothing was written.")
+    if as_json:
+        told = {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status}
+        told |= {"path": str(run.recording.absolute()), "already": pulled.already}
+        print_json(told | {"content_digest": pulled.content_digest})
+        return
+    draw(
+        facts(
+            {
+                "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
+                "digest": pulled.content_digest,
+                "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
+                "next": f"dualtaxi show {run.run_id}",
+            }
+        )
+    )

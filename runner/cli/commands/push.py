@@ -1,0 +1,139 @@
+"""`dualtaxi push`: runs to a server."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli.options import (
+    RunName,
+    find_recorded,
+    json_option,
+    recordings_option,
+    server_option,
+    token_file_option,
+    token_option,
+)
+from runner.cli.output import draw, print_json, say, size, table
+from runner.errors import RunnerError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from runner.runs import Run
+    from runner.service.client import Report
+    from runner.service.parcel import Sent
+
+    Push = Callable[[Report], tuple[Sent, str, int]]
+    """Pushes a run; returns what became of it, its name and its bytes."""
+
+
+@click.command("push")
+@click.argument("names", metavar="[RUN]...", nargs=-1, type=RunName())
+@server_option
+@token_option
+@token_file_option
+@click.option(
+    "--outbox", is_flag=True, help="Push what was recorded for a server and is still here, each to its own."
+)
+@recordings_option
+@json_option
+def command(
+    names: tuple[str, ...],
+    server: str | None,
+    token: str | None,
+    token_file: Path | None,
+    outbox: bool,
+    recordings: Path | None,
+    as_json: bool,
+) -> None:
+    """Send runs to a server, which lists them when it has verified every byte.
+
+    RUN may also be a file that `dualtaxi pack` wrote. What was sent before a connection broke is not sent
+    again, and a run that the server has already is left as it is. With --outbox, the runs that
+    `runner.record(env, "http://...")` could not send are sent now.
+
+    \b
+    Examples:
+      dualtaxi push @latest --server http://localhost:8000
+      dualtaxi push k3v9m2xq 7wd2qhmz --server https://runs.example.org --token-file ~/.dualtaxi-token
+      dualtaxi push --outbox
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.service.address import found_token
+
+    if bool(names) == outbox:
+        raise click.UsageError("expected either runs or --outbox.")
+    if names and not server:
+        raise click.UsageError("missing option '--server', such as --server http://localhost:8000.")
+    secret = found_token(token, token_file)
+    pushes = _outbox(server, secret) if outbox else _runs(names, str(server), secret, recordings)
+    results = [_outcome(name, push) for name, push in pushes]
+    stored = [result for result in results if result is not None]
+    if as_json:
+        print_json(stored)
+    else:
+        _draw(stored)
+    if len(stored) < len(results):
+        raise click.exceptions.Exit(1)
+
+
+def _runs(
+    names: tuple[str, ...], server: str, token: str | None, recordings: Path | None
+) -> Iterator[tuple[str, Push]]:
+    """Yield what is to be pushed, and what pushes it."""
+    from runner.packing.packing import SUFFIX
+    from runner.service.client import Client
+    from runner.service.parcel import Parcel
+
+    def push(name: str, report: Report) -> tuple[Sent, str, int]:
+        packed = name.endswith(SUFFIX)
+        parcel = Parcel(Path(name), Path(name).stem) if packed else Parcel.of(find_recorded(name, recordings))
+        sent = client.push(parcel, report)
+        return sent, parcel.name, parcel.path.stat().st_size
+
+    with Client(server, token) as client:
+        for name in names:
+            yield name, partial(push, name)
+
+
+def _outbox(server: str | None, token: str | None) -> Iterator[tuple[str, Push]]:
+    """Yield the runs in the outbox, and what pushes each."""
+    from runner.service.client import Client
+    from runner.service.outbox import deliver, outbox_folder, waiting
+
+    def push(run: Run, url: str, report: Report) -> tuple[Sent, str, int]:
+        size = run.recording.stat().st_size
+        with Client(url, token) as client:
+            return deliver(run, client, report), run.name, size
+
+    found = waiting(outbox_folder())
+    if not found:
+        say(f"The outbox {outbox_folder()} is empty; there is nothing to do.")
+    for run, url in found:
+        yield run.run_id, partial(push, run, server or url)
+
+
+def _outcome(name: str, push: Push) -> dict[str, Any] | None:
+    """Push, and return what came of it; None if it failed, which is said."""
+    from runner.cli.progress import bytes_line
+
+    try:
+        with bytes_line(f"pushing {name}") as report:
+            sent, called, bytes_ = push(report)
+    except RunnerError as error:
+        say(f"Error: {name}: {error}")
+        return None
+    return {"run_id": sent.run_id, "name": called, "bytes": bytes_, "already": sent.already}
+
+
+def _draw(stored: list[dict[str, Any]]) -> None:
+    if not stored:
+        return
+    drawn = table("run", "name", "size", "", left=("run", "name", ""))
+    for run in stored:
+        told = "was there already" if run["already"] else "stored"
+        drawn.add_row(run["run_id"], run["name"], size(run["bytes"]), told)
+    draw(drawn)

@@ -1,0 +1,380 @@
+"""Runs on their way to a server and back: commands, loops, crashes, servers that are killed or away."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import pytest
+from blake3 import blake3
+from click.testing import CliRunner
+from restarting import Server
+
+import runner
+from runner.cli import cli
+from runner.labels import change_labels
+from runner.packing.packing import pack
+from runner.recording.rewriting import rewrite
+from runner.runs import find_run, list_runs
+from runner.service import client as client_module
+from runner.service.address import checked_url, found_token
+from runner.service.client import Client
+from runner.service.outbox import outbox_folder
+from runner.service.parcel import Parcel, Sent, ServerAway, ServerError
+from tests.runner.recording.making import TAXIS, make_run
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    started = Server(tmp_path_factory.mktemp("server") / "runs")
+    started.start()
+    yield started
+    started.end()
+
+
+@pytest.fixture
+def own_server(tmp_path):
+    """Return a server that may be killed; it is not started yet."""
+    made = Server(tmp_path / "server" / "runs")
+    made.recordings.parent.mkdir()
+    yield made
+    made.end(signal.SIGKILL)
+
+
+@pytest.fixture(autouse=True)
+def outbox(tmp_path, monkeypatch):
+    for name in ("DUALTAXI_TOKEN", "DUALTAXI_TOKEN_FILE", "DUALTAXI_SERVER"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return outbox_folder()
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Return a folder of two small runs, `first` and `second`."""
+    folder = tmp_path_factory.mktemp("small")
+    for seed, name in enumerate(("first", "second")):
+        make_run(folder, TAXIS, name=name, seed=seed)
+    return folder
+
+
+@pytest.fixture
+def recordings(small, tmp_path):
+    return Path(shutil.copytree(small, tmp_path / "recordings"))
+
+
+@pytest.fixture
+def run(recordings):
+    return find_run("first", recordings)
+
+
+def dualtaxi(*words):
+    return CliRunner().invoke(cli, [str(word) for word in words])
+
+
+def copies(run, folder, count):
+    """Return runs of the same content, each with an id of its own."""
+    parcels = []
+    for number in range(count):
+        path = folder / f"{number}.mcap"
+        rewrite(run.recording, path, lambda name, entries, n=number: _with_id(name, entries, n))
+        parcels.append(Parcel(path, "copy", f"copy{number}", run={"status": "finished"}))
+    return parcels
+
+
+def _with_id(name, entries, number):
+    return entries | {"run_id": f"copy{number}"} if name == "run" else entries
+
+
+# --- commands ---------------------------------------------------------------------------------------------
+
+
+def test_a_run_is_pushed_and_pulled_with_all_that_is_known_of_it(server, run, recordings, tmp_path):
+    change_labels(run.folder, lambda labels: replace(labels, name="renamed", tags=("good",), note="seen"))
+    push = ("push", run.run_id, "--recordings", recordings, "--server", server.url, "--json")
+    pushed = json.loads(dualtaxi(*push).stdout)
+    assert pushed == [
+        {"run_id": run.run_id, "name": "renamed", "bytes": run.summary["bytes"], "already": False}
+    ]
+    assert json.loads(dualtaxi(*push).stdout)[0]["already"]
+    pull = ("pull", "renamed", "--recordings", tmp_path / "back", "--server", server.url, "--json")
+    assert json.loads(dualtaxi(*pull).stdout)["content_digest"] == run.summary["content_digest"]
+    assert json.loads(dualtaxi(*pull).stdout)["already"]
+    back, run = find_run(run.run_id, tmp_path / "back"), find_run(run.run_id, recordings)
+    assert back.recording.read_bytes() == run.recording.read_bytes()
+    assert {key: value for key, value in run.facts.items() if key != "owner"} == back.facts
+    assert back.labels == run.labels
+    assert [path.name for path in (tmp_path / "back").iterdir()] == [run.run_id]
+
+
+def test_a_packed_run_is_pushed_as_it_is(server, recordings, tmp_path):
+    run = find_run("second", recordings)
+    packed = pack(run, tmp_path / "a.dualtaxi").path
+    result = dualtaxi("push", packed, "--server", server.url)
+    assert (result.exit_code, "stored" in result.stdout) == (0, True)
+    assert find_run(run.run_id, server.recordings).recording.read_bytes() == run.recording.read_bytes()
+
+
+def test_what_cannot_be_pushed_is_said_and_the_others_are_pushed(server, run, recordings):
+    result = dualtaxi("push", "nosuch", run.run_id, "--recordings", recordings, "--server", server.url)
+    assert result.exit_code == 1
+    assert "nosuch" in result.stderr
+    assert run.run_id in result.stdout
+    assert dualtaxi("push", run.run_id, "--recordings", recordings).exit_code == 2
+    assert dualtaxi("push", "--server", server.url).exit_code == 2
+    assert dualtaxi("pull", "x", "--server", "ftp://there").exit_code == 2
+    missing = dualtaxi("pull", "nosuch", "--server", server.url, "--recordings", recordings)
+    assert (missing.exit_code, "nosuch" in missing.stderr) == (1, True)
+
+
+def test_a_refused_run_is_said_to_be(server, run, tmp_path):
+    data = bytearray(run.recording.read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "bad.mcap").write_bytes(data)
+    with Client(server.url) as client, pytest.raises(ServerError, match="refused the run"):
+        client.push(Parcel(tmp_path / "bad.mcap"))
+
+
+def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recordings, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    token = dualtaxi("token", "create", "pusher", "--scope", "write").stdout.strip()
+    own_server.options = ("--require-token",)
+    own_server.start()
+    push = ("push", run.run_id, "--recordings", recordings, "--server", own_server.url)
+    refused = dualtaxi(*push, "--token", "dualtaxi_wrong")
+    assert (refused.exit_code, "token" in refused.stderr) == (1, True)
+    (tmp_path / "token").write_text(token + "\n")
+    taken = dualtaxi(*push, "--token-file", tmp_path / "token")
+    assert taken.exit_code == 0, taken.stderr
+    own_server.end()
+    log = (own_server.recordings.parent / "server.log").read_text()
+    assert not [
+        text for text in (log, taken.output, refused.output) if token in text or "dualtaxi_wrong" in text
+    ]
+    states = own_server.recordings.glob(".uploads/*/upload.json")
+    assert all(token not in path.read_text() for path in states)
+
+
+def test_tokens_and_addresses_are_checked(tmp_path, monkeypatch):
+    monkeypatch.setenv("DUALTAXI_TOKEN_FILE", str(tmp_path / "token"))
+    with pytest.raises(runner.RunnerError, match="file with a token"):
+        found_token()
+    (tmp_path / "token").write_text("abc\n")
+    assert (found_token(), found_token("said")) == ("abc", "said")
+    monkeypatch.setenv("DUALTAXI_TOKEN", "variable")
+    assert found_token() == "variable"
+    with pytest.raises(runner.RunnerError, match="one line"):
+        found_token("two words")
+    assert checked_url("https://runs.example.org/them/") == "https://runs.example.org/them"
+    for wrong in ("localhost:8000", "http://", "file:///etc", "http://a:b@c", "http://c/?x=1"):
+        with pytest.raises(runner.RunnerError, match="server: found"):
+            checked_url(wrong)
+
+
+# --- faults -----------------------------------------------------------------------------------------------
+
+
+def test_a_server_killed_in_the_middle_of_twenty_uploads_loses_none(own_server, run, tmp_path, monkeypatch):
+    monkeypatch.setattr(client_module, "PIECE", 8 << 10)
+    parcels = copies(run, tmp_path, 20)
+    own_server.start()
+    some, begun = threading.Semaphore(0), time.monotonic()
+
+    def push(parcel):
+        with Client(own_server.url, patience=120) as client:
+            return client.push(parcel, lambda done, total: some.release() if 0 < done < total else None)
+
+    with ThreadPoolExecutor(20) as pool:
+        sent = [pool.submit(push, parcel) for parcel in parcels]
+        for _ in range(40):
+            assert some.acquire(timeout=60)
+        own_server.end(signal.SIGKILL)
+        visible = [path for path in own_server.recordings.iterdir() if path.name[0] != "."]
+        assert all((folder / "run.json").exists() for folder in visible)
+        received = [path.stat().st_size for path in own_server.recordings.glob(".uploads/*/body")]
+        assert any(received)
+        own_server.start()
+        states = [future.result(120) for future in sent]
+    assert {state.state for state in states} == {"stored"}
+    assert len(list_runs(own_server.recordings)) == 20, time.monotonic() - begun
+    for parcel in parcels:
+        stored = find_run(parcel.run_id, own_server.recordings)
+        assert stored.recording.read_bytes() == parcel.path.read_bytes()
+    assert not list(own_server.recordings.glob(".uploads/*/body"))
+
+
+def test_a_connection_that_lies_or_is_cut_leaves_what_came(server, run):
+    data = run.recording.read_bytes()
+    with Client(server.url) as client:
+        sent = client.begin(digest=blake3(data).hexdigest() if data else None, size=len(data) + 5)
+        head = (
+            f"PATCH /api/v1/uploads/{sent.id} HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://127.0.0.1\r\n"
+            f"Upload-Offset: 0\r\nContent-Length: {len(data)}\r\n\r\n"
+        )
+        with socket.create_connection(("127.0.0.1", server.port)) as connection:
+            connection.sendall(head.encode() + data[:1000])
+            time.sleep(0.2)
+            with pytest.raises(ServerError, match="another request") as refused:
+                client.append(sent, run.recording, len(data))
+            assert refused.value.status == 409
+        for _ in range(100):
+            if (now := client.standing(sent)).offset:
+                break
+            time.sleep(0.05)
+        assert now.offset == 1000
+        with pytest.raises(ServerError, match="expected the"):
+            client.complete(now, Parcel(run.recording), len(data), "0" * 64)
+        client.give_up(now)
+        with pytest.raises(ServerError, match="no such upload"):
+            client.standing(now)
+
+
+def test_a_pull_goes_on_where_it_was_cut_off(server, recordings, tmp_path, monkeypatch):
+    run = find_run("second", recordings)
+    real, begun = Client.download, []
+
+    def cut(self, path, tag, offset, size):
+        begun.append(offset)
+        for piece in real(self, path, tag, offset, size):
+            yield piece[: size // 3]
+            raise ServerAway("cut off")
+
+    with Client(server.url) as client:
+        client.push(run)
+        monkeypatch.setattr(Client, "download", cut)
+        pulled = client.pull(run.run_id, tmp_path / "back")
+    third = run.summary["bytes"] // 3
+    assert begun[:3] == [0, third, 2 * third]
+    assert pulled.run.recording.read_bytes() == run.recording.read_bytes()
+
+
+def test_a_recording_made_to_exhaust_memory_is_refused(server, tmp_path, run):
+    import zstandard
+
+    data = run.recording.read_bytes()
+    at = data.index(bytes.fromhex("28b52ffd"), len(data) // 3)  # the first chunk behind it
+    bomb = zstandard.compress(bytes(1 << 28), 19)
+    (tmp_path / "bomb.mcap").write_bytes(data[:at] + bomb + data[at + len(bomb) :])
+    with Client(server.url) as client, pytest.raises(ServerError, match="refused"):
+        client.push(Parcel(tmp_path / "bomb.mcap"))
+
+
+# --- loops ------------------------------------------------------------------------------------------------
+
+LOOP = """
+import os, sys, time
+import gymnasium, runner
+
+env = gymnasium.make("FrozenLake-v1", is_slippery=False)
+with runner.record(env, sys.argv[1], name="loop", seed=int(sys.argv[2])) as rec:
+    rec.action_space.seed(int(sys.argv[2]))
+    rec.reset(seed=1)
+    for step in range(int(sys.argv[3])):
+        _, _, terminated, truncated, _ = rec.step(rec.action_space.sample())
+        if terminated or truncated:
+            rec.reset()
+    if sys.argv[4] == "hang":
+        time.sleep(2)
+        print("now", flush=True)
+        time.sleep(100)
+print(rec.run.run_id, rec.run.summary["content_digest"])
+"""
+
+
+def loop(url, seed=0, steps=3_000, end="finish"):
+    command = [sys.executable, "-c", LOOP, url, str(seed), str(steps), end]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, env=os.environ, text=True)
+
+
+def drive(env, steps):
+    env.reset(seed=1)
+    for _ in range(steps):
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            env.reset()
+
+
+def test_a_loop_recorded_for_a_server_is_there_at_its_end(server, outbox):
+    with runner.record(gymnasium.make("FrozenLake-v1"), server.url, name="loop", config={"lr": 0.1}) as rec:
+        drive(rec, 2_000)
+        assert [run.run_id for run in list_runs(outbox)] == [rec.run.run_id]
+        time.sleep(1.5)
+        with Client(server.url) as client:
+            uploads = client.ask("GET", "/uploads", params={"state": "receiving"}).json()["uploads"]
+        assert [(entry["run_id"], entry["offset"] > 0) for entry in uploads] == [(rec.run.run_id, True)]
+        drive(rec, 2_000)
+    stored = find_run(rec.run.run_id, server.recordings)
+    assert stored.summary["content_digest"] == rec.run.summary["content_digest"]
+    assert (stored.status, stored.summary["train_steps"]) == ("finished", 4_000)
+    assert list(outbox.iterdir()) == []
+
+
+def test_a_loop_whose_server_is_away_waits_in_the_outbox(own_server, outbox, monkeypatch):
+    monkeypatch.setattr("runner.service.outbox.LAST_SECONDS", 0.5)
+    with pytest.warns(UserWarning, match="dualtaxi push --outbox"):  # noqa: SIM117
+        with runner.record(gymnasium.make("FrozenLake-v1"), own_server.url, name="away") as rec:
+            drive(rec, 500)
+    assert find_run(rec.run.run_id, outbox).status == "finished"
+    own_server.start()
+    result = dualtaxi("push", "--outbox", "--json")
+    assert [run["run_id"] for run in json.loads(result.stdout)] == [rec.run.run_id]
+    stored = find_run(rec.run.run_id, own_server.recordings)
+    assert stored.summary["content_digest"] == rec.run.summary["content_digest"]
+    assert list(outbox.iterdir()) == []
+    assert "empty" in dualtaxi("push", "--outbox").stderr
+
+
+def test_a_loop_that_is_killed_leaves_what_it_recorded(server, outbox):
+    with loop(server.url, end="hang") as killed:
+        assert killed.stdout is not None
+        assert killed.stdout.readline() == "now\n"
+        killed.kill()
+    (run,) = list_runs(outbox)
+    assert run.status == "interrupted"
+    data = run.recording.read_bytes()
+    result = dualtaxi("push", "--outbox")
+    assert result.exit_code == 0, result.stderr
+    stored = find_run(run.run_id, server.recordings)
+    assert (stored.status, stored.recording.read_bytes()) == ("interrupted", data)
+    with runner.open_recording(stored.recording) as recording:
+        assert recording.count(recording.topic("/train/step")) == 3_000
+
+
+def test_loops_in_many_processes_are_all_there_with_equal_digests(server, outbox):
+    with contextlib.ExitStack() as stack:
+        loops = [stack.enter_context(loop(server.url, seed, 5_000)) for seed in range(4)]
+        told = [started.communicate(timeout=200)[0] for started in loops]
+    for line in told:
+        assert re.fullmatch(r"\w+ [0-9a-f]{64}\n", line), line
+        run_id, digest = line.split()
+        assert find_run(run_id, server.recordings).summary["content_digest"] == digest
+    assert list(outbox.iterdir()) == []
+
+
+def test_what_is_no_server_is_refused_before_anything_is_recorded(outbox):
+    with pytest.raises(runner.RunnerError, match="password"):
+        runner.record(gymnasium.make("FrozenLake-v1"), "http://me:secret@localhost")
+    assert not outbox.exists()
+
+
+def test_an_upload_begun_with_other_bytes_is_sent_anew(server, run):
+    with Client(server.url) as client:
+        begun = client.begin(name="stale")
+        wrong = client.append(begun, run.recording, 5_000)
+        assert wrong.offset == 5_000
+        other = list_runs(run.folder.parent)[0 if list_runs(run.folder.parent)[0].name == "second" else 1]
+        sent = client.push(other, begun=Sent(begun.id, "receiving", 0))
+    assert (sent.state, sent.run_id) == ("stored", other.run_id)
