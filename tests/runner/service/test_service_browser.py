@@ -158,7 +158,12 @@ def test_metrics_are_drawn_and_zoomed_and_the_address_says_so(page):
 
 def test_thinned_curves_say_so_and_are_read_again_where_one_zooms(page, folder):
     runner.run(
-        {"name": "long", "episodes": 400, "log": {"every_steps": 20}, "evaluation": {"every": 0}},
+        {
+            "name": "long",
+            "episodes": 400,
+            "log": {"every_steps": 20},
+            "evaluation": {"every": 400, "trials": 2},
+        },
         recordings=folder,
     )
     browser = page("/runs/long")

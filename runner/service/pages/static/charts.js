@@ -108,7 +108,7 @@ function options(panel, lines, labels, place, sparse) {
   const axis = { stroke: look().getPropertyValue("--soft").trim(), grid: { stroke: look().getPropertyValue("--line").trim(), width: 1 }, ticks: { show: false }, font: "12px system-ui, sans-serif" };
   const series = panel.lines.map((line, i) => {
     const at = lines.indexOf(line.line), several = runs.length > 1;
-    return { label: labels[i], stroke: colour(several ? line.run : at), width: 1.8, dash: several ? DASHES[at % DASHES.length] : [], spanGaps: true, points: { show: sparse, size: 4 } };
+    return { label: labels[i], stroke: colour(several ? line.run : at), width: 1.8, dash: DASHES[at % DASHES.length], spanGaps: true, points: { show: sparse, size: 4 } };
   });
   return {
     width: place.clientWidth, height: 200,
