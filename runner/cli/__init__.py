@@ -66,6 +66,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "unpack": ("runner.cli.commands.unpack", "Take a run out of the file that `pack` wrote."),
         "push": ("runner.cli.commands.push", "Send runs to a server."),
         "pull": ("runner.cli.commands.pull", "Bring a run from a server."),
+        "submit": ("runner.cli.commands.submit", "Have an experiment or a sweep done by a server."),
     },
     "Serve": {
         "serve": ("runner.cli.commands.serve", "Open the runs to browsers and programs, over HTTP."),

@@ -1,0 +1,104 @@
+"""`dualtaxi submit`: a configuration or a sweep to a server, to be done there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from runner.cli.options import json_option, server_option, token_file_option, token_option
+from runner.cli.output import draw, facts, print_json, say
+
+if TYPE_CHECKING:
+    from runner.service.watching import Happened, JobThere
+
+
+@click.command("submit")
+@click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
+@server_option
+@token_option
+@token_file_option
+@click.option("--watch", "watching", is_flag=True, help="Stay, and tell what happens until it is over.")
+@json_option
+@click.pass_context
+def command(
+    ctx: click.Context,
+    file: Path,
+    server: str | None,
+    token: str | None,
+    token_file: Path | None,
+    watching: bool,
+    as_json: bool,
+) -> None:
+    """Have the experiment or the sweep in FILE done by a server.
+
+    It is checked there as it would be here, and queued. The server's pages and `--watch` tell how far it is;
+    Ctrl+C ends the watching, not the job. A connection that breaks is taken up again.
+
+    Exit code 0 when it is queued, or with --watch finished; 1 when it failed or was cancelled.
+
+    \b
+    Examples:
+      dualtaxi submit configs/quick.yaml --server http://localhost:8000
+      dualtaxi submit configs/sweeps/hyperparameters.yaml --server http://localhost:8000 --watch
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.service.address import found_token
+    from runner.service.client import Client
+
+    if not server:
+        raise click.UsageError("missing option '--server', such as --server http://localhost:8000.")
+    with Client(server, found_token(token, token_file)) as client:
+        job = client.submit(text_of(file), file.name)
+        say(f"Job {job.number}: {job.name}, {job.runs:,} runs; {client.url}/queue/{job.number}")
+        if watching:
+            _tell(client.watch(job.number))
+            job = client.job(job.number)
+    if as_json:
+        print_json(_as_json(job))
+    else:
+        draw(facts(_in_words(job)))
+    if watching and job.state != "finished":
+        ctx.exit(1)
+
+
+def text_of(file: Path) -> str:
+    """Return what is submitted of a file: its text; of a sweep whose base is another file, all of it.
+
+    Raises:
+        ConfigError: it cannot be read, or its base cannot.
+    """
+    from runner.config.document import read_yaml, write_yaml
+    from runner.config.loading import read_text
+    from runner.sweep.loading import load_sweep
+
+    text = read_text(file)
+    value = read_yaml(text, str(file)).value
+    if isinstance(value, Mapping) and isinstance(value.get("base"), str):
+        return write_yaml(load_sweep(file).to_mapping())
+    return text
+
+
+def _tell(happening: Iterable[Happened]) -> None:
+    """Say on stderr what happens."""
+    for happened in happening:
+        data = happened.data
+        if happened.kind == "log":
+            seed = f"seed {data['seed']}: " if "seed" in data else ""
+            say(f"{seed}{data['text']}")
+        elif happened.kind == "state":
+            say(data["state"])
+
+
+def _as_json(job: JobThere) -> dict[str, object]:
+    runs = {str(seed): run_id for seed, run_id in job.begun.items()}
+    known = {"number": job.number, "kind": job.kind, "name": job.name, "state": job.state}
+    return known | {"runs": runs, "error": job.error}
+
+
+def _in_words(job: JobThere) -> dict[str, str]:
+    told = {"job": f"{job.number}  {job.name}, {job.state}"}
+    if job.begun:
+        told["runs"] = "\n".join(f"{run_id}  seed {seed}" for seed, run_id in job.begun.items())
+    return told | ({"error": job.error} if job.error else {})
