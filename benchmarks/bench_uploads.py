@@ -44,7 +44,7 @@ PROCESSES = 20
 
 def measure(quick: bool) -> list[Figure]:
     """Return the speed of an upload, and the server's memory under load."""
-    megabytes, repetitions, steps = (100, 2, 20_000) if quick else (1000, 3, 100_000)
+    megabytes, repetitions, steps = (100, 2, 20_000) if quick else (1000, 3, 50_000)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recording = _large_recording(folder / "mine", megabytes)
@@ -55,7 +55,7 @@ def measure(quick: bool) -> list[Figure]:
 
 def _large_recording(folder: Path, megabytes: int) -> Parcel:
     """Return a run that takes so much on disk: uncompressed, of steps at random."""
-    sets = ["recording.compression=none", f"episodes={megabytes * 30}", "epsilon=1"]
+    sets = ["recording.compression=none", f"episodes={megabytes * 13}", "epsilon=1"]
     sets += ["evaluation.every=1000000", "snapshots.every=1000000"]
     run(run_command("quick", str(folder), *sets))
     return Parcel.of(find_run("@latest", folder))

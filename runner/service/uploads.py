@@ -10,14 +10,13 @@ which is one renaming, or refused. The folder is the truth: a server that was ki
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 import secrets
 import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
@@ -28,6 +27,7 @@ from runner.documents import write_whole
 from runner.errors import RunnerError, RunNotFound, StorageError
 from runner.packing.admission import sync
 from runner.runs import run_at_once
+from runner.service.appending import Appending, on_disk
 from runner.service.upload import (
     BODY_FILE,
     STATE_FILE,
@@ -45,6 +45,8 @@ from runner.service.verifying import Verdict, Verifier
 
 FOLDER: Final = ".uploads"
 LOCK_FILE: Final = "lock"
+FLUSHED_BYTES: Final = 8 << 20
+"""A request that brought so much is put on disk while the next one comes, not only at the end."""
 SWEEP_SECONDS: Final = 600.0
 """So often is looked for uploads that are to be forgotten."""
 
@@ -78,6 +80,8 @@ class Uploads:
         self._lock = _only_server(self._folder)
         self._uploads = {upload.upload_id: upload for upload in _read_all(self._folder)}
         self._verifier = Verifier()
+        self._flushing: dict[str, list[Future[None]]] = {}
+        self._flusher = ThreadPoolExecutor(1, "flushing")
         self._pool = ThreadPoolExecutor(limits.verifiers, "verifying")
         self._forget_old()
         for upload in self._uploads.values():
@@ -88,6 +92,7 @@ class Uploads:
         """Stop; what is being verified will be verified anew."""
         self._verifier.stop()
         self._pool.shutdown(wait=True, cancel_futures=True)
+        self._flusher.shutdown(wait=True, cancel_futures=True)
         self._lock.release()
 
     def __enter__(self) -> Self:
@@ -118,7 +123,7 @@ class Uploads:
     def offset(self, upload: Upload) -> int:
         """Return how many bytes of it are there."""
         if upload.state == "receiving":
-            with _on_disk():
+            with on_disk():
                 return self._body(upload.upload_id).stat().st_size
         return upload.size or 0
 
@@ -179,10 +184,15 @@ class Uploads:
             if offset + (length or 0) > most:
                 raise TooLarge(f"found {offset + (length or 0):,} bytes, expected at most {most:,}.")
             self._check_free(length or 0)
-            with _on_disk():
+            with on_disk():
                 stream = self._body(upload_id).open("ab", buffering=0)
             with stream:
-                yield Appending(stream.fileno(), most - offset)
+                sink = Appending(stream.fileno(), most - offset)
+                yield sink
+            if sink.written >= FLUSHED_BYTES:
+                with self._guard:
+                    flushed = self._flusher.submit(sync, self._body(upload_id))
+                    self._flushing.setdefault(upload_id, []).append(flushed)
 
     def complete(self, upload_id: str, owner: str, completion: Completion) -> Upload:
         """Say that all is there; it is put on disk, and verified. Returns the upload as it then is.
@@ -190,13 +200,14 @@ class Uploads:
         Raises:
             Conflict: it is not all there, or another digest was announced or completed.
         """
-        with self._in_use(upload_id, owner) as upload, _on_disk():
+        with self._in_use(upload_id, owner) as upload, on_disk():
             if upload.state != "receiving":
                 return _repeated(upload, completion)
             if (there := self.offset(upload)) != completion.size:
                 raise Conflict(f"found {there:,} bytes, expected the {completion.size:,} of the completion.")
             if upload.announced.digest not in (None, completion.digest):
                 raise Conflict("found another digest than the one announced; begin another upload.")
+            self._await_flushed(upload_id)
             sync(self._body(upload_id))
             changes = {"state": "verifying", "completion": completion, "problem": ""}
             completed = upload.model_copy(update=changes)
@@ -205,6 +216,18 @@ class Uploads:
                 self._uploads[upload_id] = completed
         self._pool.submit(self._verify, upload_id)
         return completed
+
+    def _await_flushed(self, upload_id: str) -> None:
+        """Wait for what is being put on disk already.
+
+        Raises:
+            OSError: it could not be.
+        """
+        with self._guard:
+            begun = self._flushing.pop(upload_id, [])
+        for flushed in begun:
+            if not flushed.cancel():
+                flushed.result()
 
     def give_up(self, upload_id: str, owner: str) -> None:
         """Forget an upload, and remove what was received.
@@ -290,11 +313,11 @@ class Uploads:
             self._uploads[upload_id] = settled
 
     def _write(self, upload: Upload) -> None:
-        with _on_disk():
+        with on_disk():
             write_whole(self._folder / upload.upload_id / STATE_FILE, upload.model_dump(mode="json"))
 
     def _create(self, upload: Upload) -> None:
-        with _on_disk():
+        with on_disk():
             (self._folder / upload.upload_id).mkdir(parents=True)
             self._body(upload.upload_id).touch()
         self._write(upload)
@@ -325,30 +348,8 @@ class Uploads:
 
     def _forget(self, upload: Upload) -> None:
         del self._uploads[upload.upload_id]
+        self._flushing.pop(upload.upload_id, None)
         shutil.rmtree(self._folder / upload.upload_id, ignore_errors=True)
-
-
-class Appending:
-    """Takes the bytes of one request."""
-
-    def __init__(self, descriptor: int, most: int) -> None:
-        self._descriptor = descriptor
-        self._left = most
-
-    def write(self, data: bytes | bytearray) -> None:
-        """Append bytes.
-
-        Raises:
-            TooLarge: they are more than were said to come; nothing of these is kept.
-            StorageError: the disk is full or failing; what was written is kept.
-        """
-        if len(data) > self._left:
-            raise TooLarge("found more bytes than the upload is said to have.")
-        self._left -= len(data)
-        view = memoryview(data)
-        with _on_disk():
-            while view:
-                view = view[os.write(self._descriptor, view) :]
 
 
 def _settled(verdict: Verdict) -> dict[str, Any]:
@@ -369,19 +370,6 @@ def _repeated(upload: Upload, completion: Completion) -> Upload:
     if upload.completion is not None and upload.completion.digest != completion.digest:
         raise Conflict("the upload was completed with another digest; begin another one.")
     return upload
-
-
-@contextlib.contextmanager
-def _on_disk() -> Iterator[None]:
-    """Tell a client of an error of the disk without saying where on it.
-
-    Raises:
-        StorageError: there was one.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise StorageError(f"the server's disk cannot be written ({error.strerror}).") from error
 
 
 def _only_server(folder: Path) -> FileLock:

@@ -276,7 +276,7 @@ def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
         room[0] -= written
         return written
 
-    monkeypatch.setattr("runner.service.uploads.os.write", full)
+    monkeypatch.setattr("runner.service.appending.os.write", full)
     with (
         pytest.raises(StorageError, match="No space left"),
         uploads.appending(upload.upload_id, ANNA, 0, None) as sink,
