@@ -81,7 +81,8 @@ function plot(metric, panel) {
   const [caption, place] = one.figure.children;
   const [title, unit] = [document.createElement("b"), document.createElement("span")];
   title.textContent = panel.title;
-  unit.textContent = panel.unit + (panel.lines.some((line) => line.thinned) ? ", thinned" : "");
+  unit.textContent = panel.unit + (panel.lines.some((line) => line.thinned) ? ", thinned" : "")
+    + (panel.lines.every((line) => line.episodes.length === 0) ? ", no point in this part" : "");
   caption.replaceChildren(title, " ", unit);
   place.setAttribute("role", "img");
   place.setAttribute("aria-label", `${panel.title}, ${panel.unit}: ${panel.lines.map((line) => summary(line, lines)).join("; ")}`);
@@ -99,7 +100,8 @@ function label(line, lines) {
 function summary(line, lines) {
   const known = line.values.filter((value) => value !== null);
   const last = known.at(-1);
-  return `${label(line, lines)} ends at ${last === undefined ? "no value" : Number(last.toPrecision(4))}, between ${Number(Math.min(...known).toPrecision(4))} and ${Number(Math.max(...known).toPrecision(4))}`;
+  if (last === undefined) return `${label(line, lines)} has no point in this part`;
+  return `${label(line, lines)} ends at ${Number(last.toPrecision(4))}, between ${Number(Math.min(...known).toPrecision(4))} and ${Number(Math.max(...known).toPrecision(4))}`;
 }
 
 function options(panel, lines, labels, place, sparse) {
@@ -112,7 +114,7 @@ function options(panel, lines, labels, place, sparse) {
   });
   return {
     width: place.clientWidth, height: 200,
-    scales: { x: { time: false }, y: { range: (_, low, high) => bounds(low, high, percent, positive) } },
+    scales: { x: { time: false, range: (_, low, high) => [range.from ?? low ?? 0, range.to ?? high ?? 1] }, y: { range: (_, low, high) => bounds(low, high, percent, positive) } },
     series: [{ label: "episode" }, ...series],
     axes: [{ ...axis, size: 30 }, { ...axis, size: 52 }],
     legend: { show: labels.length > 1, live: true },
