@@ -113,7 +113,7 @@ def page(browser, served):
     assert {address for address in asked if address.startswith(("http", "ws"))} <= {served}
 
 
-def wait(browser, done, seconds=180):
+def wait(browser, done, seconds=60):
     return WebDriverWait(browser, seconds, poll_frequency=0.1).until(lambda _: done())
 
 
@@ -171,7 +171,7 @@ def test_thinned_curves_say_so_and_are_read_again_where_one_zooms(page, folder):
     wait(browser, lambda: "Thinned: of up to" in text_of(browser, "[data-said]"))
     assert ", thinned" in text_of(browser, ".plots")
     plot = browser.find_element(By.CSS_SELECTOR, ".u-over")
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", plot)
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", plot)
     drag = ActionChains(browser).move_to_element_with_offset(plot, -40, 0).click_and_hold()
     drag.move_by_offset(2, 0).move_by_offset(10, 0).release().perform()
     wait(browser, lambda: "Every recorded point" in text_of(browser, "[data-said]"))

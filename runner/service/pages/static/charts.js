@@ -144,7 +144,7 @@ function go(from, to, keep = true) {
   if (keep) {
     const query = new URLSearchParams(location.search);
     for (const [name, value] of Object.entries(range)) value === null ? query.delete(name) : query.set(name, value);
-    history.pushState(null, "", `?${query}`);
+    history.pushState(null, "", query.size ? `?${query}` : location.pathname);
   }
   draw();
 }
