@@ -18,13 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 from urllib.parse import urlsplit
 
-from blake3 import blake3
-
 from runner.errors import MissingExtra, RunnerError
 from runner.runs import Run
 from runner.service import watching
 from runner.service.address import checked_url
-from runner.service.parcel import Parcel, Sent, ServerAway, ServerError
+from runner.service.parcel import Parcel, Sent, ServerAway, ServerError, digest_of
 from runner.service.watching import Happened, JobThere
 
 if TYPE_CHECKING:
@@ -341,13 +339,9 @@ def _may_pass(error: ServerError) -> bool:
 
 def _size_and_digest(path: Path) -> tuple[int, str]:
     try:
-        size = path.stat().st_size
-        digest = blake3()
-        if size:
-            digest.update_mmap(path)
+        return path.stat().st_size, digest_of(path)
     except OSError as error:
         raise RunnerError(f"{path}: cannot be read ({error.strerror}).") from error
-    return size, digest.hexdigest()
 
 
 def _pieces(stream: BinaryIO, size: int, path: Path) -> Iterator[bytes]:

@@ -18,12 +18,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from blake3 import blake3
 from filelock import FileLock
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RunnerError, StorageError
 from runner.labels import labels_from
+from runner.service.parcel import digest_of
 from runner.service.upload import BODY_FILE, Completion, read_upload
 
 PATIENCE_SECONDS: Final = 120.0
@@ -128,18 +128,6 @@ def judge(folder: Path, recordings: Path) -> Verdict:
             return Verdict(problem=_without_paths(error, body, recordings))
         except OSError as error:
             return Verdict(problem=f"the server's disk cannot be used ({error.strerror}).", try_again=True)
-
-
-def digest_of(path: Path) -> str:
-    """Return the BLAKE3 of a file.
-
-    Raises:
-        OSError: it cannot be read.
-    """
-    digest = blake3()
-    if path.stat().st_size:
-        digest.update_mmap(path)
-    return digest.hexdigest()
 
 
 def _taken(body: Path, completion: Completion, recordings: Path) -> Verdict:
