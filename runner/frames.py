@@ -194,7 +194,7 @@ def step_columns(
     else:
         records = recording.episode_steps(phase, episode)
     names = records.dtype.names or ()
-    columns = _plain_columns(records, [name for name in _BEFORE if name in names])
+    columns = _spread(_plain_columns(records, [name for name in _BEFORE if name in names]))
     columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in agents_of(recording)])
     return columns | _plain_columns(records, [name for name in _BEHIND if name in names])
 
@@ -324,6 +324,17 @@ def _flat(record: Mapping[str, Any], prefixes: Mapping[str, str]) -> dict[str, A
 def _plain_columns(records: NDArray[np.void], names: Sequence[str]) -> dict[str, Any]:
     """Return fields of records as arrays of their own."""
     return {name: records[name].copy() for name in names}
+
+
+def _spread(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return columns of which those of composed values, such as a `Dict` space's, are a column a part."""
+    spread: dict[str, NDArray[Any]] = {}
+    for name, values in columns.items():
+        if values.dtype.names is None:
+            spread[name] = values
+        else:
+            spread |= _spread({f"{name}.{part}": values[part] for part in values.dtype.names})
+    return spread
 
 
 def _by_name(values: NDArray[Any], names: Sequence[str]) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
         else:
             columns = episode_columns(recording, phase, start, stop)
     arrays = {
-        name: pa.array(values if values.ndim == 1 else list(values)) for name, values in columns.items()
+        name: pa.array(values if values.ndim == 1 else values.tolist()) for name, values in columns.items()
     }
     whole = pa.table(arrays)
     sink = pa.BufferOutputStream()

@@ -5,11 +5,13 @@ from __future__ import annotations
 import io
 import json
 
+import gymnasium
 import numpy as np
 import pyarrow as pa
 import pytest
 from click.testing import CliRunner
 
+import runner
 from runner.analysis.qtable import one_array
 from runner.analysis.tables import tables_at
 from runner.cli import cli
@@ -163,3 +165,29 @@ def test_a_damaged_recording_is_told_not_thrown(client, recordings):
     run.recording.unlink()
     assert client.get(f"{RUN}/steps/train").status_code == 409
     assert client.get(f"{RUN}/recording").status_code == 409
+
+
+def test_a_loop_of_composed_values_is_read_a_column_a_part(client, recordings):
+    space = gymnasium.spaces.Dict(
+        {"place": gymnasium.spaces.Box(-1, 1, (2,)), "go": gymnasium.spaces.Discrete(3)}
+    )
+
+    class Walk(gymnasium.Env):
+        observation_space, action_space = space, gymnasium.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return space.sample(), {}
+
+        def step(self, action):
+            return space.sample(), 1.0, False, True, {}
+
+    with runner.record(Walk(), name="walk", recordings=recordings) as env:
+        for _ in range(4):
+            env.reset(seed=1)
+            env.step(0)
+    told = client.get("/api/v1/runs/walk/steps/train").json()["columns"]
+    assert np.shape(told["next_observation.place"]) == (4, 2)
+    body = client.get("/api/v1/runs/walk/steps/train.arrow").content
+    assert pa.ipc.open_stream(body).read_all().to_pydict() == told
+    assert client.get("/api/v1/runs/walk/qtable").status_code == 400
