@@ -107,7 +107,7 @@ def test_a_new_server_waits_for_a_worker_that_has_not_stopped_yet(tmp_path, undi
 
 
 def test_a_server_that_is_told_to_stop_leaves_its_job_resumable_and_lets_watchers_go(tmp_path):
-    config = CONFIG | {"evaluation": {"every": 100, "trials": 500}, "recording": {"steps": "none"}}
+    config = CONFIG | {"evaluation": {"every": 100, "trials": 3500}, "recording": {"steps": "none"}}
     with served(tmp_path, "--workers", "1") as server:
         server.post("/jobs", json.dumps(config))
         server.until(is_under_way)
