@@ -17,6 +17,7 @@ from runner.catalogue.usage import freeable_of, totals, usages
 from runner.errors import RunnerError, RunNotFound
 from runner.service import played
 from runner.service.api.jobs import Number, queue_told, told
+from runner.service.api.uploads import OwnerOf, UploadsOf, list_uploads
 from runner.service.dependencies import ApartOf, CatalogueOf, JobsOf, KeptOf, SettingsOf
 from runner.service.pages.rendering import page, picture_address
 from runner.sweep.state import read_sweep, sweeps_in, tag_of
@@ -49,10 +50,15 @@ FREED_BY: Final = {
 
 @router.get("/queue")
 def queue(
-    request: Request, jobs: JobsOf, number: Annotated[int, Query(alias="page", ge=1, lt=10**6)] = 1
+    request: Request,
+    jobs: JobsOf,
+    uploads: UploadsOf,
+    owner: OwnerOf,
+    number: Annotated[int, Query(alias="page", ge=1, lt=10**6)] = 1,
 ) -> Response:
-    """Show the jobs, the newest first."""
-    return page(request, "queue.html", **_queue(jobs, number))
+    """Show the jobs, the newest first, and the uploads that are no runs yet."""
+    coming = [upload for upload in list_uploads(uploads, owner).uploads if upload.state != "stored"]
+    return page(request, "queue.html", uploads=coming[:ROWS], **_queue(jobs, number))
 
 
 @router.get("/queue/standing")

@@ -84,6 +84,9 @@ def test_a_refused_run_says_why_and_is_not_listed(connect, elsewhere, data):
     refused = client.get(f"{UPLOADS}/{upload}", params={"wait": 30}).json()
     assert refused["state"] == "refused"
     assert refused["problem"].startswith("the upload: ")
+    page = client.get("/queue").text
+    assert "refused" in page
+    assert "the upload: " in page
     assert client.get("/api/v1/runs").json()["total"] == 0
 
 
