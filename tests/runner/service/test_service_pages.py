@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 
 import pytest
@@ -182,3 +183,14 @@ def test_a_job_is_shown_and_cancelled(client):
     assert client.post("/queue/1/cancel", follow_redirects=False).status_code == 303
     assert "cancelled" in page_of(client, "/queue/1")
     assert client.post("/queue/1/cancel", headers=SAYS_HTML).status_code == 409
+
+
+def test_how_a_run_stands_is_told_while_it_runs_only(client, recordings):
+    assert client.get("/runs/first/standing").status_code == 204
+    file = find_run("first", recordings).folder / "run.json"
+    facts = json.loads(file.read_text())
+    owner = facts["owner"] | {"host": "elsewhere"}  # who lives as long as the file is young
+    file.write_text(json.dumps(facts | {"status": "running", "summary": {}, "owner": owner}))
+    page = page_of(client, "/runs/first")
+    assert 'data-live="/runs/' in page
+    assert "so far" in client.get("/runs/first/standing").text
