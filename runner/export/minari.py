@@ -108,6 +108,8 @@ def write_dataset(
             raise RecordingError(
                 f"{recording.path}: {phase} episode {counts[0] - 1} cannot be stored by Minari ({error})."
             ) from error
+    if not counts[0]:
+        raise RecordingError(f"{recording.path}: found no {phase} episode that ended, expected one at least.")
     return Written(counts[0], counts[1], (*notes, *_missing(recording, phase, ranges, counts)))
 
 
@@ -153,8 +155,6 @@ def episodes_of(recording: Recording, phase: str, ranges: Ranges) -> Iterator[ND
 
 def _checked(recording: Recording, phase: str, ranges: Ranges) -> Ranges:
     ended = recording.count(recording.topic(f"/{phase}/episode"))
-    if not ended:
-        raise RecordingError(f"{recording.path}: found no {phase} episode that ended, expected one at least.")
     for start, stop in ranges:
         if not start < (ended if stop is None else stop) <= ended:
             raise RecordingError(
