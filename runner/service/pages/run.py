@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from datetime import UTC, datetime
 from http import HTTPStatus
@@ -14,7 +13,7 @@ from fastapi.responses import RedirectResponse
 
 from runner import amounts
 from runner.errors import RecordingError, RunnerError
-from runner.frames import agents_of, environment_of, episode_columns, evaluation_records
+from runner.frames import agents_of, environment_of, evaluation_records
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
@@ -49,7 +48,6 @@ TABS: Final = (
     ("config", "Configuration"),
     ("rerun", "Rerun"),
 )
-ROWS: Final = 100
 MOST_LINES: Final = 500
 """Lines of a run's log that its page shows: the last ones."""
 MOST_EVALUATIONS: Final = 500
@@ -62,7 +60,7 @@ T = Annotated[int, Query(ge=0, lt=2**62)]
 @router.get("")
 def overview(request: Request, run: FoundRun, jobs: JobsOf) -> Response:
     """Show how a run stands, and its metrics."""
-    return page(request, "run_overview.html", **_head(run, ""), standing=_standing(run, jobs), problem="")
+    return page(request, "run_overview.html", **framed(run, ""), standing=_standing(run, jobs), problem="")
 
 
 @router.post("/labels")
@@ -78,7 +76,7 @@ def label(request: Request, run: FoundRun, form: Form, jobs: JobsOf, catalogue: 
     try:
         relabelled(run, changed, catalogue)
     except RunnerError as error:
-        told = _head(run, "") | {"standing": _standing(run, jobs), "problem": str(error)}
+        told = framed(run, "") | {"standing": _standing(run, jobs), "problem": str(error)}
         return page(request, "run_overview.html", HTTPStatus.BAD_REQUEST, **told)
     return RedirectResponse(f"/runs/{run.run_id}#labels-title", HTTPStatus.SEE_OTHER)
 
@@ -128,32 +126,6 @@ async def replay_trial(
     return await _replay(request, run, kept, apart, (after, trial), t)
 
 
-@router.get("/episodes")
-def episodes(
-    request: Request,
-    run: RecordedRun,
-    recording: OpenRecording,
-    phase: Literal["train", "eval"] = "train",
-    number: Annotated[int, Query(alias="page", ge=1, lt=10**9)] = 1,
-) -> Response:
-    """Show the episodes of a phase, each a link to its replay."""
-    total = recording.count(recording.topic(f"/{phase}/episode"))
-    first = (number - 1) * ROWS
-    columns = episode_columns(recording, phase, min(first, total), min(first + ROWS, total))
-    titles = [_title(name) for name in columns if name not in _NO_COLUMNS]
-    return page(
-        request,
-        "run_episodes.html",
-        **_head(run, "episodes"),
-        phase=phase,
-        total=total,
-        page=number,
-        pages=max(1, math.ceil(total / ROWS)),
-        headings=["episode" if phase == "train" else "trial", "end", *titles],
-        rows=_episode_rows(run, recording, phase, columns),
-    )
-
-
 @router.get("/evaluations")
 def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
     """Show the evaluations."""
@@ -161,7 +133,7 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
     return page(
         request,
         "run_evaluations.html",
-        **_head(run, "evaluations"),
+        **framed(run, "evaluations"),
         evaluations=records[-MOST_EVALUATIONS:],
         learners=agents_of(recording),
         event_names=[event_in_words(name) for name in environment_of(recording)["event_names"]],
@@ -174,7 +146,7 @@ async def learned(request: Request, run: RecordedRun, kept: KeptOf, apart: Apart
     key = ("learned", state_of(run))
     maps = await kept.awaited(key, lambda: apart(played.learned, run.recording), LONG)
     broad = any(len(row["svgs"][0][1]) > 60_000 for row in json.loads(maps) if row["svgs"])
-    return page(request, "run_learned.html", **_head(run, "learned"), maps=json.loads(maps), broad=broad)
+    return page(request, "run_learned.html", **framed(run, "learned"), maps=json.loads(maps), broad=broad)
 
 
 @router.get("/config")
@@ -186,7 +158,7 @@ def config(request: Request, run: FoundRun) -> Response:
     return page(
         request,
         "run_config.html",
-        **_head(run, "config"),
+        **framed(run, "config"),
         yaml=write_yaml(run.facts.get("config", {})),
         facts=facts,
         provenance=provenance,
@@ -202,7 +174,7 @@ def rerun(request: Request, run: RecordedRun, at: Annotated[str, Query(max_lengt
     return page(
         request,
         "run_rerun.html",
-        **_head(run, "rerun"),
+        **framed(run, "rerun"),
         told=_spot_in_words(spot),
         back=_replay_address(run, spot),
         frame=f"/runs/{run.run_id}/rerun/frame{query}",
@@ -226,7 +198,7 @@ def parse_spot(text: str) -> tuple[int, ...]:
     return tuple(int(part) for part in found.groups() if part is not None)
 
 
-def _head(run: Run, here: str) -> dict[str, Any]:
+def framed(run: Run, here: str) -> dict[str, Any]:
     """Return what every page of a run has."""
     return {"run": head_of(run), "tabs": TABS, "here": here}
 
@@ -313,7 +285,7 @@ async def _replay(
         request,
         "run_replay.html",
         status,
-        **_head(run, "replay"),
+        **framed(run, "replay"),
         **around,
         **shown,
         which=which,
@@ -372,55 +344,6 @@ def _around(run: Run, recording: Recording, which: tuple[int, ...]) -> dict[str,
         before = f"{base}/eval/{which[0]}/{which[1] - 1}" if which[1] else ""
         after = f"{base}/eval/{which[0]}/{which[1] + 1}" if which[1] + 1 < trials else ""
     return {"episodes": episodes, "evaluations": found, "before": before, "after": after}
-
-
-_NO_COLUMNS: Final = ("episode", "success", "terminated", "truncated", "last_step")
-
-
-def _title(column: str) -> str:
-    if column.startswith("return."):
-        return f"return {column.removeprefix('return.').replace('_', ' ')}"
-    return event_in_words(column)
-
-
-def _episode_rows(
-    run: Run, recording: Recording, phase: str, columns: dict[str, Any]
-) -> list[dict[str, Any]]:
-    """Return what is shown of some episodes."""
-    names = [name for name in columns if name not in _NO_COLUMNS]
-    lists = {name: values.tolist() for name, values in columns.items()}
-    addresses = _addresses(recording, phase, lists["episode"])
-    return [
-        {
-            "name": addresses[i].replace("eval/", "").replace("train/", "").replace("/", ", trial "),
-            "href": f"/runs/{run.run_id}/replay/{addresses[i]}",
-            "cells": [_end(lists, i), *(f"{lists[name][i]:,g}" for name in names)],
-        }
-        for i in range(len(addresses))
-    ]
-
-
-def _addresses(recording: Recording, phase: str, numbers: list[int]) -> list[str]:
-    """Return where the replay of each episode is: trials are counted within their evaluation."""
-    if phase == "train" or recording.kind != "job":
-        return [f"{phase}/{number}" for number in numbers]
-    ends: list[tuple[int, int, int]] = []
-    before = 0
-    for metrics in recording.metrics("eval"):
-        ends.append((before + int(metrics["trials"]), before, int(metrics["episode"])))
-        before += int(metrics["trials"])
-    found, at = [], 0
-    for number in numbers:
-        while at < len(ends) - 1 and number >= ends[at][0]:
-            at += 1
-        found.append(f"eval/{ends[at][2]}/{number - ends[at][1]}" if ends else f"eval/{number}/0")
-    return found
-
-
-def _end(lists: dict[str, list[Any]], i: int) -> str:
-    if lists["success"][i] > 0:
-        return "success"
-    return "ended" if lists["terminated"][i] else "step limit" if lists["truncated"][i] else "cut off"
 
 
 def _recorded_facts(run: Run) -> tuple[dict[str, str], dict[str, str], list[dict[str, Any]]]:
