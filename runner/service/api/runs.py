@@ -50,9 +50,9 @@ async def list_runs(
     catalogue: CatalogueOf,
     kept: KeptOf,
     settings: SettingsOf,
-    filter: Annotated[str, Query(max_length=10_000, description="As `dualtaxi ls` takes it.")] = "",  # noqa: A002
-    sort: Annotated[str, Query(max_length=1000, description="Fields; `-FIELD`: the largest first.")] = "",
-    columns: Annotated[str, Query(max_length=4000, description="Fields to tell; else the usual ones.")] = "",
+    filter: Annotated[str, Query(max_length=3000, description="As `dualtaxi ls` takes it.")] = "",  # noqa: A002
+    sort: Annotated[str, Query(max_length=500, description="Fields; `-FIELD`: the largest first.")] = "",
+    columns: Annotated[str, Query(max_length=1500, description="Fields to tell; else the usual ones.")] = "",
     limit: Annotated[int, Query(ge=0)] = 50,
     offset: Annotated[int, Query(ge=0, lt=2**31)] = 0,
 ) -> Response:

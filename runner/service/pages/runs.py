@@ -53,7 +53,7 @@ async def runs(
     request: Request,
     catalogue: CatalogueOf,
     kept: KeptOf,
-    filter: Annotated[str, Query(max_length=10_000)] = "",  # noqa: A002
+    filter: Annotated[str, Query(max_length=3000)] = "",  # noqa: A002
     sort: Annotated[str, Query(max_length=1000)] = "",
     columns: Annotated[list[str] | None, Query(max_length=100)] = None,
     page: Annotated[int, Query(ge=1, lt=10**8)] = 1,
