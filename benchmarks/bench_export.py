@@ -66,7 +66,7 @@ def measure(quick: bool) -> list[Figure]:
             "times",
             detail=f"rr.log: {logged:,.0f} steps/s, without any of the computing",
         ),
-        _lower("  peak memory", peaks, "MB", (600, 400), detail="resident, all of it"),
+        _lower("  peak memory", peaks, "MB", (1000, 400), detail="resident, all of it"),
         _lower(
             "  growth of the peak",
             [growth],

@@ -175,7 +175,8 @@ class Archive:
         """
         path = self.folder / name
         try:
-            with pq.ParquetFile(path, buffer_size=1 << 16, page_checksum_verification=False) as file:
+            # reading ahead would keep all that was read until the file is closed
+            with pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False) as file:
                 self._check(file, path, columns, rows)
                 for batch in file.iter_batches(n):
                     _refuse_nulls(batch, path)

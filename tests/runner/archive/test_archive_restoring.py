@@ -13,6 +13,7 @@ import pytest
 
 from runner.archive import layout
 from runner.archive.manifest import Entry, Manifest, entries_of
+from runner.archive.reading import Archive
 from runner.archive.restoring import check, restore
 from runner.errors import RecordingError, RunnerError
 from runner.recording import open as open_recording
@@ -253,3 +254,16 @@ def test_an_archive_of_a_later_version_is_refused_by_its_version(archive, tmp_pa
     path.write_text(path.read_text().replace('"version": 1', '"version": 7'))
     with pytest.raises(RecordingError, match="version 7, expected 1"):
         check(folder)
+
+
+def test_reading_a_table_keeps_nothing_of_the_groups_before(tmp_path):
+    folder = archived(make_run(tmp_path, LAKE).recording, tmp_path / "archive")
+    columns, rows, groups = pa.schema([("data", pa.int64())]), 1 << 17, 16
+    numbers = np.random.default_rng(1).integers(-(2**63), 2**63, rows, np.int64)
+    with pq.ParquetWriter(folder / "numbers.parquet", columns) as writer:
+        for _ in range(groups):
+            writer.write_table(pa.table([numbers], columns))
+    before, most = pa.total_allocated_bytes(), 0
+    for _ in Archive(folder).batches("numbers.parquet", columns, rows * groups, 4096):
+        most = max(most, pa.total_allocated_bytes() - before)
+    assert most < 4 * numbers.nbytes
