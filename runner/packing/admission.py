@@ -10,18 +10,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from runner.config.model import NAME_EXPECTED, NAME_PATTERN
 from runner.documents import write_whole
 from runner.errors import RecordingError, StorageError
-from runner.labels import LABELS_FILE, Labels, as_json
+from runner.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, change_labels
+from runner.owning import owned
 from runner.packing.packing import facts_bytes, run_facts
-from runner.packing.unpacking import known, workplace
+from runner.packing.unpacking import Occupied, known, workplace
 from runner.recording.integrity import is_merely_cut_off
 from runner.recording.reader import Recording, open_recording
-from runner.recording.rewriting import content_of
+from runner.recording.rewriting import content_of, continues
 from runner.runs import MADE_BY, RECORDING_FILE, RUN_FILE, Run, find_run
+
+UNFINISHED: Final = ("interrupted", "failed")
+"""What the status of a run is that can be gone on with."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,9 @@ class Admitted:
 def admit(recording: Path, said: Mapping[str, Any], labels: Labels, recordings: Path) -> Admitted:
     """Take a recording into a folder of runs; on the same disk without copying it. The file stays.
 
-    When this returns, the run is on disk, also should the power fail now.
+    A run that is there already, but did not come to its end, is gone on with: a recording that continues
+    its own takes that one's place, and what people say of either is kept. When this returns, the run is on
+    disk, also should the power fail now.
 
     Args:
         recording: the file, which nobody writes to any more.
@@ -48,7 +54,8 @@ def admit(recording: Path, said: Mapping[str, Any], labels: Labels, recordings: 
 
     Raises:
         RecordingError: the recording is damaged or makes no sense; nothing was written.
-        Occupied: another run of this id is there.
+        Occupied: another run of this id is there, which this does not go on with.
+        RunnerError: another process is at work on the run that is there.
         StorageError: the recordings folder cannot be written.
     """
     with open_recording(recording) as opened:
@@ -57,8 +64,12 @@ def admit(recording: Path, said: Mapping[str, Any], labels: Labels, recordings: 
     if not finished and not is_merely_cut_off(recording):
         raise RecordingError(f"{recording}: is damaged, not merely cut off; `dualtaxi repair` mends it.")
     digest, run_id = content_of(recording), str(facts["run_id"])
-    if (run := known(run_id, digest, recordings)) is not None:
-        return Admitted(run, digest, already=True)
+    try:
+        run = known(run_id, digest, recordings)
+    except Occupied as occupied:
+        return Admitted(_continued(occupied, recording, facts, labels), digest, already=False)
+    if run is not None:
+        return Admitted(_settled(run, facts), digest, already=True)
     with workplace(recordings) as folder:
         _link(recording, folder / RECORDING_FILE)
         (folder / RUN_FILE).write_bytes(facts_bytes(facts))
@@ -69,6 +80,58 @@ def admit(recording: Path, said: Mapping[str, Any], labels: Labels, recordings: 
         folder.rename(recordings / run_id)
         sync(recordings)
     return Admitted(find_run(f"{recordings}{os.sep}{run_id}", recordings), digest, already=False)
+
+
+def _continued(occupied: Occupied, recording: Path, facts: Mapping[str, Any], labels: Labels) -> Run:
+    """Return a run that is there, its recording replaced by one that goes on where it ends.
+
+    Should this be cut short, `_settled` does the rest when the same recording comes again.
+
+    Raises:
+        Occupied: the recording does not go on with it, or it is finished.
+        RunnerError: another process is at it.
+        StorageError: the folder cannot be written; nothing was lost.
+    """
+    if occupied.run.status not in UNFINISHED or occupied.run.stands_alone:
+        raise occupied
+    with owned(occupied.run) as run:
+        if run.status not in UNFINISHED or not continues(recording, run.recording):
+            raise occupied
+        change_labels(run.folder, lambda said: _merged(said, labels))
+        fresh = run.folder / f".{RECORDING_FILE}.fresh"
+        try:
+            fresh.unlink(missing_ok=True)
+            _link(recording, fresh)
+            sync(fresh)
+            fresh.replace(run.recording)
+            continued = _with_facts(run, facts)
+            sync(run.folder)
+        except OSError as error:
+            raise StorageError(f"{run.folder}: cannot be written ({error.strerror}).") from error
+        finally:
+            fresh.unlink(missing_ok=True)
+        return continued
+
+
+def _settled(run: Run, facts: Mapping[str, Any]) -> Run:
+    """Return a run that is there; if it has come to its end but does not say so, it does now."""
+    if facts["status"] != "finished" or run.status not in UNFINISHED or run.stands_alone:
+        return run
+    with owned(run) as there:
+        return _with_facts(there, facts) if there.status in UNFINISHED else there
+
+
+def _with_facts(run: Run, facts: Mapping[str, Any]) -> Run:
+    """Return a run that says of itself what came; what is its folder's own, it keeps."""
+    kept = {key: value for key, value in run.facts.items() if key not in ("owner", "proof", "summary")}
+    write_whole(run.folder / RUN_FILE, kept | dict(facts))
+    return find_run(os.fspath(run.folder.absolute()), run.folder.parent)
+
+
+def _merged(said: Labels, more: Labels) -> Labels:
+    """Return what is said of a run here and elsewhere; here, where only one of the two can hold."""
+    tags = tuple(sorted({*said.tags, *more.tags})[:MAX_TAGS])
+    return Labels(said.name or more.name, tags, said.note or more.note)
 
 
 def sync(path: Path) -> None:

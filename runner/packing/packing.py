@@ -101,7 +101,7 @@ def run_facts(recording: Recording, said: Mapping[str, Any]) -> dict[str, Any]:
     """Return what `run.json` shall say: what the recording says, and the little that it cannot know.
 
     Name, status, duration, the text of an error and the digest to be reached again are taken from `said`,
-    if they are what they must be; anything else is not.
+    if they are what they must be; anything else is not. That a run came to its end, its recording must say.
     """
     facts = recording.run_facts()
     summary, told = dict(facts["summary"]), said.get("summary")
@@ -115,7 +115,8 @@ def run_facts(recording: Recording, said: Mapping[str, Any]) -> dict[str, Any]:
         summary["bytes"] = recording.size
     if isinstance(said.get("name"), str):
         facts["name"] = said["name"]
-    if said.get("status") in ("finished", "interrupted", "failed"):
+    reached = ("finished",) if facts["status"] == "finished" else ()
+    if said.get("status") in ("interrupted", "failed", *reached):
         facts["status"] = said["status"]
     proof = said.get("proof")
     if isinstance(proof, str) and len(proof) == 64 and proof.isalnum():

@@ -61,7 +61,14 @@ def unpack(path: Path, recordings: Path, as_new: bool = False) -> Unpacked:
 
 
 class Occupied(RunnerError):
-    """Another run of this id is there already."""
+    """Another run of this id is there already: `run`."""
+
+    def __init__(self, run: Run, recordings: Path) -> None:
+        super().__init__(
+            f"{recordings}: found another run {run.run_id} ({run.name}, seed {run.seed}, {run.status}), "
+            "whose content is not that of the one to come"
+        )
+        self.run = run
 
 
 def known(run_id: str, content_digest: str, recordings: Path) -> Run | None:
@@ -80,10 +87,7 @@ def known(run_id: str, content_digest: str, recordings: Path) -> Run | None:
     with contextlib.suppress(RecordingError):
         if content_of(found.recording) == content_digest:
             return found
-    raise Occupied(
-        f"{recordings}: found another run {found.run_id} ({found.name}, seed {found.seed}, {found.status}), "
-        "whose content is not that of the one to come"
-    )
+    raise Occupied(found, recordings)
 
 
 def _known_as(manifest: Manifest, recordings: Path) -> Run | None:

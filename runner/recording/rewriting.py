@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -25,7 +26,7 @@ from runner.recording.contents import (
 from runner.recording.digest import ContentHash, combine
 from runner.recording.integrity import check_integrity, places
 from runner.recording.reader import open_recording
-from runner.recording.schema import ALL_TOPICS, KINDS, STEP, TOPICS
+from runner.recording.schema import ALL_TOPICS, KINDS, STEP, TOPICS, Topic
 from runner.recording.writer import RecordingFile
 
 Times = NDArray[np.uint64]
@@ -103,14 +104,44 @@ def content_of(path: Path) -> str:
         RecordingError: it is damaged, or states another digest than its messages have.
     """
     seen = ContentHash()
-    for opcode, offset, body in _whole_records(path):
-        if opcode == Opcode.CHUNK:
-            part, records = read_chunk(body, offset)
-            places(records, f"{path}: chunk at {offset}")
-            seen.update(_TOPIC_OF[part.channel], records)
+    for topic, records, _ in _messages(path):
+        seen.update(topic, records)
     with open_recording(path) as recording:
         result = recording.result
     return _stated(result, seen.topics(), path) if "content_digest" in result else seen.content()
+
+
+def continues(path: Path, earlier: Path) -> bool:
+    """Return whether a recording holds all that another of the same job does, and goes on from there.
+
+    Of every topic the other's messages are the first ones, byte for byte.
+
+    Raises:
+        RecordingError: one of them is damaged.
+    """
+    with open_recording(path) as later, open_recording(earlier) as before:
+        if later.run != before.run:
+            return False
+    counts: Counter[Topic] = Counter()
+    expected, seen = ContentHash(), ContentHash()
+    for topic, records, offsets in _messages(earlier):
+        expected.update(topic, records)
+        counts[topic] += len(offsets)
+    for topic, records, offsets in _messages(path):
+        shared = min(counts[topic], len(offsets))
+        counts[topic] -= shared
+        end = len(records) if shared == len(offsets) else int(offsets[shared])
+        seen.update(topic, memoryview(records)[:end])
+    return seen.topics() == expected.topics()
+
+
+def _messages(path: Path) -> Iterator[tuple[Topic, bytes, Times]]:
+    """Yield of each chunk its topic, its message records, and where in them the messages begin."""
+    for opcode, offset, body in _whole_records(path):
+        if opcode == Opcode.CHUNK:
+            part, records = read_chunk(body, offset)
+            _, _, offsets = places(records, f"{path}: chunk at {offset}")
+            yield _TOPIC_OF[part.channel], records, offsets
 
 
 def _whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:

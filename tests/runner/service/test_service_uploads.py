@@ -14,12 +14,25 @@ import pytest
 from blake3 import blake3
 
 from runner.errors import RunnerError, RunNotFound, StorageError
+from runner.execution import run_job
+from runner.job import Job
 from runner.labels import Labels, change_labels
 from runner.packing.packing import pack
-from runner.runs import find_run, list_runs
-from runner.service.upload import Announcement, Completion, Conflict, Limits, Told, TooLarge, TooMany
+from runner.recording.rewriting import rewrite
+from runner.resume import resume
+from runner.runs import create_run, find_run, list_runs
+from runner.service.upload import (
+    Announcement,
+    Completion,
+    Conflict,
+    Limits,
+    Told,
+    ToldLabels,
+    TooLarge,
+    TooMany,
+)
 from runner.service.uploads import FOLDER, Uploads
-from tests.runner.recording.making import LAKE, TAXIS, make_run
+from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
 
 ANNA, BEN = "anna", "ben"
 
@@ -213,6 +226,72 @@ def test_a_run_that_was_cut_off_is_taken_as_interrupted(uploads, taxis, tmp_path
     stored = send(uploads, data, status="interrupted")
     assert stored.run_id == taxis.run_id, stored.problem
     assert find_run(taxis.run_id, tmp_path / "runs").status == "interrupted"
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """Return a run that was interrupted, and the same one gone on with to its end."""
+    folder = tmp_path_factory.mktemp("stopped")
+    config, asked = experiment(TAXIS, episodes=400), iter(range(1_000_000))
+    run = run_job(Job(config, 0), create_run(folder, config, 0), stop=lambda: next(asked) > 30)
+    assert run.status == "interrupted"
+    early = find_run(shutil.copytree(run.folder, folder / "early" / run.run_id).as_posix(), folder)
+    return early, resume(run)
+
+
+def test_a_run_that_was_gone_on_with_takes_the_place_of_its_beginning(uploads, stopped, tmp_path):
+    early, whole = stopped
+    assert send(uploads, early.recording.read_bytes(), status="interrupted").state == "stored"
+    there = tmp_path / "runs" / early.run_id
+    change_labels(there, lambda _: Labels("mine", ("here",), "seen"))
+    data = whole.recording.read_bytes()
+    more = completion(data, status="finished").model_copy(
+        update={"labels": ToldLabels(name="yours", tags=["there"], note="other")}
+    )
+    stored = send(uploads, data, whole=more)
+    assert (stored.state, stored.problem, stored.already) == ("stored", "", False)
+    run = find_run(whole.run_id, tmp_path / "runs")
+    assert run.status == "finished"
+    assert [run.summary[key] for key in ("content_digest", "bytes")] == [
+        whole.summary[key] for key in ("content_digest", "bytes")
+    ]
+    assert run.recording.read_bytes() == data
+    assert run.labels == Labels("mine", ("here", "there"), "seen")
+    assert visible(tmp_path / "runs") == [run.run_id]
+    assert not list(there.glob(".*"))
+    refused = send(uploads, early.recording.read_bytes()[:-1], status="interrupted")
+    assert refused.state == "refused"
+    assert find_run(whole.run_id, tmp_path / "runs").recording.read_bytes() == data
+
+
+def test_what_only_says_that_it_goes_on_does_not_replace_anything(uploads, stopped, tmp_path):
+    early, _ = stopped
+    cut = early.recording.read_bytes()[:-40_000]
+    assert send(uploads, cut, status="finished").state == "stored"
+    run = find_run(early.run_id, tmp_path / "runs")
+    assert run.status == "interrupted"
+    assert send(uploads, cut, BEN, status="finished").already
+    assert find_run(early.run_id, tmp_path / "runs").status == "interrupted"
+    other = make_run(tmp_path / "other", TAXIS, seed=1)
+    facts = json.loads((run.folder / "run.json").read_text())
+    fake = tmp_path / "fake.mcap"
+    rewrite(
+        other.recording,
+        fake,
+        lambda name, entries: entries | {"run_id": run.run_id} if name == "run" else entries,
+    )
+    assert "another run" in send(uploads, fake.read_bytes(), status="finished").problem
+    assert run.recording.read_bytes() == cut
+    assert json.loads((run.folder / "run.json").read_text()) == facts
+
+
+def test_a_replacement_that_was_cut_short_is_completed_when_it_comes_again(uploads, stopped, tmp_path):
+    early, whole = stopped
+    assert send(uploads, early.recording.read_bytes(), status="interrupted").state == "stored"
+    there = find_run(early.run_id, tmp_path / "runs")
+    shutil.copy(whole.recording, there.recording)  # and killed before run.json said so
+    assert send(uploads, whole.recording.read_bytes(), status="finished").already
+    assert find_run(early.run_id, tmp_path / "runs").status == "finished"
 
 
 def test_a_client_that_lies_or_errs_gets_no_further(uploads, lake):
