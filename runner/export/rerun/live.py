@@ -30,9 +30,6 @@ TOGETHER_SECONDS: Final = 0.5
 END_SECONDS: Final = 10.0
 """How long the end of a run may wait for the viewer to take what is left."""
 
-LAST: Final = 19
-"""Niceness of the process that sends: training goes first."""
-
 
 class Piece(NamedTuple):
     """What is shown at once."""
@@ -117,8 +114,7 @@ class LiveView:
 def _send_all(pieces: Any, said: Connection, title: str, run_id: str, url: str) -> None:
     """Send pieces until there are no more; say what went wrong: the run goes on without."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the run, and thereby this
-    if hasattr(os, "nice"):
-        os.nice(LAST)
+    _give_way()
     try:
         from runner.export.rerun.live_stream import LiveStream
 
@@ -131,6 +127,14 @@ def _send_all(pieces: Any, said: Connection, title: str, run_id: str, url: str) 
             stream.close()
     except Exception as error:  # whatever the transport raises
         said.send(str(error))
+
+
+def _give_way() -> None:
+    """Run only when nothing else wants the processor: training goes first."""
+    if hasattr(os, "SCHED_IDLE"):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    elif hasattr(os, "nice"):
+        os.nice(19)
 
 
 def _together(pieces: Any) -> Iterator[list[Piece]]:
