@@ -44,9 +44,12 @@ def create_app(settings: Settings) -> FastAPI:
         RunnerError: it would be reachable from other machines and there is no token.
     """
     if settings.needs_token and not Tokens(settings.tokens).all():
+        why = (
+            "--require-token" if settings.is_loopback else f"{settings.host}, which other machines can reach,"
+        )
         raise RunnerError(
-            f"host: found {settings.host}, which other machines can reach, and no token; expected one. "
-            "Make it by `dualtaxi token create NAME`, or serve on 127.0.0.1 only."
+            f"host: found {why} and no token; expected one. Make it by `dualtaxi token create NAME`, or "
+            "serve on 127.0.0.1 without --require-token."
         )
     app = FastAPI(
         title="dualtaxi",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from runner.errors import StorageError
 from runner.service.upload import TooLarge
@@ -24,11 +24,18 @@ def on_disk() -> Iterator[None]:
 
 
 class Appending:
-    """Takes the bytes of one request."""
+    """Takes the bytes of one request.
 
-    def __init__(self, descriptor: int, most: int) -> None:
+    Args:
+        descriptor: of the file that they are appended to.
+        most: how many there may be.
+        check: raises if the disk has no room for so many.
+    """
+
+    def __init__(self, descriptor: int, most: int, check: Callable[[int], None]) -> None:
         self._descriptor = descriptor
         self._left = most
+        self._check = check
         self.written = 0
         """Bytes that were taken."""
 
@@ -37,10 +44,11 @@ class Appending:
 
         Raises:
             TooLarge: they are more than were said to come; nothing of these is kept.
-            StorageError: the disk is full or failing; what was written is kept.
+            StorageError: the disk is full, but for what is left free, or failing; what was written is kept.
         """
         if len(data) > self._left:
             raise TooLarge("found more bytes than the upload is said to have.")
+        self._check(len(data))
         self._left -= len(data)
         self.written += len(data)
         view = memoryview(data)

@@ -21,6 +21,7 @@ from runner.service.security import (
     WRITE,
     Access,
     is_allowed_host,
+    is_embedded_elsewhere,
     is_same_origin,
     unauthorized,
 )
@@ -66,7 +67,7 @@ class Guard:
         try:
             self._check(scope, headers)
         except RunnerError as error:
-            await _answer(error, scope, dict(headers))(scope, receive, _with_headers(send))
+            await self._answer(error, scope, dict(headers))(scope, receive, _with_headers(send))
             return
         limits = self._settings.limits
         streamed = scope["method"] == "PATCH" and scope["path"].startswith(UPLOADS)
@@ -97,6 +98,10 @@ class Guard:
                 raise unauthorized("token: found none, expected `Authorization: Bearer TOKEN`, or a login.")
             if "authorization" in headers:
                 return  # which no page of another site can make a browser send
+        if reads and is_embedded_elsewhere(headers):
+            raise Refused(
+                HTTPStatus.FORBIDDEN, "origin: found a page of another site, expected the service's own."
+            )
         if not reads and not is_same_origin(headers):
             raise Refused(
                 HTTPStatus.FORBIDDEN,
@@ -116,6 +121,18 @@ class Guard:
         if not kind and self._settings.needs_token:
             secret = _cookie(headers)
         return self._access.scopes_of(secret.strip(), address_of(scope)) if secret else None
+
+    def _answer(self, error: RunnerError, scope: Scope, headers: dict[str, str]) -> Response:
+        """Return how a request is refused: who reads pages is led to the login."""
+        status = status_of(error)
+        pages = "text/html" in headers.get("accept", "") and not scope["path"].startswith("/api/")
+        if pages and status == HTTPStatus.UNAUTHORIZED and scope["method"] == "GET":
+            asked = scope["path"] + (
+                f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else ""
+            )
+            return RedirectResponse(f"/login?{urlencode({'next': asked})}", HTTPStatus.SEE_OTHER)
+        more = error.headers if isinstance(error, Refused) else None
+        return refusal(status, trouble_of(error, self._settings), more)
 
 
 def address_of(scope: Scope) -> str:
@@ -163,17 +180,6 @@ class Body:
     def _too_slow(self) -> HTTPException:
         message = f"body: found {self._length:,} bytes in {time.monotonic() - self._began:.0f} s, too few."
         return HTTPException(HTTPStatus.REQUEST_TIMEOUT, message, {"connection": "close"})
-
-
-def _answer(error: RunnerError, scope: Scope, headers: dict[str, str]) -> Response:
-    """Return how a request is refused: who reads pages is led to the login."""
-    pages = "text/html" in headers.get("accept", "") and not scope["path"].startswith("/api/")
-    if pages and status_of(error) == HTTPStatus.UNAUTHORIZED and scope["method"] == "GET":
-        asked = scope["path"] + (
-            f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else ""
-        )
-        return RedirectResponse(f"/login?{urlencode({'next': asked})}", HTTPStatus.SEE_OTHER)
-    return refusal(status_of(error), trouble_of(error), error.headers if isinstance(error, Refused) else None)
 
 
 def _cookie(headers: dict[str, str]) -> str:

@@ -25,11 +25,12 @@ from runner.errors import (
     RunNotFound,
     StorageError,
 )
+from runner.service.queue import NoSuchJob, NotPossibleNow, QueueFull
 from runner.service.refused import Refused
+from runner.service.settings import Settings
+from runner.service.upload import Conflict, TooLarge, TooMany
 
 __all__ = ["Refused", "answer_errors", "answers", "content", "refusal", "status_of", "trouble_of"]
-from runner.service.queue import NoSuchJob, NotPossibleNow, QueueFull
-from runner.service.upload import Conflict, TooLarge, TooMany
 
 LOG: Final = logging.getLogger("dualtaxi.service")
 
@@ -91,13 +92,17 @@ def status_of(error: RunnerError) -> HTTPStatus:
     return next((_STATUS[kind] for kind in kinds), HTTPStatus.BAD_REQUEST)
 
 
-def trouble_of(error: RunnerError) -> Trouble:
+def trouble_of(error: RunnerError, settings: Settings) -> Trouble:
     """Return an error's message, and the problems of a configuration each with its line and key."""
-    message = "\n".join([str(error), *getattr(error, "__notes__", [])])
+    message = settings.without_folders("\n".join([str(error), *getattr(error, "__notes__", [])]))
     if not isinstance(error, ConfigError):
         return Trouble(message=message)
     problems = [
-        Problem(path=found.path or None, line=found.line or None, message=found.message)
+        Problem(
+            path=found.path or None,
+            line=found.line or None,
+            message=settings.without_folders(found.message),
+        )
         for found in error.problems
     ]
     return Trouble(message=message, problems=problems)
@@ -117,10 +122,10 @@ def answer_errors(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _unexpected)
 
 
-async def _runner_error(request: Request, error: Exception) -> Response:  # noqa: ARG001
+async def _runner_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RunnerError)
     headers = error.headers if isinstance(error, Refused) else None
-    return refusal(status_of(error), trouble_of(error), headers)
+    return refusal(status_of(error), trouble_of(error, request.app.state.settings), headers)
 
 
 async def _http_error(request: Request, error: Exception) -> Response:

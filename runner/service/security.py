@@ -227,6 +227,15 @@ def host_name(header: str) -> str:
     return name.strip("[]").lower().rstrip(".")
 
 
+def is_embedded_elsewhere(headers: dict[str, str]) -> bool:
+    """Return whether a browser says that a page of another site loads this as a part of itself.
+
+    It could not read what it gets, but have the service work for it; following a link is another thing.
+    """
+    site, mode = headers.get("sec-fetch-site"), headers.get("sec-fetch-mode")
+    return site in ("cross-site", "same-site") and mode != "navigate"
+
+
 def is_same_origin(headers: dict[str, str]) -> bool:
     """Return whether a browser says that a page of this service asks; or a program, by `Origin`.
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from runner.cache import cache_folder
 from runner.errors import RunnerError
 
 CONFIG_VARIABLE: Final = "XDG_CONFIG_HOME"
@@ -18,6 +19,17 @@ def tokens_file() -> Path:
     """Return the file of hashed tokens, in the user's configuration folder; it need not exist."""
     base = os.environ.get(CONFIG_VARIABLE)
     return (Path(base) if base else Path.home() / ".config") / "dualtaxi" / "tokens.json"
+
+
+def without_folders(text: str, *folders: Path) -> str:
+    """Return a message with the paths below some folders as they are seen from there.
+
+    Whoever reads it elsewhere learns what it is about, and not where on this machine that is.
+    """
+    for folder in folders:
+        for form in {os.fspath(folder.absolute()), os.fspath(folder.resolve())} - {folder.absolute().anchor}:
+            text = text.replace(form + os.sep, "").replace(form, folder.name)
+    return text
 
 
 @dataclass(frozen=True)
@@ -90,6 +102,10 @@ class Settings:
     def needs_token(self) -> bool:
         """Whether reading needs a token."""
         return self.tokens_for_all or not self.is_loopback
+
+    def without_folders(self, text: str) -> str:
+        """Return a message with its paths as they are seen from the service's folders, not from the root."""
+        return without_folders(text, *self.recordings, self.tokens.parent, cache_folder())
 
     def told(self) -> dict[str, Any]:
         """Return what is logged of them when the service starts."""

@@ -187,7 +187,7 @@ class Uploads:
             with on_disk():
                 stream = self._body(upload_id).open("ab", buffering=0)
             with stream:
-                sink = Appending(stream.fileno(), most - offset)
+                sink = Appending(stream.fileno(), most - offset, self._check_free)
                 yield sink
             if sink.written >= FLUSHED_BYTES:
                 with self._guard:
@@ -317,6 +317,7 @@ class Uploads:
             write_whole(self._folder / upload.upload_id / STATE_FILE, upload.model_dump(mode="json"))
 
     def _create(self, upload: Upload) -> None:
+        self._forget_some()
         with on_disk():
             (self._folder / upload.upload_id).mkdir(parents=True)
             self._body(upload.upload_id).touch()
@@ -336,6 +337,12 @@ class Uploads:
                 most = self.limits.idle_days if idle else self.limits.kept_days
                 if (idle or upload.state in ("stored", "refused")) and days > most:
                     self._forget(upload)
+
+    def _forget_some(self) -> None:
+        """Forget the oldest uploads that are over, but for as many as may be open."""
+        over = [upload for upload in self._uploads.values() if upload.state in ("stored", "refused")]
+        for upload in sorted(over, key=lambda upload: upload.created)[: -self.limits.most_open]:
+            self._forget(upload)
 
     def _touched(self, upload: Upload) -> float:
         """Return when something of an upload last changed, in seconds."""

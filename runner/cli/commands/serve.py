@@ -102,10 +102,9 @@ def command(
         require_ray()
     try:
         settings.recordings[0].mkdir(parents=True, exist_ok=True)
-        stream = log.open("a", encoding="utf-8", buffering=1) if log else sys.stderr
+        stream = log.open("a", encoding="utf-8") if log else sys.stderr
     except OSError as error:
         raise StorageError(f"{error.filename}: cannot be written ({error.strerror}).") from error
-    logs.configure(stream, for_people=log is None and sys.stderr.isatty())
     require_free(settings.recordings[0])  # refused before anybody can ask for anything
     app = create_app(settings)
     listening = bind(settings)
@@ -113,4 +112,5 @@ def command(
     sys.stdout.flush()
     if sys.stderr.isatty():
         say("Ctrl+C stops it.")
-    serve(app, settings, listening)
+    with logs.logged_to(stream, for_people=log is None and sys.stderr.isatty()):
+        serve(app, settings, listening)

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from runner.errors import RunnerError
 from runner.service.doing.order import Order, Outcome
+from runner.service.settings import without_folders
 
 NICENESS: Final = 5
 """Learning gives way to the server, which somebody waits for."""
@@ -80,5 +81,5 @@ def work(pipe: Any, order: Order) -> None:
             outcome = (do_sweep if order.kind == "sweep" else do_config)(order, line)
     except RunnerError as error:
         told = "\n".join([str(error), *getattr(error, "__notes__", [])])
-        outcome = Outcome("failed", told)
+        outcome = Outcome("failed", without_folders(told, order.recordings))
     line.tell("over", outcome)

@@ -73,7 +73,7 @@ def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
             return _form(request, text, fine=found)
         job = jobs.submit(text)
     except RunnerError as error:
-        trouble = trouble_of(error)
+        trouble = trouble_of(error, request.app.state.settings)
         lines = text.splitlines()
         problems = [
             {"line": p.line, "path": p.path, "message": p.message, "text": _line(lines, p.line)}

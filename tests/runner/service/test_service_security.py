@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import io
 import json
+import logging
+import os
 import stat
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import httpx2
 import pytest
@@ -15,6 +18,7 @@ from serving import serving
 
 from runner.cli import cli
 from runner.errors import RunnerError
+from runner.runs import find_run
 from runner.service import logs
 from runner.service.app import create_app
 from runner.service.guard import POLICY
@@ -125,6 +129,13 @@ def test_no_other_site_can_write(connect, settings, headers, recordings):
     assert client.get(RUN).json()["note"] == ""
 
 
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+def test_no_other_site_has_the_service_work_for_it_but_links_lead_here(connect, settings, site):
+    client = connect(settings, **{"Sec-Fetch-Site": site, "Sec-Fetch-Mode": "no-cors"})
+    assert client.get(f"{RUN}/plot.svg").status_code == 403
+    assert client.get("/runs", headers={"Sec-Fetch-Mode": "navigate"}).status_code == 200
+
+
 def test_a_page_of_the_service_can_write():
     assert is_same_origin({"host": "localhost:8000", "origin": "http://localhost:8000"})
     assert is_same_origin({"host": "a.org", "origin": "https://a.org", "sec-fetch-site": "same-origin"})
@@ -204,20 +215,61 @@ def test_a_note_and_tags_are_checked_as_by_the_commands(client):
     assert (back["name"], back["tags"], back["note"]) == ("first", ["keep"], "")
 
 
-def test_the_log_is_json_lines_without_secrets(connect, open_to_others, tokens):
+def test_the_log_is_json_lines_without_secrets(connect, open_to_others, tokens, tmp_path):
     _, secret = tokens.create("laptop", (READ,))
-    stream = io.StringIO()
-    logs.configure(stream)
-    client = connect(open_to_others)
-    client.get(RUNS, params={"filter": f"name:{secret}"}, headers=_bearer(secret))
-    client.get(f"{RUNS}/{secret}", headers=_bearer(secret))
-    lines = [json.loads(line) for line in stream.getvalue().splitlines()]
+    with (tmp_path / "log").open("w") as stream, logs.logged_to(stream):
+        client = connect(open_to_others)
+        client.get(RUNS, params={"filter": f"name:{secret}"}, headers=_bearer(secret))
+        client.get(f"{RUNS}/{secret}", headers=_bearer(secret))
+    text = (tmp_path / "log").read_text()
+    lines = [json.loads(line) for line in text.splitlines()]
     requests = [line for line in lines if line["event"] == "request"]
     assert [line["status"] for line in requests] == [200, 404]
     assert requests[1]["path"].startswith(RUNS)
     assert {"time", "level", "client", "method", "seconds", "bytes"} <= set(requests[0])
-    assert secret not in stream.getvalue()
-    assert secret[10:] not in stream.getvalue()
+    assert secret not in text
+    assert secret[10:] not in text
+
+
+def test_a_log_that_nobody_reads_keeps_nobody_waiting_and_says_what_it_left_out(client):
+    reading, writing = os.pipe()
+    with open(reading, "rb") as pipe, open(writing, "w") as stream:  # noqa: PTH123 - of a descriptor
+        began = time.monotonic()
+        with logs.logged_to(stream):
+            for _ in range(logs.MOST_WAITING + 3_000):
+                logs.LOG.info("said")
+            assert client.get("/healthz").status_code == 200
+            assert time.monotonic() - began < 10
+            read = ThreadPoolExecutor(1).submit(pipe.read)
+            while logging.getLogger(logs.NAME).handlers[0].queue.qsize():
+                time.sleep(0.01)
+            logs.LOG.info("last")
+        stream.close()
+        lines = [json.loads(line) for line in read.result(20).splitlines()]
+    (notice,) = [line for line in lines if line["event"] == "lines left out"]
+    said = sum(line["event"] == "said" for line in lines)
+    assert notice["lines"] + said == logs.MOST_WAITING + 3_000
+    assert lines[-1]["event"] == "last"
+
+
+def test_a_service_whose_log_is_never_read_stops_all_the_same():
+    reading, writing = os.pipe()
+    with open(reading, "rb"), open(writing, "w") as stream:  # noqa: PTH123 - of a descriptor
+        began = time.monotonic()
+        with logs.logged_to(stream):
+            for _ in range(2 * logs.MOST_WAITING):
+                logs.LOG.info("said")
+        assert time.monotonic() - began < logs.GOODBYE_SECONDS + 10
+
+
+def test_no_message_says_where_the_server_keeps_its_files(client, recordings):
+    run = find_run("first", recordings)
+    run.recording.write_bytes(run.recording.read_bytes()[:100] + bytes(100))
+    for address in (f"{RUNS}/first/metrics", f"{RUNS}/first/episodes/train", "/runs/first/evaluations"):
+        answer = client.get(address, headers={"Accept": "text/html"})
+        assert answer.status_code == 409, address
+        assert f"{run.run_id}/recording.mcap" in answer.text
+        assert str(recordings) not in answer.text
 
 
 def test_ready_is_told_with_what_is_missing(client, recordings):

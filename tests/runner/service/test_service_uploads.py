@@ -368,6 +368,32 @@ def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
     assert over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data))).state == "stored"
 
 
+def test_what_is_left_free_stays_free_also_of_bytes_whose_number_is_not_said(tmp_path, monkeypatch):
+    uploads = Uploads(tmp_path / "runs", Limits(spare_bytes=5_000))
+    upload, _ = uploads.begin(ANNA, Announcement())
+    free = iter((7_000, 7_000, 6_000))
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr("runner.service.uploads.shutil.disk_usage", lambda _: usage._replace(free=next(free)))
+    with uploads.appending(upload.upload_id, ANNA, 0, None) as sink:
+        sink.write(bytes(2_000))
+        with pytest.raises(StorageError, match="room for 1,000 bytes"):
+            sink.write(bytes(2_000))
+    assert uploads.offset(upload) == 2_000
+    uploads.close()
+
+
+def test_of_what_is_over_only_so_much_is_remembered(lake, tmp_path):
+    shutil.copytree(lake.folder, tmp_path / "runs" / lake.run_id)
+    uploads = Uploads(tmp_path / "runs", Limits(most_open=3))
+    for number in range(9):
+        known = {"run_id": lake.run_id, "content_digest": lake.summary["content_digest"]}
+        upload, _ = uploads.begin(ANNA, Announcement(digest=f"{number:064}", **known))
+        assert upload.state == "stored"
+    assert len(uploads.all()) == len(list((tmp_path / "runs" / FOLDER).glob("*/upload.json"))) == 4
+    assert uploads.get(upload.upload_id, ANNA).already
+    uploads.close()
+
+
 def test_what_is_over_or_abandoned_is_forgotten_in_time(lake, tmp_path):
     uploads = Uploads(tmp_path / "runs")
     stored = send(uploads, lake.recording.read_bytes())
