@@ -20,7 +20,7 @@ _FOLLOWS = "default_factory_not_called"
 """A default that depends on another value, which is wrong: that one is told."""
 _BRANCHES = frozenset(
     (
-        *("number", "array", "Linear", "Exponential", "Piecewise"),
+        *("integer", "number", "array", "Linear", "Exponential", "Piecewise"),
         *("RandomTable", "RunTable", "SeedRange", "Range", "path", "mapping"),
     )
 )

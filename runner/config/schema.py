@@ -152,6 +152,8 @@ def _simple(branch: Schema) -> str:  # noqa: PLR0911 - one line a kind
 
 
 def _bound(number: float) -> str:
+    if number < 0:
+        return f"-{_bound(-number)}"
     if isinstance(number, int) and number >= 10**9:
         exponent = len(str(number)) - 1
         return f"10^{exponent}" if number == 10**exponent else f"2^{number.bit_length()} - 1"
@@ -162,7 +164,7 @@ def _range(branch: Schema) -> str:
     low, above = branch.get("minimum"), branch.get("exclusiveMinimum")
     high = branch.get("maximum")
     if low is not None and high is not None:
-        return f" from {low} to {_bound(high)}"
+        return f" from {_bound(low)} to {_bound(high)}"
     if above is not None and high is not None:
         return f" above {above} and at most {_bound(high)}"
     return ""

@@ -116,7 +116,7 @@ class RayWorkers:
             actor, task = self._busy.pop(reference)
             try:
                 result: Result = self._ray.get(reference)
-            except self._ray.exceptions.RayActorError:
+            except self._ray.exceptions.RayError:
                 done.append((task, None))
             else:
                 done.append((task, result))

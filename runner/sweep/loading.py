@@ -172,8 +172,7 @@ def _fitting(
 
 def _samples(parameter: Range | list[Any]) -> Iterator[Any]:
     if isinstance(parameter, Range):
-        kind = int if parameter.whole else float
-        yield from (kind(parameter.low), kind(parameter.high))
+        yield from (parameter.at(0), parameter.last)
     else:
         yield from parameter
 

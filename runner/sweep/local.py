@@ -58,9 +58,10 @@ class LocalWorkers:
             worker = self._idle.pop()
             if worker.ask(task):
                 break
+            worker.end()
         else:
             worker = _Worker(self._context, self._stopping)
-            worker.ask(task)
+            worker.ask(task)  # `collect` finds out if it is gone already
         self._busy[worker.pipe] = worker, task
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
@@ -103,7 +104,6 @@ class _Worker:
         try:
             self.pipe.send(task)
         except OSError:
-            self.end()
             return False
         return True
 

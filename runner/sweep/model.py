@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self
+from decimal import Decimal
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
@@ -16,16 +18,28 @@ Strategy = Literal["grid", "random", "tpe", "genetic"]
 At = Literal["last", "best", "area", "first_over"]
 Direction = Literal["maximize", "minimize"]
 
+MAX_TRIALS: Final = 100_000
+
+
+def _number_kind(value: object) -> str | None:
+    if isinstance(value, float):
+        return "number"
+    return "integer" if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+Number = Annotated[
+    Annotated[int, Field(ge=-(10**15), le=10**15), Tag("integer")] | Annotated[float, Tag("number")],
+    Discriminator(_number_kind),
+]
+
 
 class Range(Section):
     """Numbers from `low` to `high`, both included; whole ones if both are whole."""
 
-    low: int | float = Field(description="The lowest value.")
-    high: int | float = Field(description="The highest value.")
+    low: Number = Field(description="The lowest value.")
+    high: Number = Field(description="The highest value.")
     log: bool = Field(default=False, description="Draw evenly in the logarithm, for values over magnitudes.")
-    step: int | float | None = Field(
-        default=None, gt=0, description="Only low, low + step, ...; a grid needs it."
-    )
+    step: Number | None = Field(default=None, description="Only low, low + step, ...; a grid needs it.")
 
     @model_validator(mode="after")
     def _is_a_range(self) -> Self:
@@ -33,6 +47,8 @@ class Range(Section):
             raise refusal(("high",), f"found {self.high:g}, expected a number above low, {self.low:g}")
         if self.log and self.low <= 0:
             raise refusal(("low",), f"found {self.low:g}, expected a number above 0: log is true")
+        if self.step is not None and self.step <= 0:
+            raise refusal(("step",), f"found {self.step:g}, expected a number above 0")
         if self.log and self.step is not None:
             raise refusal(("step",), f"found {self.step:g}, but log is true: leave out one of them")
         return self
@@ -41,6 +57,22 @@ class Range(Section):
     def whole(self) -> bool:
         """Whether its values are whole numbers."""
         return all(isinstance(bound, int) for bound in (self.low, self.high, self.step or 1))
+
+    @property
+    def steps(self) -> int:
+        """How many whole steps there are from `low` up to `high`."""
+        low, high, step = (Decimal(str(number)) for number in (self.low, self.high, self.step or 1))
+        return int((high - low) / step)
+
+    def at(self, number: int) -> int | float:
+        """Return the value after so many steps, as one would write it: 0.3, not 0.1 + 0.2."""
+        value = Decimal(str(self.low)) + number * Decimal(str(self.step or 1))
+        return int(value) if self.whole else float(value)
+
+    @property
+    def last(self) -> int | float:
+        """The highest value, which whole steps come to."""
+        return self.high if self.step is None else self.at(self.steps)
 
 
 def _parameter_kind(value: object) -> str | None:
@@ -137,7 +169,9 @@ class SweepFile(Section):
     parameters: Annotated[dict[str, Parameter], Field(min_length=1)] = Field(
         description="By path of the configuration, such as evaluation.trials: a list, or low and high."
     )
-    trials: Count | None = Field(default=None, description="How many; a grid tries all of its points.")
+    trials: Annotated[int, Field(ge=1, le=MAX_TRIALS)] | None = Field(
+        default=None, description="How many; a grid tries all of its points."
+    )
     batch: Annotated[int, Field(ge=1, le=10_000)] = Field(
         default=10,
         description="How many trials are suggested at once; a generation, if genetic. What is suggested "
@@ -166,11 +200,25 @@ class SweepFile(Section):
                     raise refusal(("parameters", name), "found a range without step: a grid needs one")
                 if isinstance(parameter, Range) and parameter.log:
                     raise refusal(("parameters", name, "log"), "found true, but a grid has steps")
+            if self.grid_points > MAX_TRIALS:
+                message = (
+                    f"found a grid of more points than {MAX_TRIALS:,}: take larger steps, or a strategy that "
+                    "tries some of them"
+                )
+                raise refusal(("parameters",), message)
         elif self.trials is None:
             raise refusal(("trials",), f"missing, expected a whole number: {self.strategy} has no end")
         if self.pruning is not None and self.objective.at == "first_over":
             raise refusal(("pruning",), "found one, but objective.at is first_over, which can come late")
         return self
+
+    @property
+    def grid_points(self) -> int:
+        """How many points the parameters have together, those without steps one a whole number."""
+        return math.prod(
+            parameter.steps + 1 if isinstance(parameter, Range) else len(parameter)
+            for parameter in self.parameters.values()
+        )
 
 
 @dataclass(frozen=True)

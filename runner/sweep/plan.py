@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from runner.amounts import size
 from runner.config import ConfigError, ExperimentConfig, from_mapping
 from runner.errors import StorageError
 from runner.execution import run_job
@@ -19,7 +19,8 @@ from runner.runs import create_run
 from runner.sweep.model import Limits, Sweep
 from runner.sweep.readings import curve_of
 from runner.sweep.search import Search
-from runner.sweep.trials import Standing
+from runner.sweep.task import Task
+from runner.sweep.trials import Room, Standing
 
 BYTES_A_STEP: Final = 17
 BYTES_AN_EPISODE: Final = 40
@@ -65,10 +66,10 @@ def plan_of(sweep: Sweep) -> Plan:
     if not configs:
         raise problems[0]
     mdp = load_mdp(configs[0].env.id, configs[0].env.kwargs, configs[0].rewards)
-    size = _try_out(configs[0], mdp, sweep.objective.metric) + _growth(configs[0], mdp)
+    bytes_a_run = _try_out(configs[0], mdp, sweep.objective.metric) + _growth(configs[0], mdp)
     excluded = len(problems) if sweep.file.strategy == "grid" else 0
     trials = search.trials - excluded
-    return Plan(trials, trials * len(sweep.seeds), size, excluded)
+    return Plan(trials, trials * len(sweep.seeds), bytes_a_run, excluded)
 
 
 def _try_out(config: ExperimentConfig, mdp: Mdp, metric: str) -> int:
@@ -117,8 +118,8 @@ def require_disk(plan: Plan, done: int, recordings: Path) -> None:
     needed, free = max(0, plan.runs - done) * plan.bytes_a_run, free_bytes(recordings)
     if needed > free:
         raise StorageError(
-            f"{recordings}: {plan.runs - done:,} runs need about {needed / 1e9:,.1f} GB, and "
-            f"{free / 1e9:,.1f} GB are free: free some, choose another --recordings, or try fewer values."
+            f"{recordings}: {plan.runs - done:,} runs need about {size(needed)}, and {size(free)} are free: "
+            "free some, choose another --recordings, or try fewer values."
         )
 
 
@@ -128,8 +129,8 @@ def free_bytes(folder: Path) -> int:
     return shutil.disk_usage(there).free
 
 
-def room(limits: Limits, plan: Plan, recordings: Path, before: int) -> Callable[[Standing], str]:
-    """Return what says why no further run may begin.
+def room(limits: Limits, plan: Plan, recordings: Path, before: int) -> Room:
+    """Return what says why a task may not be begun.
 
     Args:
         limits: the sweep's.
@@ -138,19 +139,20 @@ def room(limits: Limits, plan: Plan, recordings: Path, before: int) -> Callable[
         before: the sweep's runs that there were.
     """
 
-    def reason(standing: Standing) -> str:
+    def reason(standing: Standing, task: Task) -> str:
+        runs = before + standing.begun - standing.gone_on
         under_way = (standing.running + 1) * plan.bytes_a_run
-        if limits.runs is not None and before + standing.begun >= limits.runs:
+        if limits.runs is not None and not task.run_id and runs >= limits.runs:
             return f"limits.runs: {limits.runs:,} runs were begun"
         if limits.seconds is not None and standing.seconds >= limits.seconds:
             return f"limits.seconds: {limits.seconds:g} s are over"
         if limits.disk is not None and standing.bytes + under_way > limits.disk:
             return (
-                f"limits.disk: {standing.bytes:,} of {limits.disk:,} bytes are used, and a run needs about "
-                f"{plan.bytes_a_run:,}"
+                f"limits.disk: {size(standing.bytes)} of {size(limits.disk)} are used, and a run needs about "
+                f"{size(plan.bytes_a_run)}"
             )
         if free_bytes(recordings) < under_way:
-            return f"the disk of {recordings} is full: a run needs about {plan.bytes_a_run:,} bytes"
+            return f"the disk of {recordings} is full: a run needs about {size(plan.bytes_a_run)}"
         return ""
 
     return reason

@@ -74,7 +74,7 @@ def picture_of(results: Results) -> Picture:
     """
     drawn = tuple(entry for entry in results.ranking if _drawable(entry))
     if not drawn:
-        raise RunnerError(f"the sweep {results.sweep.name!r} has no finished trial yet: nothing to draw.")
+        raise RunnerError(_nothing_to_draw(results))
     axes = tuple(_axis(path, parameter, drawn) for path, parameter in results.sweep.file.parameters.items())
     values = [value for entry in drawn for value in (entry.low, entry.high) if value is not None]
     objective = results.sweep.objective
@@ -97,7 +97,7 @@ def learning(results: Results, recordings: Path) -> tuple[list[Group], list[Pane
     """
     finished = [entry for entry in results.ranking if entry.state == "finished"]
     if not finished:
-        raise RunnerError(f"the sweep {results.sweep.name!r} has no finished trial yet: nothing to draw.")
+        raise RunnerError(_nothing_to_draw(results))
     chosen = {"median": finished[len(finished) // 2], "best": finished[0]}
     groups = [_group(told, entry, recordings) for told, entry in chosen.items()]
     return groups, panels_of(groups)
@@ -116,6 +116,17 @@ def _group(told: str, entry: Ranked, recordings: Path) -> Group:
             series.append(read_series(recording))
     values = ", ".join(f"{path} {spoken(value)}" for path, value in entry.values.items())
     return Group(f"{told}, trial {entry.number}: {values}", tuple(series))
+
+
+def _nothing_to_draw(results: Results) -> str:
+    finished = sum(entry.state == "finished" for entry in results.ranking)
+    objective = results.sweep.objective
+    why = (
+        f"none of its {finished:,} finished trials came to {objective.described}"
+        if finished
+        else "it has no finished trial yet"
+    )
+    return f"the sweep {results.sweep.name!r}: nothing to draw, as {why}."
 
 
 def _drawable(entry: Ranked) -> bool:

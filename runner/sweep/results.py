@@ -98,7 +98,8 @@ def yaml_of(sweep: Sweep, trial: Trial) -> str:
     config = sweep.config(trial.values | {"name": f"{sweep.name}_best", "recording.steps": "all"})
     head = (
         f"# Trial {trial.number} of the sweep {sweep.name}: {words(trial.values)}.\n"
-        f"# {sweep.objective.described}: {trial.value:g}, the median over {len(trial.results)} seeds.\n"
+        f"# {sweep.objective.described}: {reading(trial.value)}, the median over "
+        f"{len(trial.results)} seeds.\n"
     )
     return head + config.to_yaml()
 
@@ -159,9 +160,9 @@ def _ranking_grid(sweep: Sweep, ranked: Sequence[Ranked]) -> Grid:
         [
             (
                 str(entry.number),
-                _number(entry.median),
+                reading(entry.median),
                 _between(entry.low, entry.high),
-                *((_number(entry.iqm.value), _between(entry.iqm.low, entry.iqm.high)) if means else ()),
+                *((reading(entry.iqm.value), _between(entry.iqm.low, entry.iqm.high)) if means else ()),
                 *(spoken(value) for value in entry.values.values()),
                 entry.state,
             )
@@ -183,13 +184,14 @@ def spoken(value: Any) -> str:
 
 
 def _between(low: float | None, high: float | None) -> str:
-    return f"{_number(low)} to {_number(high)}" if _number(low) else ""
+    return f"{reading(low)} to {reading(high)}" if reading(low) else ""
 
 
-def _number(value: float | None) -> str:
+def reading(value: float | None) -> str:
+    """Return what a trial is worth in words: `never` for a level that was not reached."""
     if value is None or math.isnan(value):
         return ""
-    return "never" if math.isinf(value) else f"{value:,.4g}"
+    return "never" if math.isinf(statistics.bounded(value)) else f"{value:,.4g}"
 
 
 def _ranked(alike: list[Trial]) -> Ranked:

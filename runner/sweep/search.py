@@ -48,7 +48,7 @@ class Search:
         self._space = {path: distribution(parameter) for path, parameter in file.parameters.items()}
         self._study = optuna.create_study(sampler=_sampler(file), direction=file.objective.direction)
         self._asked: dict[int, Any] = {}
-        self.trials = file.trials or math.prod(len(points(each)) for each in file.parameters.values())
+        self.trials = file.trials or file.grid_points
         """How many there are to be."""
 
     def ask(self, count: int) -> list[dict[str, Any]]:
@@ -102,12 +102,15 @@ class Search:
 
     def _grid_point(self, number: int) -> dict[str, Any]:
         """Return a point of the grid, the last parameter changing fastest, as Optuna has it."""
-        rest, point = number, {}
+        point: dict[str, Any] = {}
+        rest = number
         for path, parameter in reversed(self._file.parameters.items()):
-            choices = points(parameter)
-            rest, at = divmod(rest, len(choices))
-            choice = choices[at]
-            point[path] = choice if isinstance(parameter, Range) else json.dumps(choice)
+            if isinstance(parameter, Range):
+                rest, at = divmod(rest, parameter.steps + 1)
+                point[path] = parameter.at(at)
+            else:
+                rest, at = divmod(rest, len(parameter))
+                point[path] = json.dumps(parameter[at])
         return point
 
 
@@ -120,33 +123,11 @@ def distribution(parameter: Range | list[Any]) -> Any:
     if parameter.whole:
         step = int(parameter.step or 1)
         return distributions.IntDistribution(
-            int(parameter.low), _last(parameter), log=parameter.log, step=step
+            int(parameter.low), int(parameter.last), log=parameter.log, step=step
         )
     return distributions.FloatDistribution(
-        float(parameter.low), float(_last(parameter)), log=parameter.log, step=parameter.step
+        float(parameter.low), float(parameter.last), log=parameter.log, step=parameter.step
     )
-
-
-def points(parameter: Range | list[Any]) -> list[Any]:
-    """Return the points of a grid along a parameter."""
-    if not isinstance(parameter, Range):
-        return list(parameter)
-    step = parameter.step or 1
-    count = _steps(parameter) + 1
-    numbers = [parameter.low + step * number for number in range(count)]
-    return [int(number) if parameter.whole else float(number) for number in numbers]
-
-
-def _steps(parameter: Range) -> int:
-    step = parameter.step or 1
-    return math.floor((parameter.high - parameter.low) / step + 1e-9)
-
-
-def _last(parameter: Range) -> Any:
-    """Return the highest value that is reached in whole steps."""
-    if parameter.step is None:
-        return parameter.high
-    return parameter.low + parameter.step * _steps(parameter)
 
 
 def bounds(objective: Objective, curves: list[dict[int, float]], percentile: float) -> dict[int, float]:
@@ -155,7 +136,7 @@ def bounds(objective: Objective, curves: list[dict[int, float]], percentile: flo
     Args:
         objective: says what is better.
         curves: of the trials that are finished: reading by episode.
-        percentile: the share of them that a run may be worse than.
+        percentile: the share of them, in percent, that a run may be worse than.
     """
     bests: dict[int, list[float]] = {}
     for curve in curves:
@@ -164,7 +145,7 @@ def bounds(objective: Objective, curves: list[dict[int, float]], percentile: flo
         for episode, reading in zip(episodes, best, strict=True):
             bests.setdefault(episode, []).append(reading)
     return {
-        episode: objective.sign * float(np.percentile(readings, percentile))
+        episode: objective.sign * float(np.percentile(readings, 100 - percentile))
         for episode, readings in sorted(bests.items())
     }
 

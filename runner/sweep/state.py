@@ -28,7 +28,8 @@ MAX_FAILED_BYTES: Final = 8 << 20
 LOCK: Final = "owner.lock"
 FREE: Final = ("limits",)
 """What may change when a sweep is gone on with: what is done follows from the rest."""
-
+TOLD_ANYWAY: Final = ("base.name", "base.seeds")
+"""What the base has from the sweep, where it is told."""
 
 PRUNED: Final = "pruned"
 """The tag of a run that was given up."""
@@ -88,6 +89,16 @@ def begin(sweep: Sweep, recordings: Path, resume: bool, accept_changes: bool) ->
         RunnerError: there is one of this name already, or it was another.
         StorageError: the folder cannot be written.
     """
+    require_startable(sweep, recordings, resume, accept_changes)
+    _write(folder_of(sweep.name, recordings), write_yaml(sweep.to_mapping()))
+
+
+def require_startable(sweep: Sweep, recordings: Path, resume: bool, accept_changes: bool) -> None:
+    """Refuse what `begin` would refuse, and write nothing.
+
+    Raises:
+        RunnerError: there is one of this name already, or it was another.
+    """
     there = sweep.name in sweeps_in(recordings)
     if there and not resume:
         raise RunnerError(
@@ -103,7 +114,6 @@ def begin(sweep: Sweep, recordings: Path, resume: bool, accept_changes: bool) ->
                 + "\n--accept-changes goes on all the same, and runs that still belong to it count; "
                 "--name begins another."
             )
-    _write(folder_of(sweep.name, recordings), write_yaml(sweep.to_mapping()))
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, str, str]]:
@@ -113,7 +123,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple
     return [
         (key, str(ours.get(key, missing)), str(theirs.get(key, missing)))
         for key in dict.fromkeys([*ours, *theirs])
-        if ours.get(key, missing) != theirs.get(key, missing)
+        if ours.get(key, missing) != theirs.get(key, missing) and key not in TOLD_ANYWAY
     ]
 
 

@@ -89,21 +89,32 @@ def _do_elsewhere(task: Task, stop: Callable[[], bool]) -> Result:
                 shutil.copytree(recordings / task.run_id, own / task.run_id)
             result = do(replace(task, recordings=folder, elsewhere=False), stop)
             for run in list_runs(own):
-                _move_whole(run.folder, recordings)
+                move_whole(run.folder, recordings)
     except OSError as error:
-        return Result("failed", task.run_id, error=f"{recordings}: cannot be written ({error.strerror}).")
+        return Result(
+            "failed", task.run_id, error=f"{recordings}: cannot be written ({error.strerror or error})."
+        )
     return result
 
 
-def _move_whole(run: Path, recordings: Path) -> None:
-    """Put a run's folder among the recordings, in the place of the same one if it is there."""
+def move_whole(run: Path, recordings: Path) -> None:
+    """Put a run's folder among the recordings, in the place of the same one if it is there.
+
+    Raises:
+        OSError: that cannot be; the one that was there stays.
+    """
     place, mark = recordings / run.name, secrets.token_hex(4)
     fresh, old = (recordings / f".{run.name}.{mark}.{kind}" for kind in ("fresh", "old"))
     try:
         shutil.copytree(run, fresh)
         if place.exists():
             place.rename(old)
-        fresh.rename(place)
+        try:
+            fresh.rename(place)
+        except OSError:
+            if old.exists():
+                old.rename(place)
+            raise
     finally:
         for folder in (fresh, old):
             shutil.rmtree(folder, ignore_errors=True)

@@ -98,6 +98,8 @@ class Standing:
     """Trials whose values do not go together; they have no runs."""
     begun: int = 0
     """Runs that this process had begun, or gone on with."""
+    gone_on: int = 0
+    """Of them, those that were there already."""
     bytes: int = 0
     seconds: float = 0.0
     best: Trial | None = None
@@ -106,6 +108,7 @@ class Standing:
 
 
 Report = Callable[[Standing], None]
+Room = Callable[[Standing, Task], str]
 
 
 class Trials:
@@ -191,7 +194,7 @@ def run_sweep(
     *,
     stop: Callable[[], bool] = lambda: False,
     report: Report = lambda _: None,
-    room: Callable[[Standing], str] = lambda _: "",
+    room: Room = lambda *_: "",
     accept_changes: bool = False,
 ) -> tuple[Trials, Standing]:
     """Run what is left of a sweep; return its trials, and how it stands.
@@ -202,7 +205,7 @@ def run_sweep(
         workers: those who do the runs.
         stop: asked several times a second whether to stop.
         report: called with the standing several times a second.
-        room: says why no further run may begin; empty if one may.
+        room: says why a task may not be begun; empty if it may.
         accept_changes: go on with runs that were begun by other code.
 
     Raises:
@@ -230,7 +233,7 @@ class Watch:
 
     stop: Callable[[], bool]
     report: Report
-    room: Callable[[Standing], str]
+    room: Room
 
 
 class _Batch:
@@ -250,7 +253,7 @@ class _Batch:
         self._waiting: deque[Task] = deque()
 
     def prepare(self, bounds: Curve, accept_changes: bool) -> None:
-        """Take in the runs that are over, and find out which are left to do."""
+        """Take in the runs that are over, and find out which are left to do: those that were begun first."""
         tasks: dict[str, Task] = {}
         for trial in self._batch:
             if trial.error:
@@ -264,7 +267,7 @@ class _Batch:
                 else:
                     trial.take(seed, result, self._sweep)
                     self._count(result)
-        self._waiting.extend(tasks.values())
+        self._waiting.extend(sorted(tasks.values(), key=lambda task: not task.run_id))
 
     def run(self, workers: Workers, watch: Watch) -> None:
         """Have every run done; or say in the standing why not, when those under way have come to rest."""
@@ -285,11 +288,14 @@ class _Batch:
         """Give tasks to those who are idle, while there is room for their runs."""
         standing = self._standing
         while self._waiting and workers.idle and not standing.stopped:
-            standing.stopped = watch.room(standing)
+            task = self._waiting[0]
+            standing.stopped = watch.room(standing, task)
             if not standing.stopped:
                 workers.give(self._waiting.popleft())
-                standing.begun += 1
                 standing.running += 1
+                if task.identity not in self._retried:
+                    standing.begun += 1
+                    standing.gone_on += bool(task.run_id)
 
     def _take(self, task: Task, result: Result | None) -> None:
         """Take in what came of a task; that of a worker that died is tried once more."""

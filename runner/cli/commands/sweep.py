@@ -119,9 +119,7 @@ def start(
         _tell_plan(sweep, plan, as_json)
         return
     with state.held(sweep.name, folder):
-        state.begin(sweep, folder, resuming, accept_changes)
-        if retry_failed:
-            state.forget_failures(sweep.name, folder)
+        state.require_startable(sweep, folder, resuming, accept_changes)
         before = len(state.runs_of(sweep.name, folder))
         require_disk(plan, before, folder)
         say(f"{sweep.name}: {plan.runs:,} runs, about {size(plan.bytes)}; {before:,} are begun already.")
@@ -130,6 +128,9 @@ def start(
             interruptible(second=signal.SIG_DFL) as interrupt,
             _table(sweep) as report,
         ):
+            state.begin(sweep, folder, resuming, accept_changes)
+            if retry_failed:
+                state.forget_failures(sweep.name, folder)
             trials, standing = run_sweep(
                 sweep,
                 folder,
@@ -236,7 +237,8 @@ def _workers(count: int | None, ray: str | None, runs: int) -> Iterator[Workers]
     else:
         from runner.sweep.cluster import RayWorkers
 
-        with RayWorkers(count, ray or None, runs) as remote:
+        # What Ray has to say, of a worker that died, it says on stdout, where only results belong.
+        with contextlib.redirect_stdout(sys.stderr), RayWorkers(count, ray or None, runs) as remote:
             yield remote
 
 
@@ -256,7 +258,7 @@ def _table(sweep: Sweep) -> Iterator[Any]:
 def _standing(sweep: Sweep, standing: Standing) -> dict[str, str]:
     """Return how a sweep stands, in words."""
     from runner.cli.output import duration
-    from runner.sweep.results import spoken, words
+    from runner.sweep.results import reading, words
 
     left = standing.runs - standing.done - standing.failed
     here = standing.begun - standing.running
@@ -271,7 +273,7 @@ def _standing(sweep: Sweep, standing: Standing) -> dict[str, str]:
         + f", {duration(standing.seconds)} so far, {size(standing.bytes)} of disk",
     }
     if standing.best is not None:
-        told["best"] = f"{spoken(standing.best.value)} with {words(standing.best.values)}"
+        told["best"] = f"{reading(standing.best.value)} with {words(standing.best.values)}"
     return told
 
 
@@ -309,10 +311,12 @@ def _described(parameter: Any) -> str:
 
 def _tell(sweep: Sweep, trials: Trials, standing: Standing, as_json: bool) -> None:
     """Say what came of it."""
-    from runner.sweep.results import words
+    from runner.analysis.compare.statistics import bounded
+    from runner.sweep.results import reading, words
 
     best = trials.best()
     if as_json:
+        value = None if best is None or best.value is None else bounded(best.value)
         print_json(
             {
                 "name": sweep.name,
@@ -324,13 +328,13 @@ def _tell(sweep: Sweep, trials: Trials, standing: Standing, as_json: bool) -> No
                 "stopped": standing.stopped or None,
                 "seconds": round(standing.seconds, 3),
                 "bytes": standing.bytes,
-                "best": best and {"trial": best.number, "value": best.value, "values": best.values},
+                "best": best and {"trial": best.number, "value": value, "values": best.values},
             }
         )
     else:
         told = _standing(sweep, standing)
         if best is not None:
-            told["best"] = f"{best.value:g} in trial {best.number}: {words(best.values)}"
+            told["best"] = f"{reading(best.value)} in trial {best.number}: {words(best.values)}"
         draw(facts(told | {"next": f"dualtaxi sweep show {sweep.name}"}))
     for trial in trials.told:
         for error in trial.errors if trial.state == "failed" else ():

@@ -6,11 +6,12 @@ import json
 
 import pytest
 from click.testing import CliRunner
+from sweeping import Here
 
 from runner.cli import cli
 from runner.config import load
 from runner.runs import list_runs
-from runner.sweep import plan
+from runner.sweep import cluster, plan
 
 
 @pytest.fixture
@@ -55,10 +56,36 @@ def test_a_limit_stops_it_and_a_raised_one_goes_on(type_in, file, tmp_path):
     assert len(list_runs(tmp_path / "runs")) == 12
 
 
+def test_a_limit_lets_the_runs_that_are_there_be_ended(type_in, file, tmp_path):
+    type_in(str(file(limits={"runs": 3})), "--workers", "1", code=1)
+    first = list_runs(tmp_path / "runs")[-1]
+    first.recording.unlink()
+    first.update(status="interrupted")
+    again = type_in(str(file(limits={"runs": 4})), "--workers", "1", "--resume", "--json", code=1)
+    assert json.loads(again.stdout)["done"] == 4
+    assert {run.status for run in list_runs(tmp_path / "runs")} == {"finished"}
+
+
 def test_a_disk_that_is_too_small_is_told_before_anything_runs(type_in, file, monkeypatch, tmp_path):
-    monkeypatch.setattr(plan, "free_bytes", lambda _: 1000)
-    assert "12 runs need about" in type_in(str(file()), code=1).output
+    with monkeypatch.context() as small:
+        small.setattr(plan, "free_bytes", lambda _: 1000)
+        said = type_in(str(file()), code=1).output
+    assert "12 runs need about" in said
+    assert "and 1.0 kB are free" in said
     assert list_runs(tmp_path / "runs") == []
+    type_in(str(file()), "--workers", "1")  # it has not begun, so nothing is to be resumed
+
+
+def test_a_level_that_is_never_reached_is_never(type_in, file, tmp_path):
+    objective = {"metric": "finish_percent", "at": "first_over", "level": 101, "direction": "minimize"}
+    path = str(file(strategy="random", trials=1, seeds=[0], objective=objective))
+    assert "never in trial 0" in type_in(path, "--workers", "1").stdout
+    assert json.loads(type_in(path, "--resume", "--json").stdout)["best"]["value"] is None
+    best = tmp_path / "best.yaml"
+    type_in("show", "small", "--best", str(best))
+    assert ": never, the median" in best.read_text()
+    plotted = CliRunner().invoke(cli, ["plot", "small", "--recordings", str(tmp_path / "runs")])
+    assert "none of its 1 finished trials came to finish_percent, first at 101" in plotted.output
 
 
 def test_an_unknown_sweep_is_told_with_the_nearest(type_in, file):
@@ -72,6 +99,22 @@ def test_a_misspelt_command_is_no_file(type_in):
     assert "nothing.yaml: no such file" in type_in("nothing.yaml", code=2).output
 
 
+def test_what_ray_says_does_not_mix_with_the_results(type_in, file, monkeypatch):
+    class Talking(Here):
+        def __enter__(self):
+            print("(raylet) A worker died")
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+    monkeypatch.setattr(cluster, "RayWorkers", lambda *_: Talking())
+    told = type_in(str(file()), "--ray", "--json")
+    assert json.loads(told.stdout)["done"] == 12
+    assert "(raylet) A worker died" in told.stderr
+
+
 def test_without_ray_it_is_told(type_in, file, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     assert "pip install 'dualtaxi[ray]'" in type_in(str(file()), "--ray", code=2).output
+    assert type_in("ls", "--json").stdout == "[]\n"

@@ -45,6 +45,28 @@ def test_an_unknown_parameter_is_told_with_its_place_and_the_nearest_name(file):
         ({"parameters": {"step_size": {"low": 0.5, "high": 0.5}}}, 'parameters."step_size"'),
         ({"parameters": {"step_size": {"low": 0.5, "high": 0.5}}}, "above low, 0.5"),
         ({"parameters": {"step_size": []}}, "found an empty list"),
+        (
+            {"parameters": {"step_size": {"low": True, "high": 1}}},
+            "step_size.low: found true, expected a whole",
+        ),
+        (
+            {"parameters": {"step_size": {"low": "x", "high": 1}}},
+            "step_size.low: found 'x', expected a whole",
+        ),
+        ({"parameters": {"step_size": {"low": 0.1, "high": float("inf")}}}, "step_size.high: found .inf"),
+        (
+            {"parameters": {"episodes": {"low": 1, "high": 10**400}}},
+            "expected a whole number from -10^15 to 10^15",
+        ),
+        (
+            {"parameters": {"step_size": {"low": 0.1, "high": 1, "step": -0.1}}},
+            "step: found -0.1, expected a",
+        ),
+        ({"trials": 10**9}, "trials: found 1000000000, expected a whole number from 1 to 100,000"),
+        (
+            {"strategy": "grid", "trials": None, "parameters": {"episodes": {"low": 1, "high": 10**9}}},
+            "parameters: found a grid of more points than 100,000",
+        ),
         ({"parameters": {"step_size": {"low": 0.5, "high": 2.0}}}, "step_size: found 2.0"),
         ({"parameters": {"step_size": {"low": 0, "high": 1.0, "log": True}}}, "above 0: log is true"),
         ({"strategy": "gird"}, "Did you mean 'grid'?"),

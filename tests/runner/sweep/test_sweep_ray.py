@@ -12,6 +12,7 @@ from sweeping import described, digests, swept
 from runner.errors import RunnerError
 from runner.runs import list_runs
 from runner.sweep.loading import from_values
+from runner.sweep.task import Task
 
 pytest.importorskip("ray")
 from runner.sweep.cluster import RayWorkers
@@ -36,6 +37,9 @@ def test_ray_gives_what_local_workers_give_also_when_one_is_killed(tmp_path):
 
     with RayWorkers(2, None, 6) as workers:
         trials, standing = swept(tmp_path / "ray", sweep, workers, report=kill_one)
+        impossible = Task("", 0, {}, "small", (), None, sweep.objective, run_id="none")  # a TypeError
+        workers.give(impossible)
+        assert workers.collect(60) == [(impossible, None)]
     assert killed
     assert (standing.done, standing.failed) == (6, 0)
     assert len(list_runs(tmp_path / "ray")) == 6

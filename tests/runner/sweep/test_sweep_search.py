@@ -29,6 +29,18 @@ def test_a_grid_is_all_points_in_order():
     ]
 
 
+def test_a_range_goes_up_to_its_last_step_in_numbers_as_one_writes_them():
+    parameters = {
+        "discount": {"low": 0.7, "high": 0.9, "step": 0.1},
+        "epsilon": {"low": 0, "high": 0.3, "step": 0.1},
+    }
+    grid = searched(strategy="grid", trials=None, parameters=parameters).ask(12)
+    assert [values["discount"] for values in grid[::4]] == [0.7, 0.8, 0.9]
+    assert [values["epsilon"] for values in grid[:4]] == [0.0, 0.1, 0.2, 0.3]
+    drawn = searched(strategy="random", trials=30, parameters=parameters).ask(30)
+    assert {round(values["discount"], 6) for values in drawn} == {0.7, 0.8, 0.9}
+
+
 def test_choices_may_be_of_any_kind():
     choices = [{"schedule": "linear", "start": 1.0, "end": 0.1, "over": 10}, 0.5]
     search = searched(strategy="grid", trials=None, parameters={"epsilon": choices})
@@ -80,6 +92,12 @@ def test_what_a_run_is_worth(objective, expected):
 
 def test_a_run_without_readings_is_worth_nothing_known():
     assert math.isnan(value_of(Objective(), {}))
+
+
+def test_a_run_may_be_worse_than_the_share_that_is_said():
+    curves = [{100: float(reading)} for reading in range(11)]
+    assert bounds(Objective(), curves, 80.0) == {100: 2.0}
+    assert bounds(Objective(direction="minimize"), curves, 80.0) == {100: 8.0}
 
 
 def test_a_run_is_hopeless_when_its_best_is_worse_than_most():

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
 import signal
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from sweeping import Here, described, digests, swept
@@ -18,11 +20,13 @@ from runner.execution import run_job
 from runner.job import Job
 from runner.labels import read_labels
 from runner.runs import create_run, find_run, list_runs
-from runner.sweep import state
+from runner.sweep import local, state
 from runner.sweep.loading import from_values
 from runner.sweep.local import LocalWorkers
+from runner.sweep.model import Objective
 from runner.sweep.plan import plan_of
 from runner.sweep.results import ranking, results_of, sections
+from runner.sweep.task import Task, move_whole
 
 
 def test_each_run_is_an_ordinary_one_tagged_with_the_sweep(done):
@@ -131,9 +135,47 @@ def test_a_killed_process_is_replaced_and_its_run_gone_on_with(tmp_path):
     assert digests(trials) == digests(fresh)
 
 
+def test_a_process_that_is_gone_before_its_task_comes_is_replaced(done, monkeypatch):
+    real, gone = local._Worker.ask, []
+
+    def ask(worker, task):
+        if not gone:
+            gone.append(worker)
+            worker._process.kill()
+            worker._process.join()
+        return real(worker, task)
+
+    monkeypatch.setattr(local._Worker, "ask", ask)
+    folder, trials, _ = done
+    said = trials.told[0].results[0]
+    task = Task("", 0, {}, "small", (), str(folder), Objective(metric="mean_length"), run_id=said.run_id)
+    with LocalWorkers(1) as workers:
+        workers.give(task)
+        assert workers.collect(30) == [(task, None)]
+        workers.give(task)
+        ((_, result),) = workers.collect(30)
+    assert (result.status, result.digest) == ("finished", said.digest)
+
+
+def test_a_run_that_cannot_be_moved_leaves_the_one_that_was_there(done, monkeypatch, tmp_path):
+    run = list_runs(done[0])[0].folder
+    shutil.copytree(run, tmp_path / run.name)
+    real = Path.rename
+
+    def rename(path, to):
+        if path.name.endswith(".fresh"):
+            raise OSError(5, "Input/output error")
+        return real(path, to)
+
+    monkeypatch.setattr(Path, "rename", rename)
+    with pytest.raises(OSError, match="Input/output"):
+        move_whole(run, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [run.name]
+
+
 def test_hopeless_runs_are_given_up_and_stay_so(tmp_path):
     objective = {"metric": "training.percent_filled", "at": "last"}
-    pruning = {"after": 20, "trials": 2, "percentile": 80}
+    pruning = {"after": 20, "trials": 2, "percentile": 20}
     parameters = {"epsilon": [0.0, 1.0], "step_size": {"low": 0.1, "high": 1.0}}
     changes = {"trials": 12, "pruning": pruning, "objective": objective, "parameters": parameters}
     sweep = from_values(described(strategy="random", seeds=[0], **changes))
@@ -177,10 +219,11 @@ def test_values_that_do_not_go_together_are_left_out(tmp_path):
 
 def test_a_changed_sweep_is_refused_with_what_changed(sweep, tmp_path):
     state.begin(sweep, tmp_path, resume=False, accept_changes=False)
-    changed = from_values(described(trials=9, limits={"runs": 3}))
+    changed = from_values(described(trials=9, seeds=[0, 2], limits={"runs": 3}))
     with pytest.raises(RunnerError, match="trials: 6, now 9") as caught:
         state.begin(changed, tmp_path, resume=True, accept_changes=False)
     assert "limits" not in str(caught.value)
+    assert str(caught.value).count("seeds") == 1
     state.begin(changed, tmp_path, resume=True, accept_changes=True)
     assert state.read_sweep("small", tmp_path) == changed
 
