@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, Self
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -21,6 +21,8 @@ from runner.wrappers.staged import AgentRows, VectorRows
 
 class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any]):
     """A vector environment whose every reset and step is recorded; made by `record_vector`."""
+
+    env: VectorEnv[Any, Any, Any]
 
     def __init__(self, env: VectorEnv[Any, Any, Any], loop: Loop[VectorRows], mode: AutoresetMode) -> None:
         VectorWrapper.__init__(self, env)
@@ -60,23 +62,6 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
         self._over = self._over & ~which
         self._loop.reset_info(self._phase, result[1], asked, None)
         return result
-
-    def close(self, **kwargs: Any) -> None:
-        """Close the environments and the recording, as finished."""
-        try:
-            self.env.close(**kwargs)
-        finally:
-            self._loop.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: Any) -> Literal[False]:
-        try:
-            self.env.close()
-        finally:
-            self._leave(raised[1])
-        return False
 
 
 def record_vector(
@@ -171,23 +156,6 @@ class RecordedParallel(Recorded[AgentRows]):
             self._rows.reset(result[0], seed)
         self._loop.reset_info(self._phase, _by_field(result[1]), options, seed)
         return result  # type: ignore[no-any-return]
-
-    def close(self) -> None:
-        """Close the environment and the recording, as finished."""
-        try:
-            self.env.close()
-        finally:
-            self._loop.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: Any) -> Literal[False]:
-        try:
-            self.env.close()
-        finally:
-            self._leave(raised[1])
-        return False
 
 
 def record_parallel(

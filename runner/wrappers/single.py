@@ -21,7 +21,10 @@ from runner.wrappers.rows import ROWS, Rows
 class Recorded(Generic[R]):
     """What every recorded environment offers beside the environment; a context manager."""
 
+    env: Any
     _loop: Loop[R]
+    _owner: Recorded[R] | None = None
+    """Who closes the recording, if another one; kept alive as long as this is."""
     _phase: str
     _rows: R
 
@@ -62,6 +65,25 @@ class Recorded(Generic[R]):
         finally:
             self._enter(before)
 
+    def close(self, **kwargs: Any) -> None:
+        """Close the environment and the recording, as finished; not that of another it is recorded into."""
+        try:
+            self.env.close(**kwargs)
+        finally:
+            if self._owner is None:
+                self._loop.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> Literal[False]:
+        try:
+            self.env.close()
+        finally:
+            if self._owner is None:
+                self._leave(raised[1])
+        return False
+
     def _enter(self, phase: str) -> None:
         self._phase = phase
         self._rows = self._loop.rows(phase)
@@ -84,6 +106,8 @@ class Recorded(Generic[R]):
 class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     """A Gymnasium environment whose every reset and step is recorded; made by `record`."""
 
+    env: gymnasium.Env[Any, Any]
+
     def __init__(
         self,
         env: gymnasium.Env[Any, Any],
@@ -93,7 +117,6 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> None:
         gymnasium.Wrapper.__init__(self, env)
         self._owner = owner
-        """Who closes the recording, if another one; kept alive as long as this is."""
         self._env_step = env.step
         self._lock = loop.lock
         self._watched = bool(loop.plan.info or loop.plan.frames_every)
@@ -132,22 +155,6 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
             self._until_frame = self._loop.plan.frames_every
             self._loop.frame(self._phase, self.env.render())
         return result
-
-    def close(self) -> None:
-        """Close the environment and the recording, as finished; not that of another it is recorded into."""
-        try:
-            self.env.close()
-        finally:
-            if self._owner is None:
-                self._loop.close()
-
-    def __exit__(self, *raised: Any) -> Literal[False]:
-        try:
-            self.env.close()
-        finally:
-            if self._owner is None:
-                self._leave(raised[1])
-        return False
 
     def _watch(self, info: Mapping[str, Any], over: bool) -> None:
         """Record what else is asked for of the step that was just put down."""

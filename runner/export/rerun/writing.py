@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError, StorageError
@@ -53,34 +55,21 @@ def export(sources: Sequence[Source], request: Request, path: Path) -> list[Sele
         StorageError: the file cannot be written.
     """
     selections = [select(source.recording, request) for source in sources]
-    fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     stream = new_stream("-".join(source.recording.run["run_id"] for source in sources))
     if any(source.recording.kind != "job" for source in sources):
-        return _export_loops(stream, sources, selections, path, fresh)
+        return _export_loops(stream, sources, selections, path)
     exporters = [
         RunExporter(stream, source, selection) for source, selection in zip(sources, selections, strict=True)
     ]
-    try:
-        stream.save(fresh, default_blueprint=blueprint([exporter.shown for exporter in exporters]))
-        stream.send_recording_name(" and ".join(source.title for source in sources))
+    shown = blueprint([exporter.shown for exporter in exporters])
+    with _saved(stream, sources, path, shown):
         for exporter in exporters:
             exporter.export()
-        stream.flush()
-        stream.disconnect()
-        fresh.replace(path)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        fresh.unlink(missing_ok=True)
     return selections
 
 
 def _export_loops(
-    stream: rr.RecordingStream,
-    sources: Sequence[Source],
-    selections: list[Selection],
-    path: Path,
-    fresh: Path,
+    stream: rr.RecordingStream, sources: Sequence[Source], selections: list[Selection], path: Path
 ) -> list[Selection]:
     """Write somebody's own loops to an `.rrd` file."""
     from runner.export.rerun.loops import LoopExporter
@@ -95,19 +84,26 @@ def _export_loops(
         LoopExporter(stream, source.recording, selection, source.root)
         for source, selection in zip(sources, selections, strict=True)
     ]
-    try:
-        stream.save(fresh)
-        stream.send_recording_name(" and ".join(source.title for source in sources))
+    with _saved(stream, sources, path):
         for exporter in exporters:
             exporter.export()
-        stream.send_blueprint(
-            loop_blueprint(
-                [
-                    exporter.blueprint(source.title)
-                    for exporter, source in zip(exporters, sources, strict=True)
-                ]
-            )
-        )
+        views = [
+            exporter.blueprint(source.title) for exporter, source in zip(exporters, sources, strict=True)
+        ]
+        stream.send_blueprint(loop_blueprint(views))
+    return selections
+
+
+@contextlib.contextmanager
+def _saved(
+    stream: rr.RecordingStream, sources: Sequence[Source], path: Path, shown: rrb.Blueprint | None = None
+) -> Iterator[None]:
+    """Save what is sent to a stream as a file, which is there whole or not at all."""
+    fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        stream.save(fresh, default_blueprint=shown)
+        stream.send_recording_name(" and ".join(source.title for source in sources))
+        yield
         stream.flush()
         stream.disconnect()
         fresh.replace(path)
@@ -115,7 +111,6 @@ def _export_loops(
         raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
     finally:
         fresh.unlink(missing_ok=True)
-    return selections
 
 
 def new_stream(recording_id: str) -> rr.RecordingStream:
