@@ -82,7 +82,7 @@ def _page(catalogue: Catalogue, text: str, sort: str, columns: str, number: int)
         return with_originals(found, index), total, index.count(Filter(None)) if text else total
 
     rows, total, everything = catalogue.read(work)
-    asked = {"filter": text, "sort": sort, "columns": [] if shown == list(USUAL) else [",".join(shown)]}
+    asked = {"filter": text, "sort": sort, "columns": _asked(shown)}
     return render(
         "/runs",
         "runs.html",
@@ -99,15 +99,22 @@ def _page(catalogue: Catalogue, text: str, sort: str, columns: str, number: int)
 
 
 def _frame(text: str, sort: str, shown: Sequence[str]) -> dict[str, Any]:
-    """Return what stands around the rows."""
+    """Return what stands around the rows: the columns that are shown first, in their order."""
+    known = [column for column in shown if column in FIELDS]
     return {
         "filter": text,
         "sort": sort,
         "columns": shown,
+        "asked_columns": _asked(shown),
         "settings": [column for column in shown if column.startswith(SETTING)],
-        "fields": [(field.name, field.meaning) for field in FIELDS.values()],
+        "fields": [(name, FIELDS[name].meaning) for name in dict.fromkeys([*known, *FIELDS])],
         "headings": HEADINGS,
     }
+
+
+def _asked(shown: Sequence[str]) -> str:
+    """Return the columns as an address has them; nothing if they are the usual ones."""
+    return "" if list(shown) == list(USUAL) else ",".join(shown)
 
 
 def _head(column: str, asked: dict[str, Any]) -> dict[str, Any]:

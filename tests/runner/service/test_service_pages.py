@@ -44,6 +44,19 @@ def test_runs_are_searched_sorted_and_their_columns_chosen(client):
     assert "first</a>" not in page
 
 
+def test_a_search_keeps_the_columns_and_their_order(client):
+    page = page_of(client, "/runs?columns=age,name,id&filter=first")
+    assert '<input type="hidden" name="columns" value="age,name,id">' in page
+    assert re.findall(r'<input type="checkbox" name="columns" value="(\w+)" checked>', page) == [
+        "age",
+        "name",
+        "id",
+    ]
+    assert 'name="columns" value="id' not in re.sub(
+        r'<input type="checkbox"[^>]*>', "", page_of(client, "/runs")
+    )
+
+
 @pytest.mark.parametrize("query", ["filter=status:", "sort=bogus", "columns=bogus"])
 def test_a_filter_that_is_none_is_told(client, query):
     page = page_of(client, f"/runs?{query}", 400)

@@ -3,13 +3,16 @@ const head = document.querySelector("[data-job]");
 const [state, progress, runs, log] = ["state", "progress", "runs", "log"].map((name) => document.querySelector(`[data-${name}]`));
 const count = (number) => number.toLocaleString("en");
 let seen = Number(head.dataset.place);
+log.scrollTop = log.scrollHeight;
 
 function line(time, text) {
   const item = document.createElement("li"), when = document.createElement("time");
   when.dateTime = time ?? "";
   when.textContent = (time ?? "").slice(11, 19);
   item.append(when, " ", text);
+  const isAtEnd = log.scrollHeight - log.scrollTop - log.clientHeight < 40;
   log.append(item);
+  if (isAtEnd) log.scrollTop = log.scrollHeight;
 }
 
 function said(data) {

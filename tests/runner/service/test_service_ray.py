@@ -1,0 +1,65 @@
+"""A job of the service, done by a cluster of Ray."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import pytest
+
+import runner
+from runner.recording.reader import open_recording
+from runner.runs import list_runs
+from runner.service.work import Jobs
+
+pytest.importorskip("ray")
+from runner.sweep.cluster import connect
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, about its future defaults and open files
+
+CONFIG = {
+    "name": "icy",
+    "env": {"id": "FrozenLake-v1"},
+    "episodes": 60,
+    "evaluation": {"every": 30, "trials": 5},
+    "seeds": [0, 1],
+}
+ENDLESS = CONFIG | {"name": "endless", "episodes": 10**9, "seeds": [0], "recording": {"steps": "none"}}
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Return the address of a cluster of this machine alone."""
+    ray = connect(None, 2)
+    yield ray.get_runtime_context().gcs_address
+    ray.shutdown()
+
+
+def until(jobs, number, is_so):
+    deadline = time.monotonic() + 60
+    while not is_so(jobs.queue.job(number)):
+        assert time.monotonic() < deadline, (jobs.queue.job(number), jobs.events(number))
+        time.sleep(0.05)
+
+
+def test_a_job_is_done_by_ray_as_beside_the_server_and_can_be_cancelled(cluster, tmp_path):
+    here = runner.run_all(CONFIG, recordings=tmp_path / "here")
+    with Jobs(tmp_path / "far", 1, ray=cluster) as jobs:
+        number = jobs.submit(json.dumps(CONFIG), "job.yaml").number
+        until(jobs, number, lambda job: job.is_over)
+        assert jobs.queue.job(number).state == "finished", jobs.queue.job(number).error
+        far = sorted(list_runs(tmp_path / "far"), key=lambda run: run.seed)
+        digests = [[run.summary["content_digest"] for run in runs] for runs in (far, here)]
+        assert digests[0] == digests[1]
+        assert jobs.queue.runs_of(number) == {run.seed: run.run_id for run in far}
+        told = {event.kind for event in jobs.events(number)[0]}
+        assert told == {"state", "run", "log"}
+        with open_recording(far[0].recording) as recording:
+            assert "ray" in recording.provenance["command"]
+        endless = jobs.submit(json.dumps(ENDLESS), "job.yaml").number
+        until(jobs, endless, lambda _: (jobs.progress(endless) or {}).get("episode", 0) > 0)
+        jobs.cancel(endless)
+        until(jobs, endless, lambda job: job.is_over and not jobs.standing().running)
+        assert jobs.queue.job(endless).state == "cancelled"
+    (run,) = [run for run in list_runs(tmp_path / "far") if run.name == "endless"]
+    assert run.status == "interrupted"
