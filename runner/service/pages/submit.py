@@ -14,6 +14,7 @@ from fastapi.responses import RedirectResponse
 from runner.config.document import write_yaml
 from runner.config.schema import json_schema, without_references
 from runner.errors import RunnerError
+from runner.service.checking import SWEEP_KEYS
 from runner.service.dependencies import CatalogueOf, JobsOf
 from runner.service.pages.forms import Form
 from runner.service.pages.rendering import page
@@ -92,9 +93,11 @@ def _form(
     fine: Any = None,
     status: HTTPStatus = HTTPStatus.OK,
 ) -> Response:
-    return page(
-        request, "submit.html", status, text=text, problems=problems or [], fine=fine, keys=keys_of_config()
-    )
+    lines = text.splitlines()
+    is_sweep = any(line.startswith(f"{key}:") for line in lines for key in SWEEP_KEYS)
+    told = {"text": text, "problems": problems or [], "fine": fine}
+    told |= {"keys": keys_of_config(), "keys_of_sweep": keys_of_sweep() if is_sweep else []}
+    return page(request, "submit.html", status, **told)
 
 
 def _line(lines: list[str], number: int | None) -> str:
@@ -110,6 +113,14 @@ def keys_of_config() -> list[dict[str, Any]]:
     """Return the keys of a configuration, with what the schema says of each."""
     schema = without_references(json_schema())
     return list(_keys(schema["properties"]))
+
+
+@functools.cache
+def keys_of_sweep() -> list[dict[str, Any]]:
+    """Return the keys of a sweep, in the same way."""
+    from runner.sweep.model import SweepFile
+
+    return list(_keys(without_references(SweepFile.model_json_schema())["properties"]))
 
 
 def _keys(properties: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

@@ -44,6 +44,17 @@ def test_runs_are_searched_sorted_and_their_columns_chosen(client):
     assert "first</a>" not in page
 
 
+def test_the_keys_of_what_is_submitted_are_told(client):
+    config, sweep = page_of(client, "/submit"), page_of(client, "/submit?sweep=true")
+    assert "<code>epsilon</code>" in config
+    assert "<code>strategy</code>" not in config
+    assert (
+        sweep.index("<code>strategy</code>")
+        < sweep.index("Keys of its base")
+        < sweep.index("<code>epsilon</code>")
+    )
+
+
 def test_a_search_keeps_the_columns_and_their_order(client):
     page = page_of(client, "/runs?columns=age,name,id&filter=first")
     assert '<input type="hidden" name="columns" value="age,name,id">' in page
