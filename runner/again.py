@@ -110,6 +110,9 @@ def evaluation_of(
     with open_recording(run.recording) as recording:
         chosen = last_step(recording) if step is None else step
         tables_at(recording, chosen)  # refused here, before there is a run
+        states = recording.mdp.states
+        if isinstance(start, int) and not 0 <= start < states:
+            raise RunnerError(f"--start: found state {start}, expected one of 0 to {states - 1}.")
         starts = int(np.count_nonzero(recording.mdp.start))
         original = from_mapping(recording.config)
     return _with(

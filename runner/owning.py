@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Final
 
 from filelock import FileLock, Timeout
@@ -36,7 +37,8 @@ def owned(run: Run, archived: bool = False) -> Iterator[Run]:
         raise StorageError(f"{run.folder}: cannot be written ({error.strerror}).") from error
     try:
         if run.facts.get("recording", RECORDING_FILE) == RECORDING_FILE:
-            run = find_run(os.fspath(run.folder.absolute()), run.folder.parent)
+            now = find_run(os.fspath(run.folder.absolute()), run.folder.parent)
+            run = replace(now, folder=run.folder)  # called as it was: what is told of it names its path
         if run.status == "running":
             owner = run.facts.get("owner", {})
             raise RunnerError(

@@ -47,6 +47,6 @@ def find_run(name: str, recordings: Path, tell: Callable[[str], None] = lambda _
     if known is not None:
         return known
     found = the_one(name, candidates(recordings, tell), recordings)
-    for run in runs_in(Path(found.root, found.entry)):
+    for run in runs_in(recordings / found.entry):
         return run
     raise RunNotFound(f"run {found.run_id} was removed just now.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -9,6 +10,7 @@ from typing import Any, Final
 
 from peewee import BigIntegerField, BooleanField, CompositeKey, Field, FloatField, Model, TextField
 
+from runner.errors import RecordingError
 from runner.runs import Run
 
 SEEDS: Final = 2**64
@@ -112,7 +114,7 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         "note": text(run.note),
         "words": text("\n".join([run.run_id, run.name, called or "", *run.tags, run.note]), 3 * _TEXT),
         "created": math.floor(run.created.timestamp() * 1000),
-        "episodes": whole(summary.get("episodes")),
+        "episodes": whole(summary["episodes"] if "episodes" in summary else _recorded_episodes(run)),
         "episodes_to_do": whole(config.get("episodes")),
         "steps": None if train is None or evaluation is None else train + evaluation,
         "train_steps": train,
@@ -128,6 +130,18 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         "archive": text(run.archive.get("target")),
         "settings": json.dumps(dict(_flat(config))),
     }
+
+
+def _recorded_episodes(run: Run) -> int | None:
+    """Return how far a run came that was ended before it could say so; None if nobody can tell, or yet."""
+    from runner.recording.reader import open_recording
+    from runner.recording.schema import TRAIN_EPISODE
+
+    if run.status not in ("interrupted", "failed") or not run.recording.exists():
+        return None
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        return recording.count(TRAIN_EPISODE)
+    return None
 
 
 def text(value: Any, most: int = _TEXT) -> str | None:

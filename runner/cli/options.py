@@ -121,7 +121,31 @@ def find_recorded(name: str, recordings: Path | None) -> Any:
 
 
 def recorded(run: Any) -> Any:
-    """Return a run with its recording at hand: restored into the cache if it is archived, and said so."""
+    """Return a run with its recording at hand: restored into the cache if it is archived, and said so.
+
+    Raises:
+        RunnerError: it has none.
+    """
+    run = restored(run)
+    if not run.recording.exists():
+        raise RunnerError(_without_recording(run))
+    return run
+
+
+def _without_recording(run: Any) -> str:
+    """Return what can be done about a run whose recording is missing."""
+    if run.status == "running":
+        return f"run {run.run_id} has no recording yet: it has just begun."
+    if "made_by" in run.facts.get("config", {}):
+        return f"run {run.run_id} has no recording, and only the loop that it was made by can make another."
+    return (
+        f"run {run.run_id} has no recording: {run.recording} is missing. `dualtaxi resume {run.run_id}` does "
+        "it from the beginning."
+    )
+
+
+def restored(run: Any) -> Any:
+    """Return a run, restored into the cache if it is archived, and said so."""
     if run.status != "archived":
         return run
     from runner.archive.places import at_hand

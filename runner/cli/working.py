@@ -27,11 +27,6 @@ def recording_of(name: str, recordings: Path | None) -> tuple[Path, Run | None]:
     """
     try:
         run = find_recorded(name, recordings)
-        if run.status in ("interrupted", "failed") and not run.recording.exists():
-            raise RunnerError(
-                f"run {run.run_id} has no recording: it ended before there was one. "
-                f"`dualtaxi resume {run.run_id}` does it from the beginning."
-            )
         in_folder = run.recording.name == RECORDING_FILE and (run.folder / RUN_FILE).is_file()
         return run.recording, run if in_folder else None
     except (RunNotFound, RecordingError):

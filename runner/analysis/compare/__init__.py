@@ -18,7 +18,7 @@ import numpy as np
 from runner.analysis.compare import statistics
 from runner.analysis.compare.moments import HIGHER_IS_BETTER, Moment, value_of
 from runner.analysis.compare.statistics import Estimate, Values
-from runner.analysis.series import Group, points_of, title_of
+from runner.analysis.series import Group, is_loop, points_of, title_of
 
 THRESHOLDS: Final = 101
 
@@ -123,13 +123,13 @@ def compare(
 
 
 def _few(groups: Sequence[Group]) -> list[str]:
-    few = [f"{group.label} ({len(group.runs)})" for group in groups if len(group.runs) < statistics.FEW_SEEDS]
+    few = [group for group in groups if len(group.runs) < statistics.FEW_SEEDS]
     if not few:
         return []
-    return [
-        f"fewer than {statistics.FEW_SEEDS} seeds in {', '.join(few)}: take the intervals as a hint; "
-        "`--set 'seeds={count: 10}'` runs ten"
-    ]
+    told = ", ".join(f"{group.label} ({len(group.runs)})" for group in few)
+    loops = all(is_loop(run) for group in few for run in group.runs)
+    more = "record more, each with a seed of its own" if loops else "`--set 'seeds={count: 10}'` runs ten"
+    return [f"fewer than {statistics.FEW_SEEDS} seeds in {told}: take the intervals as a hint; {more}"]
 
 
 def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> MetricResult:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
+from runner.cli.options import find, json_option, recordings_option, restored, run_argument
 from runner.cli.output import UNKNOWN, age, console, draw, duration, facts, print_json, say, size, title
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
       dualtaxi show @latest
       dualtaxi show k3v9m2xq --json
     """  # noqa: D301 - Click wants the backspace itself
-    run = find_recorded(run_name, recordings)
+    run = restored(find(run_name, recordings))
     from runner.description import described
 
     told = described(run, say)

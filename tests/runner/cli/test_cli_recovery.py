@@ -9,10 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from runner.analysis.tables import tables_at
+from runner.cli import cli
+from runner.owner import owner
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.contents import survey
@@ -75,13 +78,41 @@ def test_another_writers_file(command, tmp_path, name):
 # --- resume -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["verify", "repair"])
+@pytest.mark.parametrize("name", ["verify", "repair", "play", "qtable", "plot"])
 def test_a_run_that_was_killed_before_it_had_a_recording(command, copied, name):
     copied.recording.unlink()
     copied.update(status="interrupted", summary={})
     result = command(name, copied.run_id)
     assert result.exit_code == 2
     assert f"`dualtaxi resume {copied.run_id}` does it from the beginning" in result.stderr
+
+
+def test_what_a_missing_recording_leaves_to_do_depends_on_the_run(command, copied):
+    copied.recording.unlink()
+    assert command.json("show", copied.run_id)["status"] == "finished"
+    loop = copied.update(config={"made_by": "runner.record"})
+    assert "only the loop that it was made by" in command("play", loop.run_id).stderr
+    copied.update(status="running", owner=owner())
+    assert "it has just begun" in command("play", copied.run_id).stderr
+
+
+def test_ls_says_how_far_a_killed_run_got(command, copied):
+    cut(copied, 0.7)
+    (told,) = command.json("ls")
+    with open_recording(copied.recording) as recording:
+        assert told["episodes"] == recording.count(schema.TRAIN_EPISODE) < told["episodes_to_do"]
+    assert f"{told['episodes']:,} of {told['episodes_to_do']:,}" in command("ls").stdout
+    copied.recording.write_bytes(b"nothing that can be read")
+    assert command.json("ls")[0]["episodes"] is None
+
+
+def test_a_run_is_told_by_the_path_that_it_was_found_by(command, copied, monkeypatch):
+    monkeypatch.chdir(command.recordings.parent)
+    cut(copied)
+    words = ["resume", "@latest", "--recordings", command.recordings.name]
+    said = CliRunner().invoke(cli, words).stdout
+    assert str(Path(command.recordings.name, copied.run_id)) in said
+    assert str(command.recordings) not in said
 
 
 def test_resume(command, copied, recorded_run):
@@ -311,7 +342,7 @@ def test_evaluate(command, copied):
     [
         (("--all", "--trials", 3), "--all plays each start state once"),
         (("--step", 10**9), "expected at least"),
-        (("--start", 10**7), "evaluation.start"),
+        (("--start", 10**7), "--start: found state 10000000, expected one of 0 to 6143."),
         (("--seed", -1), "-1"),
     ],
 )
