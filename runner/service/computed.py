@@ -7,20 +7,24 @@ import io
 import json
 import math
 from collections.abc import Mapping, Sequence
+from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RunnerError
-from runner.frames import Phase, episode_columns, step_columns
+from runner.frames import Phase, episode_columns, evaluation_records, step_columns, training_records
 from runner.recording.reader import open_recording
+from runner.service.refused import Refused
 
 if TYPE_CHECKING:
     from runner.analysis.series import RunSeries
     from runner.export.rerun.selection import Request
     from runner.runs import Run
+
+Which = Literal["evaluations", "training", "optimality"]
 
 
 def curves(path: Path, chosen: Sequence[str], start: int, stop: int | None, points: int) -> bytes:
@@ -52,6 +56,36 @@ def curves(path: Path, chosen: Sequence[str], start: int, stop: int | None, poin
             "thinned": bool(len(kept) < inside.sum()),
         }
     return as_json({"run_id": series.run_id, "curves": list(found.values())})
+
+
+def records(path: Path, which: Which, start: int, stop: int, most: int) -> bytes:
+    """Return evaluations, reports of training or exact measures number `start` up to `stop`, as JSON.
+
+    Raises:
+        Refused: they are more than `most`.
+        RecordingError: the recording cannot be read, or is of a loop, which has none.
+    """
+    with open_recording(path) as recording:
+        if which == "optimality":
+            found = list(recording.optimality())
+        else:
+            recording.require_job(
+                "a report of training or an evaluation", "Its metrics can be had all the same."
+            )
+            found = (evaluation_records if which == "evaluations" else training_records)(recording)
+        shown = found[start:stop]
+        if len(shown) > most:
+            raise too_many(len(shown), most)
+        told = {"run_id": recording.run["run_id"], "start": start, "total": len(found), "records": shown}
+        return as_json(told)
+
+
+def too_many(found: int, most: int) -> Refused:
+    """Return the error that a range is too long."""
+    return Refused(
+        HTTPStatus.UNPROCESSABLE_ENTITY,
+        f"query: found a range of {found:,} records, expected at most {most:,}; ask for them in parts.",
+    )
 
 
 def _lines(series: RunSeries) -> dict[tuple[str, str], tuple[NDArray[np.float64], NDArray[np.float64]]]:

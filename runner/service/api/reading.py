@@ -8,15 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel
 
-from runner.frames import Phase, episode_columns, evaluation_records, step_columns, training_records
+from runner.frames import Phase, episode_columns, step_columns
 from runner.recording.reader import Recording
 from runner.service import computed
+from runner.service.computed import too_many
 from runner.service.dependencies import ApartOf, KeptOf, OpenRecording, RecordedRun, SettingsOf, state_of
 from runner.service.kept import ALWAYS
 from runner.service.problems import Refused, answers, content
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from runner.runs import Run
+    from runner.service.apart import Apart
+    from runner.service.kept import Kept
+    from runner.service.settings import Settings
 
 router = APIRouter(
     prefix="/runs/{run}",
@@ -110,24 +116,35 @@ async def metrics(
     return Response(body, media_type="application/json")
 
 
-@router.get("/evaluations", response_model=Records, summary="The evaluations, with every event counted.")
-def evaluations(recording: OpenRecording, start: Start = 0, stop: Stop = None) -> Response:
+@router.get(
+    "/evaluations",
+    response_model=Records,
+    responses=BUSY,
+    summary="The evaluations, with every event counted.",
+)
+async def evaluations(
+    run: RecordedRun, kept: KeptOf, apart: ApartOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
+) -> Response:
     """Return evaluations as `dualtaxi show --json` has them under `eval`."""
-    _require_job(recording)
-    return _records(recording, evaluation_records(recording), start, stop)
+    return await _records(run, kept, apart, settings, "evaluations", start, stop)
 
 
-@router.get("/training", response_model=Records, summary="The reports of training.")
-def training(recording: OpenRecording, start: Start = 0, stop: Stop = None) -> Response:
+@router.get("/training", response_model=Records, responses=BUSY, summary="The reports of training.")
+async def training(
+    run: RecordedRun, kept: KeptOf, apart: ApartOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
+) -> Response:
     """Return reports of training as `dualtaxi show --json` has them under `train`."""
-    _require_job(recording)
-    return _records(recording, training_records(recording), start, stop)
+    return await _records(run, kept, apart, settings, "training", start, stop)
 
 
-@router.get("/optimality", response_model=Records, summary="The exact measures of evaluations.")
-def optimality(recording: OpenRecording, start: Start = 0, stop: Stop = None) -> Response:
+@router.get(
+    "/optimality", response_model=Records, responses=BUSY, summary="The exact measures of evaluations."
+)
+async def optimality(
+    run: RecordedRun, kept: KeptOf, apart: ApartOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
+) -> Response:
     """Return what evaluations know exactly; nothing unless `evaluation.exact` was set."""
-    return _records(recording, list(recording.optimality()), start, stop)
+    return await _records(run, kept, apart, settings, "optimality", start, stop)
 
 
 @router.get(
@@ -149,7 +166,7 @@ async def arrow(
     most = settings.limits.page_arrow
     stop = start + FEW if stop is None else stop
     if stop - start > most:
-        raise _too_many(stop - start, most)
+        raise too_many(stop - start, most)
     body = await apart(computed.arrow, run.recording, table, phase, start, stop)
     return Response(body, media_type=ARROW)
 
@@ -179,7 +196,7 @@ def steps(
     if episode is not None:
         columns = step_columns(recording, phase, episode=episode)
         if len(columns["step"]) > most:
-            raise _too_many(len(columns["step"]), most)
+            raise too_many(len(columns["step"]), most)
         return _columns(recording, columns, int(columns["step"][0]), total)
     columns = step_columns(recording, phase, start=start, stop=_bounded(start, stop, total, most))
     return _columns(recording, columns, start, total)
@@ -248,10 +265,6 @@ async def _q_table(
     return found
 
 
-def _require_job(recording: Recording) -> None:
-    recording.require_job("a report of training or an evaluation", "Its metrics can be had all the same.")
-
-
 def _bounded(start: int, stop: int | None, total: int, most: int) -> int:
     """Return behind which record to stop.
 
@@ -260,21 +273,27 @@ def _bounded(start: int, stop: int | None, total: int, most: int) -> int:
     """
     stop = min(start + FEW if stop is None else stop, total)
     if stop - start > most:
-        raise _too_many(stop - start, most)
+        raise too_many(stop - start, most)
     return stop
 
 
-def _too_many(found: int, most: int) -> Refused:
-    return Refused(
-        HTTPStatus.UNPROCESSABLE_ENTITY,
-        f"query: found a range of {found:,} records, expected at most {most:,}; ask for them in parts.",
+async def _records(
+    run: Run,
+    kept: Kept,
+    apart: Apart,
+    settings: Settings,
+    which: computed.Which,
+    start: int,
+    stop: int | None,
+) -> Response:
+    """Return some records; found in a process of its own, as all of them are read for it."""
+    stop = start + FEW if stop is None else stop
+    key = ("records", state_of(run), which, start, stop)
+    most = settings.limits.page_records
+    body = await kept.awaited(
+        key, lambda: apart(computed.records, run.recording, which, start, stop, most), ALWAYS
     )
-
-
-def _records(recording: Recording, records: list[dict[str, Any]], start: int, stop: int | None) -> Response:
-    shown = records[start : start + FEW if stop is None else stop]
-    told = {"run_id": recording.run["run_id"], "start": start, "total": len(records), "records": shown}
-    return Response(computed.as_json(told), media_type="application/json")
+    return Response(body, media_type="application/json")
 
 
 def _columns(recording: Recording, columns: dict[str, NDArray[Any]], start: int, total: int) -> Response:

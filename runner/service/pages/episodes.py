@@ -81,7 +81,7 @@ def _addresses(recording: Recording, phase: str, numbers: list[int]) -> list[str
         return [f"{phase}/{number}" for number in numbers]
     ends: list[tuple[int, int, int]] = []
     before = 0
-    for metrics in recording.metrics("eval"):
+    for metrics in recording.iter_metrics("eval"):
         ends.append((before + int(metrics["trials"]), before, int(metrics["episode"])))
         before += int(metrics["trials"])
     found, at = [], 0

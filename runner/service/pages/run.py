@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import deque
 from datetime import UTC, datetime
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -13,7 +14,7 @@ from fastapi.responses import RedirectResponse
 
 from runner import amounts
 from runner.errors import RecordingError, RunnerError
-from runner.frames import agents_of, environment_of, evaluation_records
+from runner.frames import agents_of, environment_of, evaluation_record
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
@@ -128,15 +129,17 @@ async def replay_trial(
 
 @router.get("/evaluations")
 def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
-    """Show the evaluations."""
-    records = evaluation_records(recording) if recording.kind == "job" else []
+    """Show the last evaluations."""
+    is_job = recording.kind == "job"
+    last = deque(recording.iter_metrics("eval") if is_job else (), MOST_EVALUATIONS)
+    learners, events = agents_of(recording), environment_of(recording)["event_names"]
     return page(
         request,
         "run_evaluations.html",
         **framed(run, "evaluations"),
-        evaluations=records[-MOST_EVALUATIONS:],
-        learners=agents_of(recording),
-        event_names=[event_in_words(name) for name in environment_of(recording)["event_names"]],
+        evaluations=[evaluation_record(metrics, learners, events) for metrics in last],
+        learners=learners,
+        event_names=[event_in_words(name) for name in events],
     )
 
 
@@ -333,7 +336,7 @@ def _around(run: Run, recording: Recording, which: tuple[int, ...]) -> dict[str,
     episodes = recording.count(recording.topic("/train/episode"))
     found = [
         {"after": metrics["episode"], "trials": metrics["trials"]}
-        for metrics in (recording.metrics("eval") if recording.kind == "job" else [])
+        for metrics in (recording.iter_metrics("eval") if recording.kind == "job" else [])
     ]
     base = f"/runs/{run.run_id}/replay"
     if len(which) == 1:

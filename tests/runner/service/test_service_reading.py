@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 
@@ -17,6 +18,7 @@ from runner.analysis.tables import tables_at
 from runner.cli import cli
 from runner.recording.reader import open_recording
 from runner.runs import find_run
+from runner.service.settings import Limits
 
 RUN = "/api/v1/runs/first"
 
@@ -44,6 +46,14 @@ def test_one_run_is_told_as_show_does(client, recordings):
         answer = client.get(f"{RUN}/{name}").json()
         assert answer["records"] == shown[part]
         assert answer["total"] == len(shown[part])
+
+
+def test_a_range_of_records_that_is_too_long_is_refused(connect, settings):
+    client = connect(dataclasses.replace(settings, limits=Limits(page_records=3)))
+    assert len(client.get(f"{RUN}/evaluations", params={"start": 1, "stop": 4}).json()["records"]) == 3
+    answer = client.get(f"{RUN}/evaluations", params={"stop": 10**9})
+    assert answer.status_code == 422
+    assert "at most 3" in answer.json()["error"]["message"]
 
 
 @pytest.mark.parametrize("phase", ["train", "eval"])
