@@ -80,6 +80,15 @@ def _outcome(model: Model, pair: int, key: np.uint64, t: int) -> int:
 
 
 @numba.njit(inline="always")
+def _take_reward(model: Model, tally: Tally, record: np.record, kind: int) -> None:
+    """Fill a step's record with the rewards of its outcome, and count them and its events."""
+    for i in range(len(model.width)):
+        record.rewards[i] = model.rewards[kind, i]
+        tally.returns[i] += model.rewards[kind, i]
+    tally.event_classes[Index(model.event_class[kind])] += 1
+
+
+@numba.njit(inline="always")
 def _end_episode(model: Model, tally: Tally, record: np.record, last: np.record) -> None:
     """Fill the episode's record from the tally and its last step, and clear the tally."""
     record.episode = last.episode
@@ -182,19 +191,10 @@ def train(
 
         # Record it.
         record = steps[Index(filled)]
-        record.step = step
-        record.episode = episode
-        record.t = t
-        record.state = state
-        record.action = action
-        record.next_state = next_state
-        for i in range(learners):
-            record.rewards[i] = model.rewards[kind, i]
-            tally.returns[i] += model.rewards[kind, i]
-        record.terminated = terminated
-        record.truncated = truncated
-        record.explored = explored
-        tally.event_classes[Index(model.event_class[kind])] += 1
+        record.step, record.episode, record.t = step, episode, t
+        record.state, record.action, record.next_state = state, action, next_state
+        record.terminated, record.truncated, record.explored = terminated, truncated, explored
+        _take_reward(model, tally, record, kind)
         tally.recent_outcomes[Index(place)] = kind
         place += 1
         if place == window:
@@ -267,19 +267,10 @@ def evaluate(
         truncated = t + 1 == model.step_limit
 
         record = steps[Index(filled)]
-        record.step = step
-        record.episode = episode
-        record.t = t
-        record.state = state
-        record.action = action
-        record.next_state = next_state
-        for i in range(learners):
-            record.rewards[i] = model.rewards[kind, i]
-            tally.returns[i] += model.rewards[kind, i]
-        record.terminated = terminated
-        record.truncated = truncated
-        record.explored = explored
-        tally.event_classes[Index(model.event_class[kind])] += 1
+        record.step, record.episode, record.t = step, episode, t
+        record.state, record.action, record.next_state = state, action, next_state
+        record.terminated, record.truncated, record.explored = terminated, truncated, explored
+        _take_reward(model, tally, record, kind)
         filled += 1
         step += 1
         t += 1
