@@ -8,7 +8,7 @@ import re
 import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,12 +98,20 @@ def parallel_svg(picture: Picture) -> str:
 
 
 def draw_parameter(axes: Axes, picture: Picture, axis: Axis) -> None:
-    """Draw the objective of the trials against one of their parameters, the best one in another colour."""
+    """Draw the objective of the trials against one of their parameters, the best one in another colour.
+
+    Trials that were given up are hollow.
+    """
+    from matplotlib.ticker import NullFormatter
+
     values = np.array(picture.values)
     x = np.array(axis.values)
     for place, (low, high) in zip(axis.values, picture.ranges, strict=True):
         axes.plot([place, place], [low, high], color=COLOURS[0], linewidth=0.8, alpha=0.25)
-    axes.plot(x[1:], values[1:], "o", color=COLOURS[0], markersize=3.5, alpha=0.6, markeredgewidth=0)
+    kept = np.array([trial.state == "finished" for trial in picture.trials[1:]], dtype=np.bool_)
+    dots: dict[str, Any] = {"color": COLOURS[0], "markersize": 3.5, "alpha": 0.6, "linestyle": ""}
+    axes.plot(x[1:][kept], values[1:][kept], "o", markeredgewidth=0, **dots)
+    axes.plot(x[1:][~kept], values[1:][~kept], "o", fillstyle="none", **dots)
     axes.plot(x[:1], values[:1], "D", color=BEST, markersize=6, label="best")
     if axis.choices:
         axes.set_xticks(range(len(axis.choices)), [textwrap.shorten(choice, 24) for choice in axis.choices])
@@ -113,6 +121,8 @@ def draw_parameter(axes: Axes, picture: Picture, axis: Axis) -> None:
     else:
         if axis.log:
             axes.set_xscale("log")
+            crowded = x.max() > 10 * x.min()
+            axes.xaxis.set_minor_formatter(NullFormatter() if crowded else number_on_axis)
         axes.xaxis.set_major_formatter(number_on_axis)
     _objective_axis(axes, picture)
     axes.set_title(axis.path)

@@ -60,9 +60,12 @@ class Picture:
     @property
     def footnote(self) -> str:
         """What dots and bars are, and what is missing."""
+        pruned = any(trial.state == "pruned" for trial in self.trials)
+        hollow = " A hollow one was given up: it stands where it was then." if pruned else ""
         left = f" {self.left_out} trials without a value are left out." if self.left_out else ""
         return (
-            f"A dot is a trial: the median over its seeds; the bar goes from its lowest to its highest.{left}"
+            "A dot is a trial: the median over its seeds; the bar goes from its lowest to its highest."
+            f"{hollow}{left}"
         )
 
 

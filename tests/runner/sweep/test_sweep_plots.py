@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
@@ -14,6 +15,7 @@ from runner.config import from_mapping
 from runner.errors import RunnerError
 from runner.runs import list_runs
 from runner.sweep import state
+from runner.sweep.figure import draw_parameter
 from runner.sweep.loading import from_values
 from runner.sweep.plots import learning, panel_of, picture_of
 from runner.sweep.results import results_of
@@ -45,6 +47,21 @@ def test_each_trial_stands_at_its_values(results, done):
     assert all(
         low <= value <= high for value, (low, high) in zip(picture.values, picture.ranges, strict=True)
     )
+
+
+def test_a_trial_that_was_given_up_is_hollow(results):
+    from matplotlib.figure import Figure
+
+    def hollow(entries):
+        picture = picture_of(replace(results, ranking=entries))
+        axes = Figure().add_subplot()
+        draw_parameter(axes, picture, picture.axes[0])
+        (line,) = [line for line in axes.lines if line.get_fillstyle() == "none"]
+        return len(line.get_xdata()), "A hollow one was given up" in picture.footnote
+
+    *kept, last = results.ranking
+    assert hollow(results.ranking) == (0, False)
+    assert hollow([*kept, replace(last, state="pruned")]) == (1, True)
 
 
 def test_the_best_and_the_median_learn_as_their_runs_did(results, done):
