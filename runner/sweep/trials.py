@@ -316,7 +316,7 @@ class _Batch:
 
     def _count(self, result: Result) -> None:
         standing = self._standing
-        standing.bytes += result.bytes
+        standing.bytes += self._record.weigh(result)
         standing.done += result.status in ("finished", "pruned")
         standing.pruned += result.status == "pruned"
         standing.failed += result.status == "failed"
@@ -347,6 +347,7 @@ class _Record:
         self._sweep, self._recordings = sweep, recordings
         self.runs = state.runs_of(sweep.name, recordings)
         self._failures = state.failures_of(sweep.name, recordings)
+        self._weighed: set[str] = set()
         self._results = {
             identity: Result("failed", _id_in(self.runs, identity), error=error)
             for identity, error in self._failures.items()
@@ -358,6 +359,13 @@ class _Record:
         if identity not in self._results and run is not None and is_over(run):
             self._results[identity] = result_of(run, self._sweep.objective)
         return self._results.get(identity)
+
+    def weigh(self, result: Result) -> int:
+        """Return the bytes of a result's run, if they were not asked for before."""
+        if result.run_id in self._weighed:
+            return 0
+        self._weighed.add(result.run_id)
+        return result.bytes
 
     def note(self, identity: str, result: Result) -> None:
         """Keep what came of a job."""

@@ -198,6 +198,7 @@ def test_two_trials_that_want_one_job_share_its_run(tmp_path):
     _, standing = swept(tmp_path, sweep, workers)
     assert workers.done == 4
     assert standing.done == 16
+    assert standing.bytes == sum(run.recording.stat().st_size for run in list_runs(tmp_path))
 
 
 def test_values_that_do_not_go_together_are_left_out(tmp_path):
