@@ -138,6 +138,7 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
         "run_evaluations.html",
         **framed(run, "evaluations"),
         evaluations=[evaluation_record(metrics, learners, events) for metrics in last],
+        of=recording.count(recording.topic("/eval/metrics")) if is_job else 0,
         learners=learners,
         event_names=[event_in_words(name) for name in events],
     )

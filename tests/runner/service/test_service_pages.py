@@ -44,6 +44,14 @@ def test_runs_are_searched_sorted_and_their_columns_chosen(client):
     assert "first</a>" not in page
 
 
+def test_that_not_all_evaluations_are_shown_is_said(client, monkeypatch):
+    assert "The last" not in page_of(client, "/runs/first/evaluations")
+    monkeypatch.setattr("runner.service.pages.run.MOST_EVALUATIONS", 2)
+    page = page_of(client, "/runs/first/evaluations")
+    assert "The last 2 of 7;" in page
+    assert re.findall(r'replay/eval/(\d+)/0"', page) == ["50", "60"]
+
+
 def test_the_keys_of_what_is_submitted_are_told(client):
     config, sweep = page_of(client, "/submit"), page_of(client, "/submit?sweep=true")
     assert "<code>epsilon</code>" in config

@@ -20,6 +20,7 @@ async function begun(root) {
 }
 
 const roots = [...document.querySelectorAll("[data-source]")];
+for (const root of roots) root.querySelector(".description").textContent = "Loading …";
 const replays = (await Promise.all(roots.map((root) => begun(root).catch((error) => {
   root.querySelector(".description").textContent = error.message;
   return null;
