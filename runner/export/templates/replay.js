@@ -109,7 +109,8 @@ class Replay {
       const names = data.choices.length > 1 ? data.choices[learner] : data.choices[0];
       const who = data.learners.length > 1 ? data.learners[learner] : "Next action";
       const title = Replay.made("h4", who + ": Q-values here ");
-      if (rows.length < table.of) title.append(Replay.made("small", `(${rows.length} of ${table.of} actions)`));
+      const most = rows.length < table.of ? `${rows.length} of ${table.of} actions; ` : "";
+      title.append(Replay.made("small", `(${most}bars from the lowest here to the highest)`));
       const values = rows.map((row) => row[1]), low = Math.min(...values), high = Math.max(...values);
       const bars = Replay.made("ol");
       for (const [action, value] of rows) {
