@@ -114,11 +114,16 @@ class _Writer(QueueListener):
 
 
 class _Lines(logging.Handler):
-    """Writes lines to a file descriptor; without a buffer, whose lock a thread that waits would keep."""
+    """Writes lines to a file descriptor, for one thread, without buffer or lock: a process can end meanwhile."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
         self._descriptor = descriptor
+
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Write a line, without the lock that the end of a process asks for."""
+        self.emit(record)
+        return True
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line; one that cannot be written is no reason to stop."""

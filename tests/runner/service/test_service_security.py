@@ -8,6 +8,8 @@ import json
 import logging
 import os
 import stat
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -252,14 +254,19 @@ def test_a_log_that_nobody_reads_keeps_nobody_waiting_and_says_what_it_left_out(
     assert lines[-1]["event"] == "last"
 
 
-def test_a_service_whose_log_is_never_read_stops_all_the_same():
-    reading, writing = os.pipe()
-    with open(reading, "rb"), open(writing, "w") as stream:  # noqa: PTH123 - of a descriptor
-        began = time.monotonic()
-        with logs.logged_to(stream):
-            for _ in range(2 * logs.MOST_WAITING):
-                logs.LOG.info("said")
-        assert time.monotonic() - began < logs.GOODBYE_SECONDS + 10
+def test_a_service_whose_log_is_never_read_answers_and_stops_all_the_same(recordings):
+    words = [sys.executable, "-m", "runner", "serve", "--port", "0", "--recordings", str(recordings)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        url = process.stdout.readline().strip()
+        try:
+            with httpx2.Client(base_url=url) as asking:
+                for number in range(100):  # 2 kB of log each, more than a pipe holds
+                    asked = {"filter": f"name:n{number}{'x' * 2_000}"}
+                    assert asking.get(RUNS, params=asked).status_code == 200
+            process.terminate()
+            assert process.wait(30) == 0
+        finally:
+            process.kill()
 
 
 def test_no_message_says_where_the_server_keeps_its_files(client, recordings):
