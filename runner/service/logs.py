@@ -114,7 +114,7 @@ class _Writer(QueueListener):
 
 
 class _Lines(logging.Handler):
-    """Writes lines to a file descriptor, for one thread, without buffer or lock: a process can end meanwhile."""
+    """Writes lines to a file descriptor, for one thread, without buffer or lock: a process may end then."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
