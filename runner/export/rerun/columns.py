@@ -13,11 +13,36 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.export.rerun.scene import INK
-from runner.export.rerun.thoughts import Thoughts
 
+APPLICATION: Final = "dualtaxi"
 _POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
 _STRIP: Final = pa.list_(pa.field("item", _POINT, nullable=False))
 _BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
+
+
+@dataclass(frozen=True, eq=False)
+class Thoughts:
+    """What the learners thought at n steps, and at the steps `renewed` among them."""
+
+    values: NDArray[np.float64]
+    """[n, sum of the agents' action counts]: each agent's values of its own actions; of a joint table the
+    best over the others' actions."""
+    greedy: NDArray[np.int64]
+    """[n, agents]: each agent's greedy action."""
+    renewed: NDArray[np.int64]
+    """[k]: the rows at which the pictures were renewed."""
+    value_maps: NDArray[np.float32]
+    """[k, learners, pixels]: the greatest value in the state of each pixel; nan where there is none."""
+    greedy_maps: NDArray[np.int32]
+    """[k, learners, pixels]: the learner's greedy action there; -1 where there is none."""
+
+
+def no_thoughts() -> Thoughts:
+    """Return the thoughts of who was not asked."""
+    none = np.empty(0, np.int64)
+    return Thoughts(
+        np.empty((0, 0)), none[:, None], none, np.empty((0, 0, 0), np.float32), np.empty((0, 0, 0), np.int32)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +79,14 @@ class Batch:
             rr.TimeColumn("episode", sequence=self.episode[rows]),
             rr.TimeColumn("t", sequence=self.records["t"][rows].astype(np.int64)),
         ]
+
+
+def new_stream(recording_id: str) -> rr.RecordingStream:
+    """Return a stream that has no other timelines than ours."""
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    return stream
 
 
 class Sender:

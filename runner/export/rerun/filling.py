@@ -57,26 +57,6 @@ def bar_ends(values: Any, bounds: Any, left: float, length: float, fineness: int
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
-def trails(points: Any, states: Any, t: Any, before: int, lines: Any) -> None:
-    """Fill in the way each mover came to the state of each step.
-
-    Args:
-        points: [S, movers or more, 2], where movers are in each state.
-        states: [before + n], those of earlier steps first.
-        t: [n], the steps of the episode before each.
-        before: number of earlier steps.
-        lines: [n, movers, steps + 1, 2], filled.
-    """
-    n, movers, length, _ = lines.shape
-    for k in range(n):
-        for i in range(length):
-            back = min(length - 1 - i, t[k], before + k)
-            for mover in range(movers):
-                for axis in range(2):
-                    lines[k, mover, i, axis] = points[states[before + k - back], mover, axis]
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
 def pictures_of(tables: Any, states: Any, value: Any, greedy: Any) -> None:
     """Take down a picture of each learner's table as it is now.
 

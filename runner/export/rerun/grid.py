@@ -8,7 +8,6 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from runner.export.rerun import filling
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, ink, instances, place, rgba, strips, texts
 from runner.export.rerun.scene import (
@@ -130,8 +129,12 @@ class GridWriter(Sender):
 def trails(scene: Scene, batch: Batch) -> NDArray[np.float32]:
     """Return the way each mover came, [n, movers, 6, 2]: the last five steps of the episode, to here."""
     states = np.concatenate((batch.before["state"], batch.records["state"]))
-    lines = np.empty((len(batch.records), len(scene.movers), TRAIL_STEPS + 1, 2), np.float32)
-    filling.trails(scene.points, states, batch.records["t"], len(batch.before), lines)
+    was = scene.points[states, : len(scene.movers)]
+    here = np.arange(len(batch.before), len(states))
+    steps = np.minimum(batch.records["t"], here)  # of the way that is known
+    lines = np.empty((len(here), len(scene.movers), TRAIL_STEPS + 1, 2), np.float32)
+    for back in range(TRAIL_STEPS + 1):
+        lines[:, :, TRAIL_STEPS - back] = was[here - np.minimum(back, steps)]
     return lines
 
 

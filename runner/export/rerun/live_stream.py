@@ -11,15 +11,13 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.export.rerun.classes import vocabulary_of
-from runner.export.rerun.columns import Batch, Sender
+from runner.export.rerun.columns import Batch, Sender, new_stream, no_thoughts
 from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
 from runner.export.rerun.layout import Shown, blueprint, draw_background
 from runner.export.rerun.live import Piece
 from runner.export.rerun.metrics import MetricWriter
 from runner.export.rerun.scene import TRAIL_STEPS, marks_of, scene_of
-from runner.export.rerun.thoughts import no_thoughts
-from runner.export.rerun.writing import new_stream
 from runner.mdp import Mdp
 from runner.recording import schema
 

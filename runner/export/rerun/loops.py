@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.export.rerun.classes import vocabulary_of
-from runner.export.rerun.columns import Batch, Sender, scalars
+from runner.export.rerun.columns import Batch, Sender, no_thoughts, scalars
 from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
 from runner.export.rerun.layout import Shown, draw_background
@@ -30,7 +30,6 @@ from runner.export.rerun.selection import (
     chosen_spans,
     interrupted,
 )
-from runner.export.rerun.thoughts import no_thoughts
 from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import Recording

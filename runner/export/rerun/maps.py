@@ -12,7 +12,6 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from runner.export.rerun import filling
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import (
     Batch,
@@ -143,6 +142,8 @@ class MapWriter(Sender):
 
     def _arrows(self, learner: int, greedy: NDArray[np.int32]) -> NDArray[np.float32]:
         """Return the arrows of greedy actions, [k, agents * pixels, 2]."""
+        from runner.export.rerun import filling  # Numba is slow to load, and a live view has no maps
+
         shown = self._agents(learner)
         own = self._own[:, shown] if len(shown) > 1 else np.arange(len(self._moves[shown[0]]))[:, None]
         arrows = np.empty((len(greedy), len(shown), greedy.shape[1], 2), np.float32)

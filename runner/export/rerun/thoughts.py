@@ -5,7 +5,6 @@ The tables are replayed from the recorded steps, so everything here is that of t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numba
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.tables import held_at
 from runner.config import from_mapping
+from runner.export.rerun.columns import Thoughts
 from runner.export.rerun.filling import best_of_joint, pictures_of
 from runner.export.rerun.scene import Placements, own_actions
 from runner.learning import kernel
@@ -24,31 +24,6 @@ from runner.recording.schema import STEP_NANOSECONDS, TRAIN_STEP
 
 NEAR_STEPS = 200_000
 """A replay goes on over a gap of so many steps; over a longer one it may begin anew at a snapshot."""
-
-
-@dataclass(frozen=True, eq=False)
-class Thoughts:
-    """What the learners thought at n steps, and at the steps `renewed` among them."""
-
-    values: NDArray[np.float64]
-    """[n, sum of the agents' action counts]: each agent's values of its own actions; of a joint table the
-    best over the others' actions."""
-    greedy: NDArray[np.int64]
-    """[n, agents]: each agent's greedy action."""
-    renewed: NDArray[np.int64]
-    """[k]: the rows at which the pictures were renewed."""
-    value_maps: NDArray[np.float32]
-    """[k, learners, pixels]: the greatest value in the state of each pixel; nan where there is none."""
-    greedy_maps: NDArray[np.int32]
-    """[k, learners, pixels]: the learner's greedy action there; -1 where there is none."""
-
-
-def no_thoughts() -> Thoughts:
-    """Return the thoughts of who was not asked."""
-    none = np.empty(0, np.int64)
-    return Thoughts(
-        np.empty((0, 0)), none[:, None], none, np.empty((0, 0, 0), np.float32), np.empty((0, 0, 0), np.int32)
-    )
 
 
 class Thinker:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, instances, rgba, scalars, strips
-from runner.export.rerun.filling import bar_ends
 from runner.export.rerun.scene import INK, MOVER_COLOURS, action_labels, agent_label, own_actions
 from runner.mdp import Mdp
 
@@ -97,6 +96,10 @@ class ValueWriter(Sender):
 
     def _bars(self, values: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return a bar a value, [n, values, 2 points, 2]: from the agent's lowest there to its highest."""
+        from runner.export.rerun.filling import (
+            bar_ends,  # Numba is slow to load, and a live view has no values
+        )
+
         bars = np.empty((*values.shape, 2, 2), np.float32)
         bars[:, :, 0, 0] = BAR_LEFT
         bars[..., 1] = np.concatenate(self._rows)[:, None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 import socket
 import subprocess
@@ -42,10 +43,8 @@ def require_rerun(purpose: str) -> None:
     Raises:
         MissingExtra: it is not.
     """
-    try:
-        import rerun  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("rerun-sdk", "all", purpose) from error
+    if importlib.util.find_spec("rerun") is None:
+        raise MissingExtra("rerun-sdk", "all", purpose)
 
 
 def viewer_program() -> Path:

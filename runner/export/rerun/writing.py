@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError, StorageError
 from runner.export.rerun.ahead import ahead
 from runner.export.rerun.classes import Vocabulary, vocabulary_of
-from runner.export.rerun.columns import Batch, Sender, ink, instances, place, texts
+from runner.export.rerun.columns import Batch, Sender, Thoughts, ink, instances, new_stream, place, texts
 from runner.export.rerun.layout import Shown, blueprint, draw_background, loop_blueprint
 from runner.export.rerun.metrics import MetricWriter, send_metrics
 from runner.export.rerun.scene import TRAIL_STEPS, Marks, Scene, marks_of, scene_of
 from runner.export.rerun.selection import Request, Selection, select
 from runner.export.rerun.steps import StepWriter
-from runner.export.rerun.thoughts import Thinker, Thoughts
+from runner.export.rerun.thoughts import Thinker
 from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -32,7 +32,6 @@ BATCH: Final = 8_192
 """Rows sent at a time: larger columns are dropped by the web viewer."""
 BATCHES_WAITING: Final = 8
 """Batches that may wait to be written: they are made faster than they are compressed, and would pile up."""
-APPLICATION: Final = "dualtaxi"
 
 
 @dataclass(frozen=True)
@@ -111,14 +110,6 @@ def _saved(
         raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
     finally:
         fresh.unlink(missing_ok=True)
-
-
-def new_stream(recording_id: str) -> rr.RecordingStream:
-    """Return a stream that has no other timelines than ours."""
-    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
-    stream.set_log_time_enabled(False)
-    stream.set_log_tick_enabled(False)
-    return stream
 
 
 class RunExporter:
