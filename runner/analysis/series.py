@@ -31,12 +31,18 @@ class RunSeries:
     run_id: str
     name: str
     seed: int
-    finished: bool
+    status: str
+    """How it ended: `finished`, `interrupted` or `failed`."""
     config: Mapping[str, Any]
     evaluation: list[tuple[int, Readings]]
     """(episode, readings) of every evaluation."""
     training: list[tuple[int, Readings]]
     """(episode, readings) of every report of training, those at evaluations among them."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether it came to its end."""
+        return self.status == "finished"
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,7 @@ class Group:
     def described(self) -> str:
         """Its label, and which runs they are: `quick, 3 runs (k3v9m2xq seed 0, ...)`."""
         shown = ", ".join(
-            f"{run.run_id} seed {run.seed}" + ("" if run.finished else ", interrupted")
+            f"{run.run_id} seed {run.seed}" + ("" if run.finished else f", {run.status}")
             for run in self.runs[:MOST_NAMED]
         )
         more = len(self.runs) - MOST_NAMED
@@ -76,7 +82,7 @@ TITLES: Final = {
     "exact.mean_length": ("Length of an episode, exactly", "steps, mean over start states"),
     "exact.value": ("Value of the greedy policy", "discounted, mean"),
     "exact.to_gain": ("To gain by a best response", "discounted, mean"),
-    "training.mean_length": ("Length of training episodes", "steps, running mean"),
+    "training.mean_length": ("Length of training episodes", "steps, mean"),
     "training.mean_return": ("Return of training episodes", "summed reward, mean"),
     "training.mean_reward": ("Reward in training", "a step, running mean"),
     "training.percent_filled": ("Q-table filled", "percent of its cells"),
@@ -100,7 +106,7 @@ def read_series(recording: Recording) -> RunSeries:
         run_id=recording.run["run_id"],
         name=recording.run["name"],
         seed=int(recording.run["seed"]),
-        finished=recording.result.get("status") == "finished",
+        status=recording.result.get("status", "interrupted"),
         config=recording.config,
         evaluation=[
             (record["episode"], evaluation_readings(record) | exact.get(record["evaluation"], {}))
@@ -126,11 +132,20 @@ def loop_series(recording: Recording) -> RunSeries:
         run_id=recording.run["run_id"],
         name=recording.run["name"],
         seed=int(recording.run["seed"]),
-        finished=recording.result.get("status") == "finished",
+        status=recording.result.get("status", "interrupted"),
         config=recording.config,
         evaluation=_loop_evaluations(recording),
         training=sorted(training.items()),
     )
+
+
+def trained_before(recording: Recording) -> NDArray[np.int64]:
+    """Return for each evaluation episode of somebody's own loop how many of training had ended before."""
+    trained, tested = (
+        np.concatenate([np.empty(0, np.uint64), *(block["log_time"] for block in recording.blocks(topic))])
+        for topic in (schema.TRAIN_EPISODE, schema.EVAL_EPISODE)
+    )
+    return np.searchsorted(trained, tested)
 
 
 def groups_of(series: Sequence[RunSeries]) -> list[Group]:
@@ -148,6 +163,14 @@ def groups_of(series: Sequence[RunSeries]) -> list[Group]:
 def is_loop(run: RunSeries) -> bool:
     """Return whether a run is somebody's own loop, whose training is told at even numbers of episodes."""
     return "made_by" in run.config
+
+
+def has_goal(run: RunSeries) -> bool:
+    """Return whether a run's episodes are about getting somewhere, the sooner the better.
+
+    Of a loop it is known where its environment says what success is; a pole is to be held as long as can be.
+    """
+    return not is_loop(run) or any("finish_percent" in readings for _, readings in run.evaluation)
 
 
 def title_of(metric: str) -> tuple[str, str]:
@@ -283,14 +306,12 @@ def _binned_scalars(recording: Recording, edges: NDArray[np.int64]) -> dict[str,
 
 def _loop_evaluations(recording: Recording) -> list[tuple[int, Readings]]:
     """Return the means of the evaluation episodes, by the training episodes that were done before."""
-    ends = np.concatenate(
-        [np.empty(0, np.uint64), *(b["log_time"] for b in recording.blocks(schema.TRAIN_EPISODE))]
-    )
+    before, first = trained_before(recording), 0
     agents, events = agents_of(recording), event_names_of(recording)
     known = bool(recording.environment["success_events"])
     found: dict[int, list[NDArray[np.void]]] = {}
     for block in recording.blocks(schema.EVAL_EPISODE):
-        after = np.searchsorted(ends, block["log_time"])
+        after, first = before[first : first + len(block)], first + len(block)
         for episodes in np.unique(after).tolist():
             found.setdefault(episodes, []).append(block[after == episodes])
     evaluations = []

@@ -32,8 +32,8 @@ class Episode:
     """
 
     def __init__(self, recording: Recording, phase: str, number: int, title: str) -> None:
-        self._records = recording.episode_steps(phase, number)
         self._mdp = recording.mdp
+        self._records = recording.episode_steps(phase, number)
         self._agents = agents_of(recording)
         self._title = title
         self._drawing = Drawing(self._mdp.scene) if self._mdp.scene is not None else None

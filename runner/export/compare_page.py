@@ -85,7 +85,7 @@ def _runs(groups: Sequence[Group]) -> Grid:
             f"{letter(i)}: {group.label}",
             run.name,
             str(run.seed),
-            "finished" if run.finished else "interrupted",
+            run.status,
         )
         for i, group in enumerate(groups)
         for run in group.runs

@@ -85,6 +85,8 @@ def shortcomings(recording: Recording) -> list[str]:
     said = []
     status = recording.result.get("status", "interrupted")
     if status != "finished":
-        said.append(f"The run is {status}: exported is what there is, up to its last whole chunk.")
+        said.append(
+            f"The run did not finish ({status}): exported is what there is, up to its last whole chunk."
+        )
     said += [f"Of {topic} some messages were lost in a repair; they are missing." for topic in recording.lost]
     return said

@@ -94,13 +94,19 @@ def _curve(number: int, group: Group, metric: str, line: str) -> Curve | None:
     """Return the median and the band of a metric, over the runs that have come as far.
 
     Runs report training after so many steps, so at different episodes: with several runs only the
-    reports at evaluations are taken, which are at the same episodes.
+    reports at evaluations are taken, which are at the same episodes. Somebody's own loop evaluates when it
+    likes: between its points a run is interpolated, lest the line jump from one run to the other.
     """
     runs = [points_of(run, metric, line, aligned=len(group.runs) > 1) for run in group.runs]
     episodes = sorted({episode for points in runs for episode in points})
     if not episodes:
         return None
-    values = np.array([[points.get(episode, np.nan) for episode in episodes] for points in runs])
+    values = np.array(
+        [
+            np.interp(episodes, list(points), list(points.values()), np.nan, np.nan)
+            for points in (dict(sorted(run.items())) for run in runs if run)
+        ]
+    )
     return Curve(
         number,
         line,

@@ -168,8 +168,10 @@ def footnote(groups: Sequence[Group]) -> str:
     greedy = "" if loops else " Evaluation trials follow the greedy policy: no exploring."
     if max(len(group.runs) for group in groups) == 1:
         return f"Each line is one run, as reported.{greedy}"
+    between = " Between its points a run is interpolated." if loops else ""
     return (
-        f"Lines: median over the runs of a configuration; bands: from the lowest run to the highest.{greedy}"
+        "Lines: median over the runs of a configuration that have come as far; bands: from the lowest run to "
+        f"the highest.{between}{greedy}"
     )
 
 

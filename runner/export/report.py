@@ -80,7 +80,7 @@ def render_report(recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> 
     for path in recordings:
         with open_recording(path) as recording:
             series.append(read_series(recording))
-            runs.append(_run(recording, len(runs), chosen))
+            runs.append(_run(recording, series[-1], len(runs), chosen))
     page = (
         templates()
         .get_template("report.html")
@@ -100,7 +100,7 @@ def render_report(recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> 
 # --- one run ------------------------------------------------------------------------------------------
 
 
-def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[str, Any]:
+def _run(recording: Recording, series: RunSeries, number: int, chosen: Sequence[Choice]) -> dict[str, Any]:
     """Return all that the page says of a run."""
     evaluations = evaluation_records(recording)
     environment = environment_of(recording)
@@ -116,7 +116,8 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
         "learners": agents_of(recording),
         "environment": environment,
         "facts": _facts(recording),
-        "last": evaluations[-1] if evaluations else None,
+        "last": evaluations[-1] if evaluations else _last_of_loop(series),
+        "steps": has_steps(recording),
         "evaluations": evaluations,
         "event_names": [_heading(name) for name in environment["event_names"]],
         "broad": drawing is not None and drawing.width > BROAD,
@@ -126,6 +127,15 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
         "maps": _maps(recording, episodes),
         "replay": _replay(recording, episodes, drawing),
     }
+
+
+def _last_of_loop(series: RunSeries) -> dict[str, Any] | None:
+    """Return the measures of the evaluation episodes that came last in somebody's own loop, if it has any."""
+    if not series.evaluation:
+        return None
+    episode, readings = series.evaluation[-1]
+    names = ("finish_percent", "mean_length", "mean_penalties")
+    return {"episode": episode} | {name: readings.get(name, {}).get("") for name in names}
 
 
 def _facts(recording: Recording) -> dict[str, str]:

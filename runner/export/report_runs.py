@@ -78,7 +78,7 @@ def shortcomings(recording: Recording) -> list[str]:
     run = recording.run["run_id"]
     if recording.kind != "job":
         if state_of(recording) != "finished":
-            said.append(f"Run {run} is {state_of(recording)}: shown is what its loop had done.")
+            said.append(f"Run {run} did not finish ({state_of(recording)}): shown is what its loop had done.")
         said.append(
             f"Run {run} was recorded from a loop: what it learned is not known, so no episode is shown with "
             "it; `dualtaxi view` shows what was recorded."

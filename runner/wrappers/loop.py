@@ -313,12 +313,19 @@ class Loop(Generic[R]):
             self.info(phase, info, reset=True, beside=beside)
 
     def frame(self, phase: str, image: Any) -> None:
-        """Record a picture, [height, width, 3] of uint8; it is encoded by another thread."""
+        """Record a picture, [height, width, 3] of uint8; it is encoded by another thread.
+
+        Raises:
+            ConfigError: it is something else.
+        """
         from runner.wrappers.frames import image_bytes
 
-        pixels = np.array(image, dtype=np.uint8)
-        if pixels.ndim != 3 or pixels.shape[2] != 3:
-            raise ConfigError(f"frames: found a picture of shape {pixels.shape}, expected [height, width, 3]")
+        pixels = np.array(image)
+        if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+            raise ConfigError(
+                f"frames: found {pixels.dtype} of shape {list(pixels.shape)} from render(), expected uint8 "
+                "of [height, width, 3]."
+            )
         kind = self.plan.frame_format
         with self.lock:
             position = self._moment()

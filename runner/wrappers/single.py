@@ -226,11 +226,8 @@ def record(
         return _beside(env, into, phase)
     described = describe(env, env.observation_space, env.action_space)
     plan = plan_of(recordings, name, seed, config, info, frames_every, frame_format, packing)
-    if frames_every and env.render_mode != "rgb_array":
-        raise ConfigError(
-            f"frames_every: found an environment with render_mode={env.render_mode!r}, expected "
-            "'rgb_array': make it with render_mode=\"rgb_array\"."
-        )
+    if frames_every:
+        _require_pictures(env)
     loop = Loop(described, plan, lambda recorder, part: ROWS[described.kind](recorder, described, part))
     recorded = RecordedEnv(env, loop, phase)
     recorded._own(loop)
@@ -247,7 +244,22 @@ def _beside(env: gymnasium.Env[Any, Any], into: RecordedEnv, phase: str) -> Reco
         raise ConfigError("into: found an environment of other spaces than the run's, expected the same")
     if phase == into._phase:
         raise ConfigError(f"phase: found {phase!r} for both environments of a run, expected one each")
+    if loop.plan.frames_every:
+        _require_pictures(env)
     return RecordedEnv(env, loop, phase, into)
+
+
+def _require_pictures(env: gymnasium.Env[Any, Any]) -> None:
+    """Refuse an environment that renders no pictures, in a run with frames.
+
+    Raises:
+        ConfigError: it is one.
+    """
+    if env.render_mode != "rgb_array":
+        raise ConfigError(
+            f"frames_every: found an environment with render_mode={env.render_mode!r}, expected "
+            "'rgb_array': make it with render_mode=\"rgb_array\"."
+        )
 
 
 def plan_of(

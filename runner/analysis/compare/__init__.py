@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from runner.analysis.compare import statistics
-from runner.analysis.compare.moments import HIGHER_IS_BETTER, Moment, value_of
+from runner.analysis.compare.moments import Moment, higher_is_better, value_of
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.series import Group, is_loop, points_of, title_of
 
@@ -118,8 +118,14 @@ def compare(
         moment=moment.described,
         groups={group.label: [run.run_id for run in group.runs] for group in groups},
         metrics=[_metric(groups, metric, line, moment) for metric, line in metrics],
-        notes=[*notes, *_few(groups)],
+        notes=[*notes, *_untested(metrics), *_few(groups)],
     )
+
+
+def _untested(metrics: Sequence[tuple[str, str]]) -> list[str]:
+    if not all(metric.startswith("training.") for metric, _ in metrics):
+        return []
+    return ["training is compared, as last reported; --at area takes the mean over all of it"]
 
 
 def _few(groups: Sequence[Group]) -> list[str]:
@@ -136,7 +142,7 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
     notes: list[str] = []
     found = [(group.label, _values(group, metric, line, moment, groups, notes)) for group in groups]
     title, unit = title_of(metric)
-    better = False if moment.level is not None else HIGHER_IS_BETTER.get(metric)
+    better = False if moment.level is not None else higher_is_better(metric, groups)
     if moment.level is not None:
         title, unit = f"{title}: first at {moment.level:g}", "training episodes"
     sign = -1.0 if better is False else 1.0
@@ -180,16 +186,20 @@ def _ends(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> li
     """Return a note if the last evaluation comes after other numbers of episodes in the groups."""
     if moment.kind != "last":
         return []
-    told = {
-        group.label: max(points)
+    curves = [
+        (group.label, points)
         for group in groups
         for run in group.runs
         if run.finished and (points := points_of(run, metric, line, aligned=True))
-    }
+    ]
+    told = {label: max(points) for label, points in curves}
     if len(set(told.values())) < 2:
         return []
     listed = ", ".join(f"after {end:,} episodes in {label}" for label, end in told.items())
-    return [f"the last evaluation is {listed}; --at {min(told.values())} compares after as many"]
+    last = "report of training" if metric.startswith("training.") else "evaluation"
+    shared = set.intersection(*(set(points) for _, points in curves))
+    again = f"; --at {max(shared)} compares after as many" if shared else ""
+    return [f"the last {last} is {listed}{again}"]
 
 
 def _reached(present: Sequence[tuple[str, dict[int, tuple[str, float]]]], moment: Moment) -> list[str]:

@@ -11,6 +11,8 @@ from runner.errors import RunnerError, nearest
 
 _NOT_COMPARED = ("seeds", "recording", "name")
 _USUAL = ("finish_percent", "mean_length", "mean_penalties", "mean_return")
+_USUAL_WITHOUT_GOAL = ("mean_return", "mean_length", "mean_penalties")
+_USUAL_OF_TRAINING = ("training.mean_return", "training.mean_reward", "training.mean_length")
 
 
 def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Group], list[str]]:
@@ -60,7 +62,9 @@ def require_two(groups: Sequence[Group], by: str | None = None) -> None:
 
 
 def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tuple[str, str]]:
-    """Return the (metric, line) pairs of these names; those of evaluation unless some are chosen.
+    """Return the (metric, line) pairs of these names; unless some are chosen, those of evaluation.
+
+    Where there is no evaluation it is those of training.
 
     Args:
         groups: whose.
@@ -80,8 +84,13 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
                             if (metric, line) not in lines:
                                 lines.append((metric, line))
     if not known:
-        raise RunnerError("found no evaluation in any of the runs, so there is nothing to compare.")
-    names = list(chosen) or [name for name in _USUAL if name in known]
+        raise RunnerError(
+            "found neither an evaluation nor a report of training in any run, so there is nothing to compare."
+        )
+    usual = _USUAL if "finish_percent" in known else _USUAL_WITHOUT_GOAL
+    names = list(chosen)
+    for some in (usual, _USUAL_OF_TRAINING):
+        names = names or [name for name in some if name in known]
     for name in names:
         if name not in known:
             listed = ", ".join(sorted(known))

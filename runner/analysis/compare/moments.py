@@ -10,18 +10,24 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.compare.statistics import NEVER
-from runner.analysis.series import Group, RunSeries, points_of
+from runner.analysis.series import Group, RunSeries, has_goal, points_of
 from runner.errors import RunnerError
 
-HIGHER_IS_BETTER: Final = {
+_HIGHER_IS_BETTER: Final = {
     "finish_percent": True,
     "mean_return": True,
     "training.mean_reward": True,
-    "mean_length": False,
+    "training.mean_return": True,
     "mean_penalties": False,
-    "training.mean_length": False,
 }
-"""Of other metrics nobody can say it in general: they are compared as higher or lower."""
+_LENGTHS: Final = ("mean_length", "training.mean_length")
+
+
+def higher_is_better(metric: str, groups: Sequence[Group]) -> bool | None:
+    """Return what is better of a metric; None where nobody can say it in general."""
+    if metric in _LENGTHS and all(has_goal(run) for group in groups for run in group.runs):
+        return False
+    return _HIGHER_IS_BETTER.get(metric)
 
 
 @dataclass(frozen=True)
@@ -92,15 +98,15 @@ def value_of(
         return None, "not finished; --at EPISODE takes it as far as it got"
     if moment.kind == "area":
         return _area(points, _shared_episodes(metric, line, groups))
-    return _of_curve(points, metric, moment), ""
+    return _of_curve(points, higher_is_better(metric, groups), moment), ""
 
 
-def _of_curve(points: dict[int, float], metric: str, moment: Moment) -> float:
+def _of_curve(points: dict[int, float], higher: bool | None, moment: Moment) -> float:
     if moment.level is not None:
         at = first_crossing(points, moment.level)
         return NEVER if at is None else float(at)
     if moment.kind == "best":
-        best = min if HIGHER_IS_BETTER.get(metric) is False else max
+        best = min if higher is False else max
         return best(points.values())
     return points[max(points)]
 

@@ -69,16 +69,12 @@ def select_loop(recording: Recording, request: Request) -> Selection:
     if tested:
         selection.evaluations = [(Evaluation(0, 0, 0, 0), Span(first, tested, 0))]
     shown = sum(span.stop - span.start for span in selection.train)
-    selection.chosen.append(
-        f"{shown:,} of {total:,} training steps, {tested - first:,} of {tested:,} of eval"
-    )
+    evaluated = f", {tested - first:,} of {tested:,} of evaluation" if tested else ""
+    whose = f"of {several} environments the first, in " if (several := recording.environments) > 1 else ""
+    selection.chosen.append(f"{whose}{shown:,} of {total:,} training steps{evaluated}")
     if shown < total or first:
         selection.left_out.append(
             f"{total - shown + first:,} steps (--episodes START:STOP chooses; --all: everything)"
-        )
-    if recording.environments > 1:
-        selection.warnings.append(
-            f"Shown are the steps of the first of {recording.environments} environments."
         )
     return selection
 

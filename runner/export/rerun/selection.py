@@ -239,7 +239,7 @@ def _without_steps(recording: Recording, request: Request, selection: Selection)
 def interrupted(recording: Recording) -> str:
     """Return what is to be said of a run that did not finish."""
     status = recording.result.get("status", "interrupted")
-    return f"The run is {status}: exported is what there is, up to its last whole chunk."
+    return f"The run did not finish ({status}): exported is what there is, up to its last whole chunk."
 
 
 def _tell(

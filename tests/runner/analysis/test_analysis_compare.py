@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ import runner
 from runner.analysis.compare import compare, statistics
 from runner.analysis.compare.groups import grouped, metrics_of
 from runner.analysis.compare.moments import Moment
-from runner.analysis.compare.sections import sections
+from runner.analysis.compare.sections import in_short, sections
 from runner.analysis.sections import markdown
-from runner.analysis.series import RunSeries
+from runner.analysis.series import RunSeries, groups_of
 from runner.errors import RunnerError
+from runner.export.plots import panels_of
 
 FINISH = [("finish_percent", "")]
 
@@ -24,7 +26,8 @@ def run(seed, curve, *, name="a", finished=True, metric="finish_percent", line="
     """Return a run whose metric takes the values of a curve, every 100 episodes."""
     evaluation = [(100 * k, {metric: {line: float(value)}}) for k, value in enumerate(curve)]
     config = {"episodes": 100 * (len(curve) - 1), "name": name, "seeds": [seed]} | config
-    return RunSeries(f"{name}{seed}{'' if finished else 'x'}", name, seed, finished, config, evaluation, [])
+    status = "finished" if finished else "interrupted"
+    return RunSeries(f"{name}{seed}{'' if finished else 'x'}", name, seed, status, config, evaluation, [])
 
 
 def two_groups(left, right, **kwargs):
@@ -245,3 +248,57 @@ def test_what_cannot_be_compared_is_said_and_ends_with_2(command, words, expecte
     assert refused.exit_code == 2
     assert expected in refused.stderr
     assert "Traceback" not in refused.output
+
+
+def loop(seed, curve, *, every=100, name="a", metric="mean_return", training=False, **config):
+    """Return somebody's own loop, whose metric takes the values of a curve, every so many episodes."""
+    made = run(seed, [], name=name, made_by="runner.record", **config)
+    points = [(every * k, {metric: {"": float(value)}}) for k, value in enumerate(curve, 1)]
+    return replace(made, **{"training" if training else "evaluation": points})
+
+
+def test_a_longer_episode_is_not_worse_in_a_loop_whose_environment_has_no_goal():
+    runs = [loop(0, [9, 400], lr=0.1), loop(0, [9, 300], lr=0.2)]
+    both = [
+        replace(
+            one,
+            evaluation=[(at, {**told, "mean_length": told["mean_return"]}) for at, told in one.evaluation],
+        )
+        for one in runs
+    ]
+    groups, _ = grouped(both)
+    compared = compare(groups, metrics_of(groups), Moment("last"))
+    assert [(metric.metric, metric.higher_is_better) for metric in compared.metrics] == [
+        ("mean_return", True),
+        ("mean_length", None),
+    ]
+    assert "a, lr=0.1 is better than a, lr=0.2 at 1 of 1 seeds" in in_short(compared)[0]
+
+
+def test_loops_without_evaluation_are_compared_by_their_training():
+    made = [loop(0, [1, value], metric="training.mean_return", training=True, lr=value) for value in (2, 5)]
+    groups, _ = grouped(made)
+    compared = compare(groups, metrics_of(groups), Moment("last"))
+    (metric,) = compared.metrics
+    assert (metric.metric, metric.higher_is_better) == ("training.mean_return", True)
+    assert [group.values for group in metric.groups] == [[2.0], [5.0]]
+    assert any(note.startswith("training is compared") for note in compared.notes)
+
+
+def test_a_moment_is_advised_only_if_all_runs_have_it():
+    groups, _ = grouped([loop(0, [1, 2], every=70, lr=1), loop(0, [1, 2], every=80, lr=2)])
+    notes = compare(groups, metrics_of(groups), Moment("last")).metrics[0].notes
+    assert notes == ["the last evaluation is after 140 episodes in a, lr=1, after 160 episodes in a, lr=2"]
+
+
+def test_a_line_does_not_jump_between_runs_that_evaluated_at_other_moments():
+    (group,) = groups_of([loop(1, [0, 0, 0], every=10), loop(2, [100, 100, 100], every=11)])
+    (panel,) = panels_of([group])
+    (curve,) = panel.curves
+    assert curve.episodes.tolist() == [10, 11, 20, 22, 30, 33]
+    assert curve.median.tolist() == [0, 50, 50, 50, 50, 100]
+
+
+def test_a_legend_says_how_a_run_ended():
+    failed = replace(run(0, [1, 2]), status="failed")
+    assert "a0 seed 0, failed" in groups_of([failed])[0].described

@@ -66,7 +66,10 @@ def test_plot_and_report_draw_loops(folder, name, tmp_path):
     assert "Return of training episodes" in drawn
     assert "Return of evaluation trials" in drawn
     assert dualtaxi(folder, "report", name, "-o", str(tmp_path / "report.html")).exit_code == 0
-    assert "from a loop" in (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "from a loop" in page
+    assert "no steps were recorded" not in page
+    assert "No evaluation was recorded" not in page
 
 
 def test_diff_says_where_loops_part(folder):
@@ -117,9 +120,10 @@ def test_verify_finds_a_digest_that_is_not_its_messages(folder, tmp_path):
         ("evaluate", "pole"),
         ("qtable", "lake"),
         ("play", "pole"),
+        ("play", "rooms"),
         ("export", "gif", "pole", "-o", "x.gif"),
     ],
-    ids=lambda words: words[0],
+    ids=" ".join,
 )
 def test_what_a_loop_has_not_is_refused_in_a_sentence(folder, words):
     done = dualtaxi(folder, *words)
@@ -133,6 +137,16 @@ def test_the_grid_of_a_loop_becomes_a_film(folder, tmp_path):
     with open_recording(runner.find_run("lake", folder).recording) as recording:
         steps = len(recording.episode_steps("train", 2))
     assert f"training episode 2, {steps + 1} frames" in done.stdout
+
+
+def test_an_evaluation_of_a_loop_is_played(folder):
+    with open_recording(runner.find_run("lake", folder).recording) as recording:
+        trained = recording.count(schema.TRAIN_EPISODE)
+        second = recording.episode_steps("eval", 1)["state"].tolist()
+    done = dualtaxi(folder, "play", "lake", "--eval", f"{trained}:1", "--json")
+    assert done.exit_code == 0, done.output
+    assert [json.loads(line)["state"] for line in done.stdout.splitlines()] == second
+    assert f"the nearest of 1 is after {trained}" in dualtaxi(folder, "play", "lake", "--eval", "1").output
 
 
 def test_the_grid_of_a_loop_is_played(folder):

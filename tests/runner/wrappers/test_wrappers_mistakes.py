@@ -155,3 +155,25 @@ def test_a_forked_process_leaves_the_recording_alone(tmp_path):
     assert rec.run.summary["train_steps"] == 2
     with opened(rec.run.recording) as recording:
         assert len(list(recording.transitions("train"))) == 2
+
+
+def test_a_second_environment_that_renders_nothing_is_refused_before_the_loop_goes_on(tmp_path):
+    blind = Rooms()
+    blind.render_mode = None
+    with (
+        runner.record(Rooms(), tmp_path, frames_every=4) as rec,
+        pytest.raises(RunnerError, match="frames_every: found an environment with render_mode=None"),
+    ):
+        runner.record(blind, into=rec, phase="eval")
+
+
+@pytest.mark.parametrize(
+    "picture", [None, np.ones((4, 4, 3)), np.zeros((4, 4), np.uint8)], ids=["nothing", "floats", "flat"]
+)
+def test_what_render_returns_is_a_picture_or_refused(tmp_path, monkeypatch, picture):
+    monkeypatch.setattr(Rooms, "render", lambda _: picture)
+    with (
+        runner.record(Rooms(), tmp_path, frames_every=4) as rec,
+        pytest.raises(RunnerError, match=r"expected uint8 of \[height, width, 3\]"),
+    ):
+        rec.reset(seed=0)
