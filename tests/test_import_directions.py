@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,6 +61,12 @@ def part_of(file: Path) -> str:
 def test_every_part_of_the_runner_has_its_place_in_the_order():
     parts = {part_of(file) for file in FILES["runner"]} - {"__init__", "__main__"}
     assert parts == set(RANK), "say in ORDER what a new part may know"
+
+
+def test_the_page_on_the_architecture_names_every_part():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    layout = page.partition("## The layout")[2].partition("Imports go one way")[0]
+    assert {part for part in RANK if not re.search(rf"\b{part}(\.py|/)`", layout)} == set()
 
 
 @pytest.mark.parametrize("part", RANK)
