@@ -1,4 +1,4 @@
-"""The Python examples in the documentation run as they stand."""
+"""The documentation is true: its examples and commands run as they stand, and it shows every picture."""
 
 from __future__ import annotations
 
@@ -94,6 +94,14 @@ def test_commands_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert program == "dualtaxi"
         done = CliRunner().invoke(cli, words)
         assert done.exit_code == (words[0] == "diff"), f"{words}: {done.output}"
+
+
+def test_every_picture_is_shown_and_every_shown_one_is_there() -> None:
+    images = ROOT / "docs" / "images"
+    shown = {
+        name for page in PAGES for name in re.findall(r"images/([\w.-]+)", page.read_text(encoding="utf-8"))
+    }
+    assert shown == {image.name for image in images.iterdir()}
 
 
 def test_there_are_examples() -> None:
