@@ -28,7 +28,6 @@ from runner.export.rerun.scene import (
 from runner.mdp import Mdp
 from runner.words import action_names
 
-MOST_CLASSES: Final = 60_000
 MOST_REWARDS: Final = 2_000
 MOST_T: Final = 10_000
 _LEVELS: Final = 4_000
