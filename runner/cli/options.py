@@ -70,7 +70,7 @@ folders_option: Final = click.option(
     metavar="DIR",
     multiple=True,
     callback=_folders,
-    help="A folder of runs; may be given several times.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
+    help="A folder of runs; may be repeated.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
 )
 
 filter_argument: Final = click.argument("words", metavar="[FILTER]...", nargs=-1)
@@ -82,7 +82,7 @@ set_option: Final = click.option(
     "overrides",
     multiple=True,
     metavar="KEY=VALUE",
-    help="Put another value in the configuration, such as evaluation.trials=50. May be repeated.",
+    help="Put another value in the configuration, such as evaluation.trials=50; may be repeated.",
 )
 
 

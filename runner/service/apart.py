@@ -126,7 +126,7 @@ def _context() -> Any:
 
 def _work(its: Connection, function: Callable[..., Any], args: Any, keywords: Any) -> None:
     """Send what a function returns, or its error."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is the service's to act on
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to act on
     try:
         told = ("done", function(*args, **keywords))
     except (RunnerError, OSError) as error:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     "statuses",
     multiple=True,
     type=click.Choice([status for status in STATUSES if status != "running"]),
-    help="Of this status; may be given several times. Archived ones go only if it is said.",
+    help="Of this status; may be repeated. Archived ones go only if it is said.",
 )
 @dry_run_option
 @yes_option

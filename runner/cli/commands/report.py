@@ -27,14 +27,14 @@ from runner.cli.output import say, size
     type=click.IntRange(0),
     multiple=True,
     metavar="N",
-    help="Show this training episode too, counted from 0. May be repeated.",
+    help="Show this training episode too, counted from 0; may be repeated.",
 )
 @click.option(
     "--eval",
     "trials",
     multiple=True,
     metavar="N:TRIAL",
-    help="Show this trial of the evaluation after N training episodes too. May be repeated.",
+    help="Show this trial of the evaluation after N training episodes too; may be repeated.",
 )
 @click.option("--force", is_flag=True, help="Replace the file if it exists.")
 @recordings_option

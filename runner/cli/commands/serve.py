@@ -19,7 +19,7 @@ from runner.cli.output import say
     type=click.IntRange(0, 65535),
     default=8000,
     show_default=True,
-    metavar="N",
+    metavar="PORT",
     help="Listen there; 0: any port that is free.",
 )
 @click.option(
@@ -27,7 +27,7 @@ from runner.cli.output import say
     "hosts",
     multiple=True,
     metavar="NAME",
-    help="A name by which it may be asked for, such as that of a proxy; may be given several times.",
+    help="A name by which it may be asked for, such as that of a proxy; may be repeated.",
 )
 @click.option("--proxy", "proxies", multiple=True, metavar="ADDRESS", help="Believe this proxy who asks.")
 @click.option("--require-token", is_flag=True, help="Ask for a token for reading too, on any host.")
@@ -63,7 +63,7 @@ def command(
 ) -> None:
     """Open the runs to browsers and programs: list, replay, compare, upload, submit.
 
-    The address is printed on stdout; a log goes to stderr, as JSON lines unless that is a terminal. Ctrl+C
+    The address is printed on stdout; a log goes to stderr, as JSON lines unless that is a terminal. Ctrl-C
     or SIGTERM stops it: what is under way comes to its end, and jobs are finished or left resumable.
 
     Other hosts than loopback ones need a token (`dualtaxi token create NAME`), and a proxy for TLS in front:
@@ -111,6 +111,6 @@ def command(
     click.echo(url_of(listening))
     sys.stdout.flush()
     if sys.stderr.isatty():
-        say("Ctrl+C stops it.")
+        say("Ctrl-C stops it.")
     with logs.logged_to(stream, for_people=log is None and sys.stderr.isatty()):
         serve(app, settings, listening)

@@ -35,7 +35,7 @@ def command(
     """Have the experiment or the sweep in FILE done by a server.
 
     It is checked there as it would be here, and queued. The server's pages and `--watch` tell how far it is;
-    Ctrl+C ends the watching, not the job. A connection that breaks is taken up again.
+    Ctrl-C ends the watching, not the job. A connection that breaks is taken up again.
 
     Exit code 0 when it is queued, or with --watch finished; 1 when it failed or was cancelled.
 
