@@ -9,7 +9,7 @@ without a traceback and exits with `exit_code`.
     ├── RecordingError       a recording is damaged, foreign, or of an unknown version
     ├── Diverged             a recording differs from what its job gives
     ├── RunNotFound          no run, or more than one, answers to a name
-    ├── StorageError         the recordings folder cannot be written, or its disk is full
+    ├── StorageError         a file or folder cannot be written, or the disk is full
     └── MissingExtra         a command needs an optional package
 """
 
@@ -80,7 +80,7 @@ class RunNotFound(RunnerError):
 
 
 class StorageError(RunnerError):
-    """The recordings folder cannot be written, or its disk is full."""
+    """A file or folder cannot be written, or the disk is full."""
 
     exit_code = 1
 

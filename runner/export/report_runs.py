@@ -7,7 +7,7 @@ import secrets
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from runner.errors import RecordingError, RunnerError
+from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.runs import Run, find_run, list_runs
@@ -32,7 +32,8 @@ def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
     """Have a file written beside its place, and put there when it is whole.
 
     Raises:
-        RunnerError: there is one already and `force` is not given, or it cannot be written.
+        RunnerError: there is one already and `force` is not given.
+        StorageError: it cannot be written.
     """
     require_new(path, force)
     fresh = path.with_name(f".{secrets.token_hex(4)}.{path.name}")
@@ -40,7 +41,7 @@ def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
         write(fresh)
         fresh.replace(path)
     except OSError as error:
-        raise RunnerError(f"{path}: cannot be written ({error.strerror}).") from error
+        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
     finally:
         if os.path.lexists(fresh):
             fresh.unlink()

@@ -136,7 +136,7 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     import time
 
-    from runner.errors import StorageError
+    from runner.export.report_runs import require_new
     from runner.export.rerun.viewer import require_rerun
     from runner.recording.reader import open_recording
 
@@ -146,8 +146,7 @@ def command(
     started = time.monotonic()
     run = find_recorded(run_name, recordings)
     path = output or Path(f"{run.name}-{run.run_id}.rrd")
-    if path.exists() and not force:
-        raise StorageError(f"{path}: exists already; choose another file by -o, or replace it by --force.")
+    require_new(path, force)
     request = request_of(episodes, evaluations, every, everything)
     with open_recording(run.recording) as recording:
         source = Source(recording, f"{run.name}, seed {run.seed} ({run.run_id})")

@@ -9,7 +9,6 @@ import click
 
 from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
 from runner.cli.output import UNKNOWN, draw, facts, number, print_json, say, table, title
-from runner.errors import StorageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -25,11 +24,13 @@ if TYPE_CHECKING:
     "--state", type=click.IntRange(0), metavar="S", help="The values of one state, with their history."
 )
 @click.option(
-    "--out",
+    "-o",
+    "--output",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE.npy",
     help="Write the whole table: float64 [states, actions], of several agents [agents, states, actions].",
 )
+@click.option("--force", is_flag=True, help="Replace the file if it exists.")
 @recordings_option
 @json_option
 def command(
@@ -37,7 +38,8 @@ def command(
     step: int | None,
     episode: int | None,
     state: int | None,
-    out: Path | None,
+    output: Path | None,
+    force: bool,
     recordings: Path | None,
     as_json: bool,
 ) -> None:
@@ -51,36 +53,40 @@ def command(
     Examples:
       dualtaxi qtable @latest --episode 500
       dualtaxi qtable k3v9m2xq --step 50000 --state 17
-      dualtaxi qtable k3v9m2xq --step 50000 --out table.npy
+      dualtaxi qtable k3v9m2xq --step 50000 -o table.npy
     """  # noqa: D301 - Click wants the backspace itself
     if step is not None and episode is not None:
         raise click.UsageError("--step and --episode exclude each other: choose one.")
     from runner.analysis.qtable import at_moment, told_of
+    from runner.export.report_runs import require_new
     from runner.recording.reader import open_recording
 
+    if output is not None:
+        require_new(output, force)
     with open_recording(find_recorded(run_name, recordings).recording) as recording:
         replay = at_moment(recording, step, episode)
         told = told_of(recording, replay, state)
         tables = replay.tables
-    if out is not None:
-        _write(out, tables)
-        told["out"] = str(out.absolute())
+    if output is not None:
+        _write(output, force, tables)
+        told["path"] = str(output.absolute())
     if as_json:
         print_json(told)
     else:
         _draw(told)
 
 
-def _write(path: Path, tables: list[NDArray[Any]]) -> None:
+def _write(path: Path, force: bool, tables: list[NDArray[Any]]) -> None:
     import numpy as np
 
     from runner.analysis.qtable import one_array
+    from runner.export.report_runs import write_new
 
-    try:
-        with path.open("wb") as stream:
+    def write(fresh: Path) -> None:
+        with fresh.open("wb") as stream:  # of a name, NumPy would make another one
             np.save(stream, one_array(tables))
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror}).") from error
+
+    write_new(path, force, write)
 
 
 def _draw(told: dict[str, Any]) -> None:
@@ -100,8 +106,8 @@ def _draw(told: dict[str, Any]) -> None:
         rows = [row for row in told["values"] if row["agent"] == one["agent"]]
         parts += [title(one["agent"]), _drawn(rows)]
     draw(*parts)
-    if "out" in told:
-        say(f"Written: {told['out']}")
+    if "path" in told:
+        say(f"Written: {told['path']}")
 
 
 def _drawn(rows: list[dict[str, Any]]) -> Any:

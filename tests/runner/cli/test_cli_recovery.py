@@ -276,7 +276,7 @@ def test_what_cannot_be_repaired_stays(command, tmp_path, content):
 
 def test_qtable(recorded, recorded_run, tmp_path):
     out = tmp_path / "table.npy"
-    result = recorded("qtable", recorded_run.recording, "--step", 300, "--out", out)
+    result = recorded("qtable", recorded_run.recording, "--step", 300, "-o", out)
     assert result.exit_code == 0
     assert "after 300 training steps" in result.stdout
     with open_recording(recorded_run.recording) as recording:
@@ -285,6 +285,18 @@ def test_qtable(recorded, recorded_run, tmp_path):
         ended = int(recording.episodes("train", 9, 10)[0]["last_step"]) + 1
     assert recorded.json("qtable", "@latest", "--episode", 10)["step"] == ended
     assert recorded.json("qtable", "@latest")["step"] == recorded_run.summary["train_steps"]
+
+
+def test_qtable_replaces_a_file_only_when_asked(recorded, tmp_path):
+    out = tmp_path / "mine"
+    out.write_text("mine")
+    result = recorded("qtable", "@latest", "-o", out)
+    assert result.exit_code == 2
+    assert "--force" in result.stderr
+    assert out.read_text() == "mine"
+    assert recorded.json("qtable", "@latest", "-o", out, "--force")["path"] == str(out)
+    assert np.load(out).dtype == np.float64
+    assert list(tmp_path.iterdir()) == [out]
 
 
 def test_qtable_of_a_state(recorded, recorded_run):
@@ -312,12 +324,12 @@ def test_qtable_of_a_state(recorded, recorded_run):
         (("--state", 10**7), "state: found 10000000"),
         (("--step", 1, "--episode", 1), "choose one"),
         (("--step", -1), "-1"),
-        (("--out", "/nowhere/table.npy"), "cannot be written"),
+        (("-o", "/nowhere/table.npy"), "cannot be written"),
     ],
 )
 def test_qtable_of_what_is_not_there(recorded, words, told):
     result = recorded("qtable", "@latest", *words)
-    assert result.exit_code == (1 if "--out" in words else 2)
+    assert result.exit_code == (1 if "-o" in words else 2)
     assert told in result.stderr
     assert not result.stdout
 

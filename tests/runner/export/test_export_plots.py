@@ -110,6 +110,12 @@ def test_a_file_is_replaced_only_when_asked(pictured, tmp_path):
     assert path.read_text() != "mine"
 
 
+def test_a_file_that_cannot_be_written_is_said_as_a_full_disk_is(pictured, tmp_path):
+    result = plot(pictured("stairs", log=None).recording, "-o", tmp_path / "nowhere" / "plot.svg")
+    assert result.exit_code == 1
+    assert "cannot be written (No such file or directory)" in result.stderr
+
+
 def test_a_name_stands_for_all_its_runs(pictured, tmp_path):
     runs = [pictured("lake", name="trio", seed=seed) for seed in (1, 2, 3)]
     words = ("trio", "--recordings", runs[0].folder.parent, "-o", tmp_path / "p.svg")

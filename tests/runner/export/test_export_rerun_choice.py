@@ -114,7 +114,7 @@ class TestCommand:
         run, path = pictured("lake"), tmp_path / "a.rrd"
         path.write_bytes(b"precious")
         result = invoke("export", "rerun", run.folder, "-o", path)
-        assert result.exit_code != 0
+        assert result.exit_code == 2
         assert "--force" in result.output
         assert path.read_bytes() == b"precious"
         result = invoke("export", "rerun", run.folder, "-o", path, "--force")
