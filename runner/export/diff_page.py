@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -80,7 +80,7 @@ def told_of(difference: RunDiff, a: Recording, b: Recording) -> dict[str, Any]:
         "notes": difference.notes,
         "legend": [(i, COLOURS[i], "AB"[i], name) for i, name in enumerate(names)],
         "partings": [_parting(difference, *pair, a, b) for pair in _partings(difference)],
-        "training": _overlap_told(told["Training"], difference),
+        "training": _overlap_told(told["Training"], difference) + _loops_told(told, difference),
         "tables": {"figures": _table_figures(difference, a, b), **_parts(told["Q-tables"])},
         "metrics": _parts(told["Metrics"]),
         "others": [
@@ -104,6 +104,14 @@ def _partings(difference: RunDiff) -> Iterator[tuple[Parting, Cause]]:
 def _overlap_told(section: Section, difference: RunDiff) -> list[str]:
     """Return how far training is the same, in sentences: the last one of its section."""
     return section.sentences[-1:] if difference.overlap is not None else []
+
+
+def _loops_told(told: Mapping[str, Section], difference: RunDiff) -> list[str]:
+    """Return where somebody's own loops part: nobody knows why, so there is nothing to picture."""
+    parted = difference.parting is not None and difference.cause is None
+    return (told["Training"].sentences if parted else []) + (
+        told["Evaluation"].sentences if difference.loop_evaluation is not None else []
+    )
 
 
 # --- where they part ----------------------------------------------------------------------------------

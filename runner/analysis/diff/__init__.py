@@ -12,7 +12,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from runner.analysis.diff.causes import Cause, Row, Update, cause_of, kind_of
-from runner.analysis.diff.loops import comparable, loop_environment_diff, loop_means, loop_parting
+from runner.analysis.diff.loops import (
+    comparable,
+    loop_environment_diff,
+    loop_means,
+    loop_parting,
+    parted_topics,
+)
 from runner.analysis.diff.metrics import MetricDiff, metric_diffs
 from runner.analysis.diff.settings import (
     Change,
@@ -70,6 +76,8 @@ class RunDiff:
     overlap: Overlap | None = None
     evaluations: list[tuple[Parting, Cause]] = field(default_factory=list)
     """The first evaluation that parts: where, and why; empty if none does."""
+    loop_evaluation: Parting | None = None
+    """The first step of evaluation at which somebody's own loops part."""
     tables: list[TableDiff] = field(default_factory=list)
     metrics: list[MetricDiff] = field(default_factory=list)
     costs: list[Change] = field(default_factory=list)
@@ -133,6 +141,11 @@ def _diff_of_loops(a: Recording, b: Recording) -> RunDiff:
     notes = ["recorded from a loop: what it learned is not known, so no cause and no tables are told"]
     if not comparable(a, b):
         notes.append("the environments have other spaces: no steps are compared")
+    partings = [
+        loop_parting(a, b, phase) if comparable(a, b) and not same else None for phase in ("train", "eval")
+    ]
+    if comparable(a, b) and not any(partings) and (topics := parted_topics(a, b)):
+        notes.append(f"all steps are the same; what differs is in {', '.join(topics)}")
     return RunDiff(
         a=_who(a),
         b=_who(b),
@@ -140,7 +153,8 @@ def _diff_of_loops(a: Recording, b: Recording) -> RunDiff:
         config=changes_in(_settings(a), _settings(b)),
         provenance=changes_in(a.provenance, b.provenance),
         environment=loop_environment_diff(a, b),
-        parting=loop_parting(a, b) if comparable(a, b) and not same else None,
+        parting=partings[0],
+        loop_evaluation=partings[1],
         costs=changes_in(_costs(a) | loop_means(a), _costs(b) | loop_means(b)),
         notes=notes,
     )

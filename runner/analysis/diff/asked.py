@@ -28,7 +28,8 @@ def without(difference: RunDiff, ignore: Sequence[str]) -> RunDiff:
 def as_json(difference: RunDiff) -> dict[str, Any]:
     """Return the difference as JSON can hold it; whole step records are left out."""
     told = dataclasses.asdict(difference)
-    for parting in (told["parting"], *(pair[0] for pair in told["evaluations"])):
+    evaluations = (pair[0] for pair in told["evaluations"])
+    for parting in (told["parting"], told["loop_evaluation"], *evaluations):
         if parting is not None:
             del parting["a_step"], parting["b_step"]
     return told

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,9 @@ from runner.recording import schema
 from runner.recording.messages import decode
 from runner.recording.reader import Recording
 
-_HEADER = {name for name, _ in schema.HEADER}
+MOST_NUMBERS: Final = 16
+"""A value of more numbers is not told whole where it differs."""
+_HEADER: Final = {name for name, _ in schema.HEADER}
 
 
 def loop_environment_diff(a: Recording, b: Recording) -> EnvironmentDiff:
@@ -35,11 +37,11 @@ def comparable(a: Recording, b: Recording) -> bool:
     return len(both) == 1 and a.spaces == b.spaces and a.run["agents"] == b.run["agents"]
 
 
-def loop_parting(a: Recording, b: Recording) -> Parting | None:
-    """Return the first step of training at which two loops part, and the first field of it that differs."""
-    topics = [recording.topic("/train/step") for recording in (a, b)]
+def loop_parting(a: Recording, b: Recording, phase: str = "train") -> Parting | None:
+    """Return the first step of a phase at which two loops part, and the first field of it that differs."""
+    topics = [recording.topic(f"/{phase}/step") for recording in (a, b)]
     if topics[0] not in a.dtypes:
-        return _message_parting(a, b)
+        return _message_parting(a, b, phase)
     streams = [recording.blocks(topic) for recording, topic in zip((a, b), topics, strict=True)]
     left: NDArray[Any] = np.empty(0)
     right: NDArray[Any] = np.empty(0)
@@ -51,10 +53,10 @@ def loop_parting(a: Recording, b: Recording) -> Parting | None:
         )
         n = min(len(left), len(right))
         if not n:
-            return _end(left, right, position)
+            return _end(left, right, position, phase)
         rows, name = _first_difference(left[:n], right[:n])
         if name:
-            return _parting(left[rows], right[rows], name)
+            return _parting(left[rows], right[rows], name, phase)
         left, right, position = left[n:], right[n:], position + n
 
 
@@ -82,37 +84,50 @@ def _rows_differ(left: NDArray[Any], right: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray((one != other).any(axis=1))
 
 
-def _end(left: NDArray[Any], right: NDArray[Any], position: int) -> Parting | None:
+def _end(left: NDArray[Any], right: NDArray[Any], position: int, phase: str) -> Parting | None:
     """Return the parting where one loop ends before the other; None if both end."""
     if not (len(left) or len(right)):
         return None
     step = left[0] if len(left) else right[0]
     a, b = ("one more" if len(block) else "none" for block in (left, right))
     return Parting(
-        "train", None, None, position, int(step["episode"]), int(step["t"]), "step", a, b, None, None
+        phase, None, None, position, int(step["episode"]), int(step["t"]), "step", a, b, None, None
     )
 
 
-def _parting(left: np.void, right: np.void, name: str) -> Parting:
+def _parting(left: np.void, right: np.void, name: str, phase: str) -> Parting:
+    part, one, other = _part(name, left[name], right[name])
     return Parting(
-        phase="train",
+        phase=phase,
         evaluation=None,
         after=None,
         step=int(left["step"]),
         episode=int(left["episode"]),
         t=int(left["t"]),
-        field=name,
-        a=left[name].tolist(),
-        b=right[name].tolist(),
+        field=part,
+        a=one.tolist(),
+        b=other.tolist(),
         a_step=left,
         b_step=right,
     )
 
 
-def _message_parting(a: Recording, b: Recording) -> Parting | None:
+def _part(name: str, one: Any, other: Any) -> tuple[str, Any, Any]:
+    """Return the first part of a value that differs: of a Dict its entry, of many numbers the one."""
+    for entry in one.dtype.names or ():
+        if one[entry].tobytes() != other[entry].tobytes():
+            return _part(f"{name}.{entry}", one[entry], other[entry])
+    if one.size <= MOST_NUMBERS:
+        return name, one, other
+    rows = _rows_differ(one.reshape(-1), other.reshape(-1))
+    place = np.unravel_index(int(rows.argmax()), one.shape)
+    return f"{name}[{', '.join(map(str, place))}]", one[place], other[place]
+
+
+def _message_parting(a: Recording, b: Recording, phase: str) -> Parting | None:
     """Return the parting of loops whose steps vary in size."""
     streams: list[Iterator[tuple[int, bytes]]] = [
-        recording.messages(recording.topic("/train/step")) for recording in (a, b)
+        recording.messages(recording.topic(f"/{phase}/step")) for recording in (a, b)
     ]
     position = 0
     while True:
@@ -127,9 +142,15 @@ def _message_parting(a: Recording, b: Recording) -> Parting | None:
     names = [name for name in some if steps[0].get(name) != steps[1].get(name)]
     name = names[0] if all(steps) and names else "step"
     told_a, told_b = (str(step.get(name, "none")) for step in steps)
-    return Parting(
-        "train", None, None, position, some["episode"], some["t"], name, told_a, told_b, None, None
-    )
+    return Parting(phase, None, None, position, some["episode"], some["t"], name, told_a, told_b, None, None)
+
+
+def parted_topics(a: Recording, b: Recording) -> list[str]:
+    """Return the topics whose content differs, as both recordings' digests say, if they have them."""
+    left, right = (recording.result.get("topic_digests") for recording in (a, b))
+    if not left or not right:
+        return []
+    return sorted(name for name in left.keys() | right.keys() if left.get(name) != right.get(name))
 
 
 def loop_means(recording: Recording) -> dict[str, Any]:

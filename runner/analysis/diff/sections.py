@@ -71,6 +71,8 @@ def in_short(difference: RunDiff) -> str:
         said.append("Training differs from the first step on.")
     elif difference.overlap is not None:
         said.append("Training took the same steps.")
+    elif difference.loop_evaluation is not None:
+        said.append("Training took the same steps, evaluation did not.")
     return " ".join(said)
 
 
@@ -110,10 +112,7 @@ def _trajectory(difference: RunDiff) -> Section:
         sentences += _told(parting, difference.cause)
         grids += _q_rows(difference.cause)
     elif parting is not None:
-        sentences.append(
-            f"They part at training step {parting.step:,}, of episode {parting.episode:,} at time "
-            f"{parting.t:,}: {spoken(parting.field)} is {_text(parting.a)} in A, {_text(parting.b)} in B."
-        )
+        sentences.append(_of_loops(parting))
     elif overlap is not None:
         sentences.append("Training is the same, step by step.")
     if overlap is not None and parting is not None:
@@ -134,7 +133,17 @@ def _evaluations(difference: RunDiff) -> Section:
             *evaluation_told(difference, cause),
         ]
         grids += _q_rows(cause)
+    if difference.loop_evaluation is not None:
+        sentences.append(_of_loops(difference.loop_evaluation))
     return Section("Evaluation", sentences, grids)
+
+
+def _of_loops(parting: Parting) -> str:
+    phase = "training" if parting.phase == "train" else "evaluation"
+    return (
+        f"They part at {phase} step {parting.step:,}, of episode {parting.episode:,} at time {parting.t:,}: "
+        f"{spoken(parting.field)} is {_text(parting.a)} in A, {_text(parting.b)} in B."
+    )
 
 
 def _told(parting: Parting, cause: Cause) -> list[str]:

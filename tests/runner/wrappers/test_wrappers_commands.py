@@ -92,6 +92,64 @@ def test_diff_says_where_loops_part(folder):
     assert "other spaces" in foreign.stdout
 
 
+def looped(folder: Path, name: str, tested: int = 0, logged: float = 0.0) -> None:
+    """Record a loop in whose evaluation and log others may differ."""
+    with runner.record(make("CartPole-v1"), folder, name=name) as env:
+        list(play(env, 50, 0))
+        with env.phase("eval"):
+            list(play(env, 50, tested))
+        env.log("loss", logged)
+
+
+def test_diff_says_where_evaluations_of_loops_part(tmp_path):
+    looped(tmp_path, "one")
+    looped(tmp_path, "two", tested=1)
+    told = dualtaxi(tmp_path, "diff", "one", "two")
+    assert told.exit_code == 1
+    assert "Training took the same steps, evaluation did not." in told.stdout
+    assert "They part at evaluation step 0" in told.stdout
+    parted = json.loads(dualtaxi(tmp_path, "diff", "one", "two", "--json").stdout)
+    assert (parted["parting"], parted["loop_evaluation"]["step"]) == (None, 0)
+    page = tmp_path / "diff.html"
+    dualtaxi(tmp_path, "diff", "one", "two", "--html", str(page))
+    assert "They part at evaluation step 0" in page.read_text()
+
+
+def test_diff_says_what_differs_between_loops_of_the_same_steps(tmp_path):
+    looped(tmp_path, "one")
+    looped(tmp_path, "two", logged=1.0)
+    told = dualtaxi(tmp_path, "diff", "one", "two")
+    assert told.exit_code == 1
+    assert "all steps are the same; what differs is in /scalar." in told.stdout
+
+
+class Pictures(gymnasium.Env[Any, Any]):
+    """Observes many numbers, of which one is what it was made with."""
+
+    observation_space = gymnasium.spaces.Dict({"picture": gymnasium.spaces.Box(0, 255, (9, 9), np.uint8)})
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return {"picture": np.zeros((9, 9), np.uint8)}, {}
+
+    def step(self, action: Any) -> Any:
+        picture = np.zeros((9, 9), np.uint8)
+        picture[3, 4] = self.number
+        return {"picture": picture}, 0.0, True, False, {}
+
+
+def test_diff_of_pictures_tells_the_number_that_differs(tmp_path):
+    for number in (7, 8):
+        with runner.record(Pictures(number), tmp_path, name=f"of{number}") as env:
+            env.reset()
+            env.step(1)
+    parting = json.loads(dualtaxi(tmp_path, "diff", "of7", "of8", "--json").stdout)["parting"]
+    assert (parting["field"], parting["a"], parting["b"]) == ("next_observation.picture[3, 4]", 7, 8)
+
+
 @pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
 def test_verify_checks_what_can_be_checked(folder, name):
     told = dualtaxi(folder, "verify", name)
