@@ -1,15 +1,28 @@
-"""Small JSON files beside a recording: read within bounds, replaced whole."""
+"""JSON: values that it can hold; small files of it beside a recording, read within bounds, replaced whole."""
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import secrets
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 _WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+def finite(value: Any) -> Any:
+    """Return a value as JSON can hold it: NaN and infinity, for which it has no word, as None."""
+    if isinstance(value, Mapping):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
 
 
 def read_object(path: str | os.PathLike[str], most: int) -> dict[str, Any]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from runner.amounts import UNKNOWN, age, amount, duration, number, size
+from runner.documents import finite
 
 if TYPE_CHECKING:  # imported when something is drawn
     from rich.console import Console, RenderableType
@@ -37,8 +37,8 @@ UNBOUNDED: Final = 1000
 
 
 def print_json(value: Any, indent: int | None = 1) -> None:
-    """Print a value as JSON on stdout; None for `indent` makes it one line. NaN becomes null."""
-    click.echo(json.dumps(_finite(value), indent=indent, allow_nan=False))
+    """Print a value as JSON on stdout; None for `indent` makes it one line. NaN and infinity become null."""
+    click.echo(json.dumps(finite(value), indent=indent, allow_nan=False))
 
 
 def say(text: str) -> None:
@@ -108,14 +108,3 @@ def facts(pairs: Mapping[str, str]) -> Table:
     for name, text in pairs.items():
         made.add_row(name, text)
     return made
-
-
-def _finite(value: Any) -> Any:
-    """Return a value that JSON can hold: no NaN, no infinity, no NumPy."""
-    if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value

@@ -6,7 +6,7 @@ import dataclasses
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.documents import finite
 from runner.errors import RunnerError
 from runner.frames import Phase, episode_columns, evaluation_records, step_columns, training_records
 from runner.recording.reader import open_recording
@@ -239,19 +240,7 @@ def replay(runs: Sequence[Run], request: Request) -> Path:
 
 def as_json(value: Any) -> bytes:
     """Return a value as JSON; NaN and infinity become null."""
-    return json.dumps(_finite(value), allow_nan=False, ensure_ascii=False).encode(errors="replace")
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, np.generic):
-        return _finite(value.item())
-    return value
+    return json.dumps(finite(value), allow_nan=False, ensure_ascii=False).encode(errors="replace")
 
 
 def _series(paths: Sequence[Path]) -> list[RunSeries]:

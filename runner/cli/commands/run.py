@@ -7,13 +7,14 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
 from runner.cli import INTERRUPTED
 from runner.cli.options import config_argument, json_option, recordings_option, set_option
 from runner.cli.output import amount, duration, print_json, say, size
+from runner.cli.working import announcing, run_as_json
 
 if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
     from rich.console import RenderableType
@@ -112,7 +113,7 @@ def command(
 
 def _tell(run: Run, number: int, as_json: bool) -> None:
     if as_json:
-        print_json(_as_json(run), indent=None)
+        print_json(run_as_json(run), indent=None)
     else:
         _summarise(run, blank=number > 0)
     sys.stdout.flush()
@@ -124,7 +125,6 @@ def _run_abreast(
     """Run an experiment's seeds side by side, and tell of each run."""
     from runner.api import abreast, interruptible, jobs_in
     from runner.cli.progress import counting
-    from runner.learning.compilation import announced
     from runner.mdp import load_mdp
 
     load_mdp(config.env.id, config.env.kwargs, config.rewards)  # refused before all else
@@ -132,7 +132,7 @@ def _run_abreast(
     runs: list[Run] = []
     with (
         interruptible(second=signal.SIG_DFL) as interrupt,
-        announced(lambda: say("Compiling the learning kernel, this once: a few seconds.")),
+        announcing(),
         counting("runs", len(config.seeds)) as done,
     ):
         for run in abreast(jobs_in(config, folder), folder, name, at_once, interrupt):
@@ -182,9 +182,8 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch
             contextlib.nullcontext() if watch is None else watch(run) as view,
         ):
             from runner.execution import run_job
-            from runner.learning.compilation import announced
 
-            with announced(lambda: say("Compiling the learning kernel, this once: a few seconds.")):
+            with announcing():
                 run = run_job(job, run, report, interrupt, view)
     if view is not None and (view.dropped or view.failure):
         say(f"Recorded in full, but not all was shown live: {view.failure or 'the viewer was too slow'}.")
@@ -228,25 +227,6 @@ def _announce(config: ExperimentConfig, folder: Path) -> None:
 def _someone_answers() -> bool:
     """Return whether there is a terminal to ask on."""
     return sys.stdin.isatty() and sys.stderr.isatty()
-
-
-def _as_json(run: Run) -> dict[str, Any]:
-    """Return what programs want to know of a run that is over."""
-    summary = run.summary
-    return {
-        "run_id": run.run_id,
-        "name": run.name,
-        "seed": run.seed,
-        "status": run.status,
-        "path": str(run.recording.absolute()),
-        "content_digest": summary["content_digest"],
-        "episodes": summary["episodes"],
-        "train_steps": summary["train_steps"],
-        "eval_steps": summary["eval_steps"],
-        "seconds": summary["seconds"],
-        "bytes": summary["bytes"],
-        "last_evaluation": summary["last_evaluation"],
-    }
 
 
 def _summarise(run: Run, blank: bool) -> None:
