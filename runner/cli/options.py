@@ -42,6 +42,23 @@ class RunName(click.ParamType):  # type: ignore[type-arg]  # generic in newer ve
         ]
 
 
+class TrialName(click.ParamType):  # type: ignore[type-arg]  # generic in newer versions only
+    """`N:TRIAL`, a trial of the evaluation after N training episodes."""
+
+    name = "N:TRIAL"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        """Return both numbers."""
+        if isinstance(value, tuple):
+            return value
+        after, colon, trial = value.partition(":")
+        if not after.isdecimal() or (colon and not trial.isdecimal()):
+            self.fail(f"found {value!r}, expected N:TRIAL, such as 3000:0", param, ctx)
+        return int(after), int(trial or 0)
+
+
 run_argument: Final = click.argument("run_name", metavar="RUN", type=RunName())
 
 config_argument: Final = click.argument("config", metavar="CONFIG", type=click.Path(path_type=Path))
@@ -85,6 +102,17 @@ set_option: Final = click.option(
     help="Put another value in the configuration, such as evaluation.trials=50; may be repeated.",
 )
 
+episode_option: Final = click.option(
+    "--episode", type=click.IntRange(0), metavar="N", help="A training episode, counted from 0."
+)
+
+trial_option: Final = click.option(
+    "--eval",
+    "trial",
+    type=TrialName(),
+    metavar="N:TRIAL",
+    help="A trial, counted from 0, of the evaluation after N training episodes.",
+)
 
 token_option: Final = click.option(
     "--token", metavar="TOKEN", help="Lets one in.  [default: $DUALTAXI_TOKEN, or of $DUALTAXI_TOKEN_FILE]"

@@ -114,15 +114,3 @@ def require_steps(recording: Recording) -> None:
             f"{recording.path}: found no steps (recording.steps: none), so there is no episode to show; "
             "`dualtaxi rerecord` records them."
         )
-
-
-def parse_trial(text: str) -> tuple[int, int]:
-    """Return the numbers in `N:TRIAL`: training episodes before the evaluation, and the trial.
-
-    Raises:
-        RunnerError: it is something else.
-    """
-    after, colon, number = text.partition(":")
-    if not after.isdecimal() or (colon and not number.isdecimal()):
-        raise RunnerError(f"--eval: found {text!r}, expected N:TRIAL, such as 3000:0.")
-    return int(after), int(number or 0)

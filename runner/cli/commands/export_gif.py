@@ -6,19 +6,14 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find_recorded, recordings_option, run_argument
+from runner.cli.options import episode_option, find_recorded, recordings_option, run_argument, trial_option
 from runner.cli.output import say, size
 
 
 @click.command("gif")
 @run_argument
-@click.option("--episode", type=click.IntRange(0), metavar="N", help="A training episode, counted from 0.")
-@click.option(
-    "--eval",
-    "chosen",
-    metavar="N:TRIAL",
-    help="A trial, counted from 0, of the evaluation after N training episodes.",
-)
+@episode_option
+@trial_option
 @click.option(
     "-o",
     "--output",
@@ -57,7 +52,7 @@ from runner.cli.output import say, size
 def command(
     run_name: str,
     episode: int | None,
-    chosen: str | None,
+    trial: tuple[int, int] | None,
     output: Path,
     speed: float,
     steps: int,
@@ -77,31 +72,25 @@ def command(
       dualtaxi export gif k3v9m2xq --eval 3000:7 -o trial.gif
       dualtaxi export gif k3v9m2xq --episode 0 --speed 8 --force
     """  # noqa: D301 - Click wants the backspace itself
-    if episode is not None and chosen is not None:
+    if episode is not None and trial is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
+    from runner.export import report_replay as replay
     from runner.export.gif import require_packages, require_states, write_gif
-    from runner.export.report_replay import (
-        last_episode,
-        last_whole_evaluation,
-        training_episode,
-        trial,
-        typical_trial,
-    )
-    from runner.export.report_runs import parse_trial, shortcomings, state_of, write_new
+    from runner.export.report_runs import shortcomings, state_of, write_new
     from runner.recording.reader import open_recording
 
     require_packages()
     said: list[int] = []
     with open_recording(find_recorded(run_name, recordings).recording) as recording:
         require_states(recording)
-        if episode is None and chosen is None and last_whole_evaluation(recording) is None:
-            episode = last_episode(recording)
+        if episode is None and trial is None and replay.last_whole_evaluation(recording) is None:
+            episode = replay.last_episode(recording)
             say(f"There is no whole evaluation: this is the last training episode, {episode:,}.")
         if episode is not None:
-            shown = training_episode(recording, episode, steps)
+            shown = replay.training_episode(recording, episode, steps)
         else:
-            after, number = parse_trial(chosen) if chosen is not None else typical_trial(recording)
-            shown = trial(recording, after, number, steps)
+            after, number = trial or replay.typical_trial(recording)
+            shown = replay.trial(recording, after, number, steps)
         write_new(output, force, lambda path: said.append(write_gif(path, recording, shown, speed, width)))
         if state_of(recording) != "finished":
             say(shortcomings(recording)[0])

@@ -6,11 +6,18 @@ import time
 from collections.abc import Iterator
 from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
+from runner.cli.options import (
+    episode_option,
+    find_recorded,
+    json_option,
+    recordings_option,
+    run_argument,
+    trial_option,
+)
 from runner.cli.output import print_json
 
 if TYPE_CHECKING:
@@ -20,33 +27,10 @@ if TYPE_CHECKING:
     from runner.recording.reader import Recording
 
 
-class _Trial(click.ParamType):  # type: ignore[type-arg]  # generic in newer versions only
-    """`N:TRIAL`, a trial of the evaluation after N training episodes."""
-
-    name = "N:TRIAL"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
-        """Return both numbers."""
-        if isinstance(value, tuple):
-            return value
-        after, colon, trial = value.partition(":")
-        if not after.isdecimal() or (colon and not trial.isdecimal()):
-            self.fail(f"found {value!r}, expected N:TRIAL, such as 3000:0", param, ctx)
-        return int(after), int(trial or 0)
-
-
 @click.command("play")
 @run_argument
-@click.option("--episode", type=click.IntRange(0), metavar="N", help="A training episode, counted from 0.")
-@click.option(
-    "--eval",
-    "trial",
-    type=_Trial(),
-    metavar="N:TRIAL",
-    help="A trial, counted from 0, of the evaluation after N training episodes.",
-)
+@episode_option
+@trial_option
 @click.option(
     "--speed",
     type=click.FloatRange(0, min_open=True),

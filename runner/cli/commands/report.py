@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import RunName, recorded, recordings_option
+from runner.cli.options import RunName, TrialName, recorded, recordings_option
 from runner.cli.output import say, size
 
 
@@ -32,6 +32,7 @@ from runner.cli.output import say, size
 @click.option(
     "--eval",
     "trials",
+    type=TrialName(),
     multiple=True,
     metavar="N:TRIAL",
     help="Show this trial of the evaluation after N training episodes too; may be repeated.",
@@ -42,7 +43,7 @@ def command(
     run_names: tuple[str, ...],
     output: Path,
     episodes: tuple[int, ...],
-    trials: tuple[str, ...],
+    trials: tuple[tuple[int, int], ...],
     force: bool,
     recordings: Path | None,
 ) -> None:
@@ -63,7 +64,7 @@ def command(
       dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
     """  # noqa: D301 - Click wants the backspace itself
     from runner.export.report import require_packages, write_report
-    from runner.export.report_runs import find_runs, parse_trial, write_new
+    from runner.export.report_runs import find_runs, write_new
     from runner.runs import recordings_folder
     from runner.sweep.state import is_sweep
 
@@ -75,7 +76,7 @@ def command(
         _report_sweep(run_names[0], folder, output, force)
         return
     chosen = [("train", number, 0) for number in episodes]
-    chosen += [("eval", *parse_trial(text)) for text in trials]
+    chosen += [("eval", *trial) for trial in trials]
     paths = [run.recording for run in map(recorded, find_runs(run_names, folder))]
     said: list[str] = []
     write_new(output, force, lambda path: said.extend(write_report(path, paths, chosen)))
