@@ -69,6 +69,12 @@ def test_the_page_on_the_architecture_names_every_part():
     assert {part for part in RANK if not re.search(rf"\b{part}(\.py|/)`", layout)} == set()
 
 
+def test_the_page_on_the_architecture_quotes_the_order():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    order = " < ".join(", ".join(line.split()) for line in ORDER.strip().split("\n"))
+    assert order in " ".join(page.split())
+
+
 @pytest.mark.parametrize("part", RANK)
 def test_a_part_knows_only_what_comes_before_it(part):
     known = {
