@@ -88,15 +88,15 @@ def command(
     require_two(groups, by)
     comparison = compare(groups, metrics_of(groups, metrics), moment, notes)
     if html is not None:
-        _write_page(html, force, comparison, groups)
-    elif as_json:
+        (say if as_json else click.echo)(_write_page(html, force, comparison, groups))
+    if as_json:
         print_json(dataclasses.asdict(comparison))
-    else:
+    elif html is None:
         print_sections(sections(comparison), as_markdown)
 
 
 def _read(names: tuple[str, ...], recordings: Path | None) -> list[RunSeries]:
-    """Return the metrics of all runs that answer to the names; says which are not finished."""
+    """Return the metrics of all runs that answer to the names."""
     from runner.analysis.series import read_series
     from runner.export.report_runs import find_runs
     from runner.recording.reader import open_recording
@@ -109,7 +109,8 @@ def _read(names: tuple[str, ...], recordings: Path | None) -> list[RunSeries]:
     return found
 
 
-def _write_page(path: Path, force: bool, comparison: Comparison, groups: list[Group]) -> None:
+def _write_page(path: Path, force: bool, comparison: Comparison, groups: list[Group]) -> str:
+    """Write the page; return what there is to say of it."""
     from runner.export.compare_page import render_comparison
     from runner.export.report_runs import write_text_new
 
@@ -118,4 +119,4 @@ def _write_page(path: Path, force: bool, comparison: Comparison, groups: list[Gr
     for note in comparison.notes:
         say(f"Note: {note}.")
     runs = sum(len(group.runs) for group in groups)
-    click.echo(f"{path}: {len(comparison.metrics)} metrics of {runs} runs in {len(groups)} groups")
+    return f"{path}: {len(comparison.metrics)} metrics of {runs} runs in {len(groups)} groups"

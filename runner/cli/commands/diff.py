@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.options import RunName, find_recorded, json_option, recordings_option
-from runner.cli.output import print_json, size
+from runner.cli.output import print_json, say, size
 from runner.cli.sections import print_sections, require_page
 
 if TYPE_CHECKING:
@@ -75,7 +75,8 @@ def command(
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
         difference = without(diff(recording_a, recording_b, levels, first), ignore)
         if html is not None:
-            _write_page(html, force, difference, recording_a, recording_b)
+            page = _write_page(html, force, difference, recording_a, recording_b)
+            (say if as_json else click.echo)(page)
     if as_json:
         print_json(told(difference))
     elif html is None:
@@ -83,12 +84,13 @@ def command(
     ctx.exit(0 if difference.same_content else 1)
 
 
-def _write_page(path: Path, force: bool, difference: RunDiff, a: Recording, b: Recording) -> None:
+def _write_page(path: Path, force: bool, difference: RunDiff, a: Recording, b: Recording) -> str:
+    """Write the page; return what there is to say of it."""
     from runner.export.diff_page import render_diff
     from runner.export.report_runs import write_text_new
 
     write_text_new(path, force, render_diff(difference, a, b))
-    click.echo(f"{path}: {size(path.stat().st_size)}")
+    return f"{path}: {size(path.stat().st_size)}"
 
 
 def _print(difference: RunDiff, everything: bool, as_markdown: bool) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 
 import pytest
@@ -96,3 +97,14 @@ def test_an_existing_page_is_replaced_by_force_only(command, pictured, tmp_path)
     assert again.exit_code == 2
     assert "--force" in again.stderr
     assert CliRunner().invoke(cli, [*words, "--force"]).exit_code == (command == "diff")
+
+
+@pytest.mark.parametrize("command", ["diff", "compare"])
+def test_beside_a_page_stdout_is_json_alone(command, pictured, tmp_path):
+    runs = [pictured("taxi"), pictured("taxi", discount=0.5)]
+    page = tmp_path / "page.html"
+    words = [command, *(str(run.recording) for run in runs), "--html", str(page), "--json"]
+    made = CliRunner().invoke(cli, words)
+    assert isinstance(json.loads(made.stdout), dict)
+    assert f"{page}: " in made.stderr
+    assert page.stat().st_size > 1000
