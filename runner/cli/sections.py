@@ -25,6 +25,12 @@ def print_sections(made: Sequence[Section], as_markdown: bool) -> None:
         _draw(section)
 
 
+def require_one_form(as_json: bool, as_markdown: bool) -> None:
+    """Refuse to print in two forms at once."""
+    if as_json and as_markdown:
+        raise click.UsageError("--json and --markdown are two ways to print; choose one.")
+
+
 def require_page(path: Path, force: bool) -> None:
     """Refuse to begin where the page could not be made in the end."""
     from runner.export.report import require_packages

@@ -10,7 +10,7 @@ import click
 
 from runner.cli.options import RunName, json_option, recorded, recordings_option
 from runner.cli.output import print_json, say
-from runner.cli.sections import print_sections, require_page
+from runner.cli.sections import print_sections, require_one_form, require_page
 
 if TYPE_CHECKING:
     from runner.analysis.compare import Comparison
@@ -80,6 +80,7 @@ def command(
     from runner.analysis.compare.sections import sections
     from runner.analysis.compare.statistics import require_scipy
 
+    require_one_form(as_json, as_markdown)
     require_scipy()
     if html is not None:
         require_page(html, force)

@@ -9,7 +9,7 @@ import click
 
 from runner.cli.options import RunName, find_recorded, json_option, recordings_option
 from runner.cli.output import print_json, say, size
-from runner.cli.sections import print_sections, require_page
+from runner.cli.sections import print_sections, require_one_form, require_page
 
 if TYPE_CHECKING:
     from runner.analysis.diff import RunDiff
@@ -68,6 +68,7 @@ def command(
     from runner.analysis.diff.asked import level_of, without
     from runner.recording.reader import open_recording
 
+    require_one_form(as_json, as_markdown)
     levels = dict(level_of(target) for target in targets)
     if html is not None:
         require_page(html, force)

@@ -172,13 +172,14 @@ def show(
       dualtaxi sweep show hyperparameters
       dualtaxi sweep show hyperparameters --best best.yaml
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.cli.sections import print_sections
+    from runner.cli.sections import print_sections, require_one_form
     from runner.errors import RunnerError
     from runner.export.report_runs import require_new, write_text_new
     from runner.runs import recordings_folder
     from runner.sweep.results import SHOWN, results_of, sections
     from runner.sweep.state import read_sweep
 
+    require_one_form(as_json, as_markdown)
     folder = recordings_folder(recordings)
     if best is not None:
         require_new(best, force)
@@ -221,8 +222,10 @@ def ls(recordings: Path | None, as_json: bool) -> None:
     names = sweeps_in(recordings_folder(recordings))
     if as_json:
         print_json(names)
+    elif names:
+        click.echo("\n".join(names))
     else:
-        click.echo("\n".join(names) or "no sweeps yet; `dualtaxi sweep FILE` begins one")
+        say("No sweeps yet. `dualtaxi sweep FILE` begins one.")
 
 
 @contextlib.contextmanager

@@ -1,9 +1,10 @@
 """How results look: numbers in words, tables that fit, drawings."""
 
 import pytest
+from click.testing import CliRunner
 from rich.console import Console
 
-from runner.cli import output
+from runner.cli import cli, output
 from runner.cli.drawing import Drawing, signs
 from runner.cli.evaluations import evaluation_table, some
 from runner.config import from_mapping
@@ -176,3 +177,10 @@ def test_the_estimate_is_bounded_and_grows_with_what_is_recorded():
 )
 def test_the_step_limit_is_the_registrations(env, limit):
     assert step_limit(from_mapping({"episodes": 1, "env": env})) == limit
+
+
+@pytest.mark.parametrize("words", [("diff", "a", "b"), ("compare", "a", "b"), ("sweep", "show", "a")])
+def test_json_and_markdown_at_once_are_refused(words):
+    result = CliRunner().invoke(cli, [*words, "--json", "--markdown"])
+    assert result.exit_code == 2
+    assert "choose one" in result.stderr

@@ -118,3 +118,8 @@ def test_without_ray_it_is_told(type_in, file, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     assert "pip install 'dualtaxi[ray]'" in type_in(str(file()), "--ray", code=2).output
     assert type_in("ls", "--json").stdout == "[]\n"
+
+
+def test_where_there_are_no_sweeps_stdout_is_empty(type_in):
+    told = type_in("ls")
+    assert (told.stdout, told.stderr) == ("", "No sweeps yet. `dualtaxi sweep FILE` begins one.\n")
