@@ -72,6 +72,8 @@ LOGGED: Final = "training.logged."
 """What somebody's own loop logged under a name of its own."""
 _POINTS: Final = 200
 _MOST_NAMES: Final = 64
+_TITLE: Final = 40
+"""Letters of a name for which there is room above a panel."""
 
 TITLES: Final = {
     "finish_percent": ("Evaluation trials that succeed", "percent of trials"),
@@ -178,7 +180,8 @@ def title_of(metric: str) -> tuple[str, str]:
     if metric.startswith("event."):
         return f"Event: {event_in_words(metric.removeprefix('event.'))}", "times a trial, mean"
     if metric.startswith(LOGGED):
-        return f"Logged: {metric.removeprefix(LOGGED)}", "as logged, mean"
+        name = " ".join(metric.removeprefix(LOGGED).split())
+        return f"Logged: {name if len(name) <= _TITLE else name[: _TITLE - 1] + '…'}", "as logged, mean"
     return TITLES[metric]
 
 

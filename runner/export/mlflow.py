@@ -6,11 +6,12 @@ import contextlib
 import json
 import logging
 import os
+import re
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,6 +25,10 @@ _STATUS: Final = {"finished": "FINISHED", "interrupted": "KILLED", "failed": "FA
 _AT_ONCE: Final = 1000
 _PARAMS_AT_ONCE: Final = 100
 _LONGEST: Final = 6000
+_LONGEST_NAME: Final = 240
+_TOLD: Final = 60
+_REFUSED: Final = re.compile(r"[^/\w.\- :]")
+"""What MLflow has in no name."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +128,8 @@ def _export(
 def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) -> Exported:
     from mlflow.entities import Metric, Param
 
-    params = params_of(recording.config)
-    fitting = [Param(key, text) for key, text in params.items() if len(text) <= _LONGEST]
+    params, names = params_of(recording.config), dict[str, str]()
+    fitting = [Param(_name(key, names), text) for key, text in params.items() if len(text) <= _LONGEST]
     notes = [
         f"{key} is longer than MLflow's {_LONGEST:,} characters; it is in run.json alone."
         for key, text in params.items()
@@ -132,7 +137,7 @@ def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) 
     ]
     for start in range(0, len(fitting), _PARAMS_AT_ONCE):
         client.log_batch(run_id, params=fitting[start : start + _PARAMS_AT_ONCE])
-    began, count, last = created(recording), 0, 0.0
+    began, written, last = created(recording), 0, 0.0
     rows = (
         (f"{found.phase}/{name}", value, began + seconds_of(found.position), found.step)
         for found in measures(recording)
@@ -140,9 +145,10 @@ def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) 
     )
     while some := list(islice(rows, _AT_ONCE)):
         client.log_batch(
-            run_id, [Metric(key, value, round(at * 1000), step) for key, value, at, step in some]
+            run_id,
+            [Metric(_name(key, names), value, round(at * 1000), step) for key, value, at, step in some],
         )
-        count, last = count + len(some), max(last, *(at for _, _, at, _ in some))
+        written, last = written + len(some), max(last, *(at for _, _, at, _ in some))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "run.json")
         path.write_text(json.dumps(recording.run_facts(), indent=1), encoding="utf-8")
@@ -151,7 +157,26 @@ def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) 
         client.log_artifact(run_id, str(recording.path))
     status = _STATUS.get(recording.result.get("status", "interrupted"), "KILLED")
     client.set_terminated(run_id, status, round(max(last, began) * 1000))
-    return Exported(run_id, count, False, tuple(notes))
+    notes += [
+        f"{_short(name)} is called {_short(key)}: MLflow takes no such name."
+        for name, key in names.items()
+        if name != key
+    ]
+    return Exported(run_id, written, False, tuple(notes))
+
+
+def _name(name: str, known: dict[str, str]) -> str:
+    """Return what MLflow takes for a name, another one for each; `known` is what was taken so far."""
+    if name not in known:
+        parts = _REFUSED.sub("_", name)[:_LONGEST_NAME].split("/")
+        plain = "/".join(part if part.strip(". ") else "_" for part in parts)
+        several = (plain if number == 1 else f"{plain}_{number}" for number in count(1))
+        known[name] = next(one for one in several if one not in known.values())
+    return known[name]
+
+
+def _short(name: str) -> str:
+    return repr(name if len(name) <= _TOLD else f"{name[: _TOLD - 1]}…")
 
 
 def _digest(recording: Recording) -> str:

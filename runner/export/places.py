@@ -77,7 +77,8 @@ def require_steps(recording: Recording) -> None:
         RecordingError: it has none.
     """
     if not has_steps(recording):
-        raise RecordingError(f"{recording.path}: found no steps to export; `dualtaxi rerecord` records them.")
+        hint = "; `dualtaxi rerecord` records them" if recording.kind == "job" else ""
+        raise RecordingError(f"{recording.path}: found no steps to export{hint}.")
 
 
 def shortcomings(recording: Recording) -> list[str]:

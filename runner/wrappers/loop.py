@@ -15,7 +15,7 @@ import numpy as np
 from blake3 import blake3
 
 from runner import runs
-from runner.errors import ConfigError, RunnerError, StorageError
+from runner.errors import ConfigError, RecordingError, RunnerError, StorageError
 from runner.mdp import Mdp
 from runner.provenance import provenance
 from runner.recording import schema
@@ -30,6 +30,7 @@ from runner.recording.writer import RecordingFile
 from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder
 from runner.service.outbox import Follower, connected, is_server, outbox_folder
 from runner.wrappers.described import Described, as_json
+from runner.wrappers.values import lone_number
 
 MADE_BY: Final = "runner.record"
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
@@ -64,7 +65,7 @@ class Plan:
             "made_by": MADE_BY,
             "env": {"id": described.env_id, "kwargs": described.kwargs},
             "seeds": [self.seed],
-            "config": as_json(dict(self.config)),
+            "config": self._settings(),
             "info": list(self.info),
             "frames": {"every": self.frames_every, "format": self.frame_format},
             "recording": {
@@ -75,6 +76,17 @@ class Plan:
                 "steps": "all",
             },
         }
+
+    def _settings(self) -> Any:
+        """Return the user's own settings as JSON holds them."""
+        try:
+            told = as_json(dict(self.config))
+            json.dumps(told, ensure_ascii=False).encode()
+        except (RecursionError, ValueError) as error:
+            raise ConfigError(
+                f"config: found what JSON cannot hold ({error}), expected text, numbers, lists and mappings."
+            ) from error
+        return told
 
     def _check(self) -> None:
         expectations = (
@@ -246,13 +258,7 @@ class Loop(Generic[R]):
                 payload = encode_log(value, position * STEP_NANOSECONDS / 1e9, name=name)
                 self._recorder.append(self._topics["/log"], payload, position)
                 return
-            try:
-                number = float(value)
-            except (TypeError, ValueError, OverflowError) as error:
-                raise ConfigError(
-                    f"log: found {type(value).__name__} for {name!r}, expected a number that a "
-                    "float64 holds, or text; an array is recorded by snapshot()."
-                ) from error
+            number = _number(name, value)
             step, episode = self.rows(phase).place
             fields = {"name": name, "value": number, "phase": phase, "step": step, "episode": episode}
             self._recorder.append(self._topics["/scalar"], encode(schema.SCALAR, fields), position)
@@ -441,6 +447,21 @@ def _write_environment(file: RecordingFile, described: Described, mdp: Mdp | Non
 
 def _result(status: str, result: Mapping[str, Any]) -> dict[str, str]:
     return {"json": json.dumps({"status": status, **result}, sort_keys=True)}
+
+
+def _number(name: str, value: Any) -> float:
+    """Return a number that is logged, which may stand in an array of one.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    try:
+        return lone_number(value, name) if np.size(value) == 1 and np.ndim(value) else float(value)
+    except (TypeError, ValueError, OverflowError, RecordingError) as error:
+        raise ConfigError(
+            f"log: found {type(value).__name__} for {name!r}, expected a number that a float64 holds, or "
+            "text; an array is recorded by snapshot()."
+        ) from error
 
 
 def _is_text(value: Any) -> bool:

@@ -7,12 +7,14 @@ import sys
 import warnings
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pyarrow.csv
 import pyarrow.parquet
 import pytest
 from click.testing import CliRunner
 
+import runner
 from runner.cli import cli
 from runner.export.scalars import measures
 from runner.recording import schema
@@ -252,6 +254,28 @@ def test_mlflow_reads_the_run_once(export, taxis):
     (anew,) = read_mlflow()
     assert anew["id"] != found["id"]
     assert anew["files"] == ["run.json"]
+
+
+def test_mlflow_takes_whatever_a_loop_calls_its_numbers(export, tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "loops", config={"a b|c": 1}) as env:
+        env.reset(seed=0)
+        for value, name in enumerate(("mean |q|", "mean _q_", "a\nb", "../up", "/", "x" * 300)):
+            env.log(name, np.array([value]))
+    said = export("mlflow", env.run.recording).stderr
+    assert "'train/logged/mean |q|' is called 'train/logged/mean _q_': MLflow takes no such name." in said
+    (found,) = read_mlflow()
+    logged = {key.removeprefix("train/logged/"): points[0][2] for key, points in found["history"].items()}
+    assert sorted(logged.values()) == [0, 1, 2, 3, 4, 5]
+    assert (logged["mean _q_"], logged["mean _q__2"], logged["a_b"]) == (0, 1, 2)
+    assert found["params"]["config.a b_c"] == "1"
+
+
+def test_a_loop_without_steps_is_not_told_to_be_done_again(export, tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "loops") as env:
+        env.reset(seed=0)
+    said = export("csv", env.run.recording, code=2).stderr
+    assert "found no steps to export" in said
+    assert "rerecord" not in said
 
 
 def test_a_store_that_cannot_be_used_is_told(export, taxis):

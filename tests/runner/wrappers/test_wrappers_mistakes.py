@@ -177,3 +177,22 @@ def test_what_render_returns_is_a_picture_or_refused(tmp_path, monkeypatch, pict
         pytest.raises(RunnerError, match=r"expected uint8 of \[height, width, 3\]"),
     ):
         rec.reset(seed=0)
+
+
+@pytest.mark.parametrize("value", [1.5, np.float32(1.5), np.array(1.5), np.array([[1.5]])], ids=repr)
+def test_a_lone_number_is_logged_however_it_comes(tmp_path, value):
+    with runner.record(pole(), tmp_path) as rec:
+        rec.log("loss", value)
+    with opened(rec.run.recording) as recording:
+        (scalar,) = recording.decoded(recording.topic("/scalar"))
+    assert scalar["value"] == 1.5
+
+
+@pytest.mark.parametrize("kind", ["itself", "surrogate"])
+def test_settings_that_json_cannot_hold_are_refused_before_there_is_a_run(tmp_path, kind):
+    settings: dict[str, Any] = {"text": "\ud800"} if kind == "surrogate" else {}
+    if kind == "itself":
+        settings["itself"] = settings
+    with pytest.raises(RunnerError, match="config: found what JSON cannot hold"):
+        runner.record(pole(), tmp_path, config=settings)
+    assert not list(tmp_path.iterdir())
