@@ -22,6 +22,7 @@ from runner.errors import RecordingError, RunnerError, StorageError
 from runner.owning import owned
 from runner.recording.integrity import checked_survey, may_be_cut
 from runner.recording.reader import Recording, open_recording
+from runner.recording.rewriting import content_of
 from runner.runs import RECORDING_FILE, RUN_FILE, Run, run_at_once
 
 Report = Callable[[int], None]
@@ -87,7 +88,7 @@ class _Archiving:
             size = recording.size
             if dry_run or existing is None:
                 manifest = self._write(recording, dry_run)
-            elif existing.run.get("content_digest") == recording.result.get("content_digest") is not None:
+            elif _holds(existing, recording):
                 manifest = existing
             else:
                 raise RunnerError(
@@ -112,6 +113,14 @@ class _Archiving:
             manifest = write_archive(recording, folder, self._report)
             self._target.commit(self._run.run_id, folder)
         return manifest
+
+
+def _holds(manifest: Manifest, recording: Recording) -> bool:
+    """Return whether an archive has a recording's content; of a killed run, that of its whole chunks."""
+    stated = recording.result.get("content_digest")
+    if manifest.run.get("content_digest") != stated:
+        return False
+    return stated is not None or manifest.digest == content_of(recording.path)
 
 
 def _stub(place: str, manifest: Manifest, recording_bytes: int) -> dict[str, Any]:

@@ -200,6 +200,8 @@ def test_a_killed_run_is_archived_and_restored(run, recordings, command):
     back = find_run(run.run_id, recordings)
     assert back.status == "interrupted"
     assert back.recording.exists()
+    assert "it was there already" in done(command("archive", run.run_id, "--remove"))
+    assert not back.recording.exists()
 
 
 def test_another_archive_of_the_same_id_is_left_alone(run, recordings, command):
