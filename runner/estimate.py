@@ -78,6 +78,6 @@ def step_limit(config: ExperimentConfig) -> int | None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Return how much the disk of a folder would still take."""
+    """Return how much the disk of a folder, which need not exist, would still take."""
     there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
     return shutil.disk_usage(there).free

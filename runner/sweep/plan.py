@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Final
 from runner.amounts import size
 from runner.config import ConfigError, ExperimentConfig, from_mapping
 from runner.errors import StorageError
+from runner.estimate import free_bytes
 from runner.execution import run_job
 from runner.job import Job
 from runner.mdp import Mdp, load_mdp
@@ -121,12 +121,6 @@ def require_disk(plan: Plan, done: int, recordings: Path) -> None:
             f"{recordings}: {plan.runs - done:,} runs need about {size(needed)}, and {size(free)} are free: "
             "free some, choose another --recordings, or try fewer values."
         )
-
-
-def free_bytes(folder: Path) -> int:
-    """Return how much the disk of a folder, which need not exist, would still take."""
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    return shutil.disk_usage(there).free
 
 
 def room(limits: Limits, plan: Plan, recordings: Path, before: int) -> Room:

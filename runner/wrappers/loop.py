@@ -28,6 +28,7 @@ from runner.recording.recorder import FLUSH_SECONDS, Recorder, storage_error
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.writer import RecordingFile
 from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder
+from runner.scene import is_whole
 from runner.service.outbox import Follower, connected, is_server, outbox_folder
 from runner.wrappers.described import Described, as_json
 from runner.wrappers.values import lone_number
@@ -91,15 +92,15 @@ class Plan:
     def _check(self) -> None:
         expectations = (
             ("name", "text", self.name is None or isinstance(self.name, str)),
-            ("seed", "a whole number from 0", _is_whole(self.seed, 0, 2**64 - 1)),
+            ("seed", "a whole number from 0", is_whole(self.seed, 0, 2**64 - 1)),
             ("config", "a mapping", isinstance(self.config, Mapping)),
             ("info", "names of fields", all(isinstance(name, str) for name in self.info)),
-            ("frames_every", "a whole number from 0", _is_whole(self.frames_every, 0, 2**31)),
+            ("frames_every", "a whole number from 0", is_whole(self.frames_every, 0, 2**31)),
             ("frame_format", "png or jpeg", self.frame_format in ("png", "jpeg")),
             ("compression", "zstd, lz4 or none", self.compression in ("zstd", "lz4", "none")),
-            ("level", "1 to 19", _is_whole(self.level, 1, 19)),
+            ("level", "1 to 19", is_whole(self.level, 1, 19)),
             ("index", "message or chunk", self.index in ("message", "chunk")),
-            ("chunk_steps", "256 to 65,536", _is_whole(self.chunk_steps, 256, 65_536)),
+            ("chunk_steps", "256 to 65,536", is_whole(self.chunk_steps, 256, 65_536)),
         )
         for key, expected, holds in expectations:
             if not holds:
@@ -467,7 +468,3 @@ def _number(name: str, value: Any) -> float:
 def _is_text(value: Any) -> bool:
     """Return whether a value is text that UTF-8 can hold: without lone surrogates."""
     return isinstance(value, str) and value == value.encode("utf-8", "ignore").decode()
-
-
-def _is_whole(value: Any, low: int, high: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high

@@ -24,6 +24,7 @@ from runner.export.rerun.scene import (
     Scene,
     action_labels,
     agent_label,
+    rgb,
 )
 from runner.mdp import Mdp
 from runner.words import action_names
@@ -50,7 +51,7 @@ class Classes:
     def context(self) -> list[tuple[int, str, tuple[int, int, int]]]:
         """Return (number, label, colour) of all."""
         return [
-            (number, label, _rgb(colour))
+            (number, label, rgb(colour))
             for number, (label, colour) in enumerate(zip(self.labels, self.colours, strict=True))
         ]
 
@@ -181,7 +182,3 @@ def _levels(classes: Classes, value_range: tuple[float, float]) -> Levels:
 def _signed(value: float, digits: int | None = None) -> str:
     text = f"{value:g}" if digits is None else f"{value:.{digits}f}"
     return text.replace("-", "−")
-
-
-def _rgb(colour: str) -> tuple[int, int, int]:
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from runner.export.rerun.maps import draw_blocks
-from runner.export.rerun.scene import Scene, agent_label
+from runner.export.rerun.scene import Scene, agent_label, rgb
 from runner.export.rerun.values import TOP, WIDTH, bar_rows, draw_table
 from runner.mdp import Mdp
 
@@ -211,7 +211,7 @@ def _draw_scene(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
         static=True,
     )
     marks = scene.description.get("landmarks", [])
-    tints = [(*_rgb(mark["colour"]), 110) for mark in marks]
+    tints = [(*rgb(mark["colour"]), 110) for mark in marks]
     if marks:
         stream.log(
             f"{path}/landmarks",
@@ -225,7 +225,7 @@ def _draw_scene(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
             rr.Points2D(
                 [(c + 0.14, r + 0.06) for r, c in (mark["cell"] for mark in marks)],
                 labels=[mark["name"] for mark in marks],
-                colors=[_rgb(mark["colour"]) for mark in marks],
+                colors=[rgb(mark["colour"]) for mark in marks],
                 radii=0.0,
                 show_labels=True,
                 draw_order=26,
@@ -255,7 +255,3 @@ def _wall(first: Sequence[int], second: Sequence[int]) -> list[tuple[float, floa
         return [(x, row), (x, row + 1)]
     y = max(row, other_row)
     return [(column, y), (column + 1, y)]
-
-
-def _rgb(colour: str) -> tuple[int, int, int]:
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

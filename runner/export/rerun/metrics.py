@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.export.rerun.events import evaluation_texts, send_text
-from runner.export.rerun.scene import agent_label
+from runner.export.rerun.scene import agent_label, rgb
 from runner.recording import schema
 from runner.recording.reader import Recording
 
@@ -176,7 +176,7 @@ class MetricWriter:
         width = 1.2 if trained else 2.2
         return rr.SeriesLines(
             names=[self._label + name for name in names],
-            colors=[_rgb(c) for c in colours],
+            colors=[rgb(c) for c in colours],
             widths=[width] * len(names),
         )
 
@@ -205,7 +205,3 @@ def send_metrics(writer: MetricWriter, recording: Recording) -> None:
 
 def _steps(rows: Rows) -> NDArray[np.int64]:
     return np.array([row["log_time"] // schema.STEP_NANOSECONDS for row in rows], np.int64)
-
-
-def _rgb(colour: str) -> tuple[int, int, int]:
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)

@@ -33,6 +33,11 @@ _STUB: Final = 0.34
 """Length of the arrow of a move that led nowhere."""
 
 
+def rgb(colour: str) -> tuple[int, int, int]:
+    """Return red, green and blue of a colour such as `#E69F00`."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Tables of S states; movers come first among the drawn points, then the passengers."""

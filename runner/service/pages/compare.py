@@ -171,17 +171,13 @@ def _results(found: list[Run]) -> list[tuple[str, list[str]]]:
         ("Success in the last evaluation, %", [amounts.number(each.get("finish_percent")) for each in last]),
         ("Mean length of its trials", [amounts.number(each.get("mean_length")) for each in last]),
         ("Penalties a trial", [amounts.number(each.get("mean_penalties")) for each in last]),
-        ("Training episodes", [_count(each.summary.get("episodes")) for each in found]),
-        ("Steps of training", [_count(each.summary.get("train_steps")) for each in found]),
+        ("Training episodes", [amounts.number(each.summary.get("episodes"), 0) for each in found]),
+        ("Steps of training", [amounts.number(each.summary.get("train_steps"), 0) for each in found]),
         (
             "Content digest",
             [str(each.summary.get("content_digest") or amounts.UNKNOWN)[:16] for each in found],
         ),
     ]
-
-
-def _count(value: int | None) -> str:
-    return amounts.UNKNOWN if value is None else f"{value:,}"
 
 
 def _same_content(found: list[Run]) -> bool:

@@ -42,7 +42,7 @@ def templates() -> jinja2.Environment:
         "size": amounts.size,
         "duration": amounts.duration,
         "age": _age,
-        "count": lambda value: amounts.UNKNOWN if value is None else f"{value:,}",
+        "count": lambda value: amounts.number(value, 0),
         "sentence": lambda text: f"{text[:1].upper()}{text[1:]}{'' if text[-1:] in '.:' else '.'}",
         "with_name": lambda value, name: (name, value),
         "with_prefix": lambda value, prefix: f"{prefix}{value}",

@@ -232,8 +232,8 @@ def _standing(run: Run, jobs: Jobs) -> dict[str, Any]:
         "Mean length of its trials": amounts.number(last.get("mean_length")),
         "Penalties a trial": amounts.number(last.get("mean_penalties")),
         "Training episodes": amounts.UNKNOWN if done is None else f"{done:,}",
-        "Steps of training": _count(summary.get("train_steps")),
-        "Steps of evaluation": _count(summary.get("eval_steps")),
+        "Steps of training": amounts.number(summary.get("train_steps"), 0),
+        "Steps of evaluation": amounts.number(summary.get("eval_steps"), 0),
         "Time": _seconds(run),
         "Recording": amounts.size(summary["bytes"]) if summary.get("bytes") else amounts.UNKNOWN,
     }
@@ -265,10 +265,6 @@ def _seconds(run: Run) -> str:
 
 def _percent(value: float | None) -> str:
     return amounts.UNKNOWN if value is None else f"{amounts.number(value)} %"
-
-
-def _count(value: int | None) -> str:
-    return amounts.UNKNOWN if value is None else f"{value:,}"
 
 
 async def _replay(
@@ -356,8 +352,8 @@ def _recorded_facts(run: Run) -> tuple[dict[str, str], dict[str, str], list[dict
         "Run": run.run_id,
         "Begun": f"{run.created:%Y-%m-%d %H:%M:%S} UTC",
         "Content digest": run.summary.get("content_digest") or "none: told when a run ends properly",
-        "Steps": f"{_count(run.summary.get('train_steps'))} of training, "
-        f"{_count(run.summary.get('eval_steps'))} of evaluation",
+        "Steps": f"{amounts.number(run.summary.get('train_steps'), 0)} of training, "
+        f"{amounts.number(run.summary.get('eval_steps'), 0)} of evaluation",
     }
     try:
         with open_recording(run.recording) as recording:
