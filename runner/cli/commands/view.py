@@ -60,6 +60,7 @@ class _Spot(click.ParamType):  # type: ignore[type-arg,unused-ignore]
 @click.option(
     "--size", "picture_size", default="1600x900", show_default=True, metavar="WxH", help="Of the screenshot."
 )
+@click.option("--force", is_flag=True, help="Replace the screenshot if it exists.")
 @choice_options
 @recordings_option
 def command(
@@ -69,6 +70,7 @@ def command(
     port: int,
     screenshot: Path | None,
     picture_size: str,
+    force: bool,
     episodes: tuple[tuple[int, int | None], ...] | None,
     evaluations: tuple[int, ...] | None,
     every: int | None,
@@ -90,9 +92,12 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     if len(run_names) > 2:
         raise click.UsageError(f"found {len(run_names)} runs, expected one or two.")
+    from runner.export.report_runs import require_new
     from runner.export.rerun.viewer import require_rerun
 
     require_rerun("view")
+    if screenshot is not None:
+        require_new(screenshot, force)
     from runner.export.rerun.cache import exported
     from runner.export.rerun.spots import with_spot
 

@@ -110,6 +110,14 @@ def test_an_interrupted_run_is_exported_as_far_as_it_came(pictured, tmp_path):
 class TestCommand:
     """What the commands refuse."""
 
+    def test_a_screenshot_that_exists_needs_force(self, pictured, tmp_path):
+        picture = tmp_path / "mine.png"
+        picture.write_text("mine")
+        result = invoke("view", pictured("taxis").recording, "--screenshot", picture)
+        assert result.exit_code == 2
+        assert "--force" in result.stderr
+        assert picture.read_text() == "mine"
+
     def test_a_file_that_exists_needs_force(self, pictured, tmp_path):
         run, path = pictured("lake"), tmp_path / "a.rrd"
         path.write_bytes(b"precious")
