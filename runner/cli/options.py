@@ -1,4 +1,4 @@
-"""The arguments and options that commands share, and how they complete in a shell."""
+"""The arguments and options that commands share, and the runs that they name."""
 
 from __future__ import annotations
 
@@ -6,60 +6,13 @@ from pathlib import Path
 from typing import Any, Final
 
 import click
-from click.shell_completion import CompletionItem
 
+from runner.cli.parameters import RunName, TrialName
 from runner.errors import RunnerError
 
-
-class RunName(click.ParamType):  # type: ignore[type-arg]  # generic in newer versions only
-    """The name of a run; completes ids and names."""
-
-    name = "run"
-
-    def shell_complete(
-        self,
-        ctx: click.Context,
-        param: click.Parameter,  # noqa: ARG002
-        incomplete: str,
-    ) -> list[CompletionItem]:
-        """Return the ids and names that begin so, the newest first; paths, once there is a slash."""
-        from runner.catalogue.finding import candidates
-        from runner.runs import recordings_folder
-
-        if "/" in incomplete or "\\" in incomplete:
-            return [CompletionItem(incomplete, type="file")]
-        try:
-            runs = candidates(recordings_folder(ctx.params.get("recordings")))
-        except RunnerError:
-            return []
-        found = {"@latest": "the newest run"} if runs else {}
-        found |= {run.run_id: f"{run.name}, seed {run.seed}" for run in runs}
-        names = [run.name for run in runs]
-        found |= {name: "the run of this name" for name in names if names.count(name) == 1}
-        found |= {f"{name}@latest": "the newest of this name" for name in names if names.count(name) > 1}
-        return [
-            CompletionItem(name, help=text) for name, text in found.items() if name.startswith(incomplete)
-        ]
-
-
-class TrialName(click.ParamType):  # type: ignore[type-arg]  # generic in newer versions only
-    """`N:TRIAL`, a trial of the evaluation after N training episodes."""
-
-    name = "N:TRIAL"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
-        """Return both numbers."""
-        if isinstance(value, tuple):
-            return value
-        after, colon, trial = value.partition(":")
-        if not after.isdecimal() or (colon and not trial.isdecimal()):
-            self.fail(f"found {value!r}, expected N:TRIAL, such as 3000:0", param, ctx)
-        return int(after), int(trial or 0)
-
-
 run_argument: Final = click.argument("run_name", metavar="RUN", type=RunName())
+
+runs_argument: Final = click.argument("run_names", metavar="RUN...", nargs=-1, required=True, type=RunName())
 
 config_argument: Final = click.argument("config", metavar="CONFIG", type=click.Path(path_type=Path))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli.options import RunName, find, json_option, recordings_option
+from runner.cli.options import find, json_option, recordings_option, runs_argument
 from runner.cli.output import draw, facts, print_json, say, size
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @click.command("archive")
-@click.argument("run_names", metavar="RUN...", nargs=-1, required=True, type=RunName())
+@runs_argument
 @click.option(
     "--to",
     metavar="DIR|URL",

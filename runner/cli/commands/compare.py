@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.options import RunName, json_option, recorded, recordings_option
+from runner.cli.options import json_option, recorded, recordings_option, runs_argument
 from runner.cli.output import print_json, say
 from runner.cli.sections import print_sections, require_one_form, require_page
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command("compare")
-@click.argument("run_names", metavar="RUN...", type=RunName(), nargs=-1, required=True)
+@runs_argument
 @click.option("--by", metavar="PATH", help="Group by a value of the configuration, such as discount.")
 @click.option(
     "--metric",

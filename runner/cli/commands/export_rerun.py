@@ -10,50 +10,10 @@ import click
 
 from runner.cli.options import find_recorded, recordings_option, run_argument
 from runner.cli.output import duration, say, size
+from runner.cli.parameters import EpisodeRanges, Numbers
 
 if TYPE_CHECKING:
     from runner.export.rerun.selection import Request, Selection
-
-
-class EpisodeRanges(click.ParamType):  # type: ignore[type-arg,unused-ignore]
-    """`0:20,49980:50000`: ranges of episodes; a single number is that episode."""
-
-    name = "ranges"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[tuple[int, int | None], ...]:
-        """Return (start, stop) of each range; an open end is None."""
-        if isinstance(value, tuple):
-            return value
-        return tuple(self._range(part.strip(), param, ctx) for part in value.split(","))
-
-    def _range(
-        self, text: str, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int | None]:
-        start, colon, stop = text.partition(":")
-        known = all(number == "" or number.isdecimal() for number in (start, stop))
-        if not known or not (start or colon):
-            self.fail(f"found {text!r}, expected START:STOP or N, such as 0:20,49980:50000", param, ctx)
-        first = int(start or 0)
-        return first, (int(stop) if stop else None) if colon else first + 1
-
-
-class Numbers(click.ParamType):  # type: ignore[type-arg,unused-ignore]
-    """Numbers parted by commas."""
-
-    name = "numbers"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, ...]:
-        """Return the numbers."""
-        if isinstance(value, tuple):
-            return value
-        parts = [part.strip() for part in value.split(",")]
-        if not all(part.isdecimal() for part in parts):
-            self.fail(f"found {value!r}, expected numbers such as 1000,49000", param, ctx)
-        return tuple(int(part) for part in parts)
 
 
 def choice_options(command: Callable[..., Any]) -> Callable[..., Any]:

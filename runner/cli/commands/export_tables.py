@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from runner.cli.commands.export_rerun import EpisodeRanges
 from runner.cli.options import find_recorded, recordings_option, run_argument
 from runner.cli.output import say, size
+from runner.cli.parameters import EpisodeRanges
 from runner.cli.progress import counting
 
 Ranges = tuple[tuple[int, int | None], ...]

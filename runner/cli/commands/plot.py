@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import RunName, recorded, recordings_option
+from runner.cli.options import recorded, recordings_option, runs_argument
 from runner.cli.output import say
 
 
 @click.command("plot")
-@click.argument("run_names", metavar="RUN...", type=RunName(), nargs=-1, required=True)
+@runs_argument
 @click.option(
     "-o",
     "--output",

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli.options import (
-    RunName,
     find_recorded,
     json_option,
     recordings_option,
@@ -18,6 +17,7 @@ from runner.cli.options import (
     token_option,
 )
 from runner.cli.output import draw, print_json, say, size, table
+from runner.cli.parameters import RunName
 from runner.errors import RunnerError
 
 if TYPE_CHECKING:

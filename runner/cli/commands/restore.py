@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import RunName, find, json_option, recordings_option
+from runner.cli.options import find, json_option, recordings_option
 from runner.cli.output import draw, facts, print_json
+from runner.cli.parameters import RunName
 
 
 @click.command("restore")

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import RunName, find, json_option, recordings_option
+from runner.cli.options import find, json_option, recordings_option, runs_argument
 from runner.cli.removing import carry_out, dry_run_option, force_option, yes_option
 from runner.errors import RunnerError
 from runner.runs import recordings_folder
 
 
 @click.command("rm")
-@click.argument("run_names", metavar="RUN...", nargs=-1, required=True, type=RunName())
+@runs_argument
 @recordings_option
 @yes_option
 @dry_run_option

@@ -3,35 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from runner.cli.commands.export_rerun import choice_options, request_of, tell
-from runner.cli.options import RunName, find_recorded, recordings_option
+from runner.cli.options import find_recorded, recordings_option
 from runner.cli.output import say
+from runner.cli.parameters import RunName, SpotName
 
 if TYPE_CHECKING:
     from runner.export.rerun.spots import Spot
     from runner.runs import Run
-
-
-class _Spot(click.ParamType):  # type: ignore[type-arg,unused-ignore]
-    """`EPISODE:T`, or `eval:N:TRIAL:T`."""
-
-    name = "spot"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, ...]:
-        """Return (episode, t) or (N, trial, t)."""
-        if isinstance(value, tuple):
-            return value
-        parts = value.removeprefix("eval:").split(":")
-        wanted = 3 if value.startswith("eval:") else 2
-        if not 1 <= len(parts) <= wanted or not all(part.isdecimal() for part in parts):
-            self.fail(f"found {value!r}, expected EPISODE:T such as 120:5, or eval:N:TRIAL:T", param, ctx)
-        return tuple(int(part) for part in parts) + (0,) * (wanted - len(parts))
 
 
 @click.command("view")
@@ -39,7 +22,7 @@ class _Spot(click.ParamType):  # type: ignore[type-arg,unused-ignore]
 @click.option(
     "--at",
     "spot",
-    type=_Spot(),
+    type=SpotName(),
     metavar="EPISODE:T",
     help="Where to look: a step of a training episode; eval:N:TRIAL:T for a step of an evaluation.",
 )
