@@ -135,7 +135,7 @@ def loop_series(recording: Recording) -> RunSeries:
         name=recording.run["name"],
         seed=int(recording.run["seed"]),
         status=recording.result.get("status", "interrupted"),
-        config=recording.config,
+        config=_without_seed(recording.config, int(recording.run["seed"])),
         evaluation=_loop_evaluations(recording),
         training=sorted(training.items()),
     )
@@ -254,6 +254,14 @@ def training_readings(side: Mapping[str, Any]) -> Readings:
         "training.zero_cells": dict(side["zero_cells"]),
         "training.schedule": {spoken(key): side[key] for key in ("epsilon", "step_size", "discount")},
     }
+
+
+def _without_seed(config: Mapping[str, Any], seed: int) -> Mapping[str, Any]:
+    """Return a loop's configuration without the run's own seed among its settings, as in vars(args)."""
+    own = config.get("config")
+    if not isinstance(own, Mapping) or own.get("seed") != seed:
+        return config
+    return {**config, "config": {key: value for key, value in own.items() if key != "seed"}}
 
 
 def _stretch(episodes: int) -> int:

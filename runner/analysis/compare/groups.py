@@ -145,7 +145,10 @@ def _mixed(group: Group) -> list[str]:
 def _only_one(groups: Sequence[Group], by: str | None) -> str:
     (group,) = groups
     if len(group.runs) == 1:
-        return f"found one run, {group.runs[0].run_id}, expected at least two to compare."
+        return (
+            f"found one run, {group.runs[0].run_id}, expected at least two to compare; of runs of the same "
+            "configuration and seed one counts, and runner.record's `config` tells loops apart."
+        )
     if by is not None:
         return f"found {len(group.runs)} runs, all with {group.label}, expected two values at least."
     return (

@@ -101,6 +101,21 @@ def looped(folder: Path, name: str, tested: int = 0, logged: float = 0.0) -> Non
         env.log("loss", logged)
 
 
+def test_loops_that_have_their_seed_among_their_settings_are_one_group(tmp_path):
+    for seed in (1, 2):
+        for rate in (0.1, 0.2):
+            args = {"seed": seed, "lr": rate}
+            with runner.record(make("CartPole-v1"), tmp_path, name="pole", seed=seed, config=args) as env:
+                list(play(env, 50, seed))
+    told = json.loads(dualtaxi(tmp_path, "compare", "pole", "--json").stdout)
+    assert {label: len(ids) for label, ids in told["groups"].items()} == {
+        "pole, config.lr=0.1": 2,
+        "pole, config.lr=0.2": 2,
+    }
+    dualtaxi(tmp_path, "plot", "pole", "-o", str(tmp_path / "plot.svg"))
+    assert (tmp_path / "plot.svg").read_text().count("2 runs: ") == 2
+
+
 def test_diff_says_where_evaluations_of_loops_part(tmp_path):
     looped(tmp_path, "one")
     looped(tmp_path, "two", tested=1)
