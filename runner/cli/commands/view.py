@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.commands.export_rerun import choice_options, request_of, tell
+from runner.cli.choosing import choice_options, request_of, tell
 from runner.cli.options import find_recorded, recordings_option
 from runner.cli.output import say
 from runner.cli.parameters import RunName, SpotName
