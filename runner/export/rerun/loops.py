@@ -58,6 +58,8 @@ def select_loop(recording: Recording, request: Request) -> Selection:
     selection = Selection()
     if recording.result.get("status") != "finished":
         selection.warnings.append(interrupted(recording))
+    if recording.kind == "variable":
+        selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
     total = recording.count(schema.TRAIN_STEP)
     if recording.environments > 1 or recording.kind == "variable" or total <= SPREAD_STEPS:
         stop = total if request.everything else min(total, SPREAD_STEPS)
@@ -110,7 +112,9 @@ class LoopExporter:
             for phase in self._frames
         ]
         left += [rrb.TensorView(origin=f"{root}/array/{name}", name=name) for name in self._arrays[:2]]
-        left.append(rrb.TextLogView(origin=f"{root}/log", name="Log"))
+        told = any(True for _ in self._recording.messages(schema.LOG_TOPIC))
+        if told:
+            left.append(rrb.TextLogView(origin=f"{root}/log", name="Log"))
         episodes = any(self._recording.count(schema.PHASES[phase][1]) for phase in PHASES)
         drawn = [*(("return", "length") if episodes else ()), "reward", *self._lines()]
         plots = [_series(root, name, [f"{phase}/{name}" for phase in PHASES]) for name in drawn]
@@ -119,8 +123,10 @@ class LoopExporter:
             *([4] if self._scene else []),
             *([3] * len(self._frames)),
             *([2] * len(self._arrays[:2])),
-            1,
+            *([1] if told else []),
         ]
+        if not left:
+            return rrb.Grid(*plots, grid_columns=2, name=title)
         return rrb.Horizontal(
             rrb.Vertical(*left, row_shares=shares),
             rrb.Grid(*plots, grid_columns=2),

@@ -242,3 +242,12 @@ def test_an_export_to_rerun_says_that_it_shows_the_first_environment(tmp_path):
         assert select(recording, Request()).chosen == [
             "of 3 environments the first, in 15 of 15 training steps"
         ]
+
+
+def test_an_export_to_rerun_says_that_texts_are_not_drawn(tmp_path):
+    from runner.export.rerun.selection import Request, select
+
+    with runner.record(make("RoomsText"), tmp_path) as rec:
+        list(play(rec, 5))
+    with open_recording(rec.run.recording) as recording:
+        assert "they are not drawn" in select(recording, Request()).warnings[0]
