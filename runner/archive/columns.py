@@ -77,17 +77,14 @@ def _space_columns(run: Mapping[str, str], where: str) -> dict[str, SpaceColumns
     return {field: SpaceColumns(spaces[space], field, where) for field, space in fields.items()}
 
 
-def merged(
-    recording: Recording, topics: tuple[Topic, Topic], stop: int | None = None
-) -> Iterator[tuple[Topic, Records]]:
+def merged(recording: Recording, topics: tuple[Topic, Topic]) -> Iterator[tuple[Topic, Records]]:
     """Yield the messages of a topic of training and one of evaluation in the order they were recorded.
 
     Args:
         recording: whose.
         topics: two fixed-width topics.
-        stop: how many of each at most.
     """
-    waiting = [(topic, iter(recording.blocks(topic, 0, stop))) for topic in topics]
+    waiting = [(topic, iter(recording.blocks(topic))) for topic in topics]
     heads = [(topic, block, blocks) for topic, blocks in waiting if (block := next(blocks, None)) is not None]
     while len(heads) == 2:
         heads.sort(key=lambda head: int(head[1]["log_time"][0]))

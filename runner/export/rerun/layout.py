@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -46,10 +46,8 @@ class Shown:
     """Whether values of the tables are exported."""
 
 
-def blueprint(
-    runs: Sequence[Shown], play_state: Literal["paused", "following"] = "following"
-) -> rrb.Blueprint:
-    """Return the arrangement for one run, or for several side by side."""
+def blueprint(runs: Sequence[Shown]) -> rrb.Blueprint:
+    """Return the arrangement for one run, or for several side by side; it opens at the last step."""
     last = max(run.last for run in runs)
     plots = _plots(runs, last)
     with_steps = [run for run in runs if run.steps]
@@ -65,7 +63,7 @@ def blueprint(
         body = rrb.Vertical(rrb.Horizontal(*halves), below, row_shares=[7, 3]) if halves else below
     return rrb.Blueprint(
         body,
-        rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_A_SECOND, play_state=play_state),
+        rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_A_SECOND, play_state="following"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,

@@ -84,6 +84,18 @@ def test_several_seeds_are_for_run_all(tiny, tmp_path):
     assert [run.seed for run in runs] == [2]
 
 
+@pytest.mark.parametrize("at_once", [1, 2])
+def test_each_of_several_seeds_has_the_name_and_reports(tiny, tmp_path, at_once):
+    told = []
+    several = ["seeds=[1, 2]", "recording.steps=none"]
+    runs = runner.run_all(
+        tiny, overrides=several, name="both", recordings=tmp_path, report=told.append, at_once=at_once
+    )
+    assert [(run.seed, run.name) for run in runs] == [(1, "both"), (2, "both")]
+    assert {progress.episodes for progress in told} == {30}
+    assert len({id(progress) for progress in told}) == 2
+
+
 def test_seeds_side_by_side_record_what_each_records_alone(tiny, tmp_path):
     several = ["seeds=[1, 2, 3, 4, 5]", "recording.steps=none"]
     abreast = list(runner.run_all(tiny, overrides=several, recordings=tmp_path / "abreast", at_once=3))
