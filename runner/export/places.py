@@ -1,17 +1,58 @@
-"""Where an export goes: a folder that appears when it is whole, and replaces only what an export wrote."""
+"""Where an export goes: a file or folder that is there when it is whole, and replaces another if asked."""
 
 from __future__ import annotations
 
 import contextlib
 import fnmatch
+import os
 import secrets
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from runner.errors import MissingExtra, RecordingError, RunnerError, StorageError
 from runner.export.report_runs import has_steps
 from runner.recording.reader import Recording
+
+
+def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
+    """Have a file written beside its place, and put there when it is whole.
+
+    Raises:
+        RunnerError: there is one already and `force` is not given.
+        StorageError: it cannot be written.
+    """
+    require_new(path, force)
+    fresh = path.with_name(f".{secrets.token_hex(4)}.{path.name}")
+    try:
+        write(fresh)
+        fresh.replace(path)
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
+    finally:
+        if os.path.lexists(fresh):
+            fresh.unlink()
+
+
+def require_new(path: Path, force: bool) -> None:
+    """Refuse a path at which no file may be written.
+
+    Raises:
+        RunnerError: it is a folder, or there is a file already and `force` is not given.
+    """
+    if path.is_dir():
+        raise RunnerError(f"{path}: found a folder, expected a file to write.")
+    if path.exists() and not force:
+        raise RunnerError(f"{path}: exists already; --force replaces it, or choose another name.")
+
+
+def write_text_new(path: Path, force: bool, text: str) -> None:
+    """Write text to a file, as `write_new` does."""
+
+    def write(fresh: Path) -> None:
+        fresh.write_text(text, encoding="utf-8")
+
+    write_new(path, force, write)
 
 
 @contextlib.contextmanager

@@ -1,13 +1,11 @@
-"""What plot, report and film share: which runs are meant, and a file that is replaced only when asked."""
+"""What plot, report and film share: which runs are meant, and what is to be said of them."""
 
 from __future__ import annotations
 
-import os
-import secrets
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
-from runner.errors import RecordingError, RunnerError, StorageError
+from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.runs import Run, find_run, list_runs
@@ -26,46 +24,6 @@ def find_runs(names: Iterable[str], recordings: Path) -> list[Run]:
         for run in alike or [find_run(name, recordings)]:
             found.setdefault(run.recording.absolute(), run)
     return list(found.values())
-
-
-def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
-    """Have a file written beside its place, and put there when it is whole.
-
-    Raises:
-        RunnerError: there is one already and `force` is not given.
-        StorageError: it cannot be written.
-    """
-    require_new(path, force)
-    fresh = path.with_name(f".{secrets.token_hex(4)}.{path.name}")
-    try:
-        write(fresh)
-        fresh.replace(path)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        if os.path.lexists(fresh):
-            fresh.unlink()
-
-
-def require_new(path: Path, force: bool) -> None:
-    """Refuse a path at which no file may be written.
-
-    Raises:
-        RunnerError: it is a folder, or there is a file already and `force` is not given.
-    """
-    if path.is_dir():
-        raise RunnerError(f"{path}: found a folder, expected a file to write.")
-    if path.exists() and not force:
-        raise RunnerError(f"{path}: exists already; --force replaces it, or choose another name.")
-
-
-def write_text_new(path: Path, force: bool, text: str) -> None:
-    """Write text to a file, as `write_new` does."""
-
-    def write(fresh: Path) -> None:
-        fresh.write_text(text, encoding="utf-8")
-
-    write_new(path, force, write)
 
 
 def state_of(recording: Recording) -> str:

@@ -113,7 +113,7 @@ def _read(names: tuple[str, ...], recordings: Path | None) -> list[RunSeries]:
 def _write_page(path: Path, force: bool, comparison: Comparison, groups: list[Group]) -> str:
     """Write the page; return what there is to say of it."""
     from runner.export.compare_page import render_comparison
-    from runner.export.report_runs import write_text_new
+    from runner.export.places import write_text_new
 
     page = render_comparison(comparison, groups)
     write_text_new(path, force, page)

@@ -76,7 +76,8 @@ def command(
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
     from runner.export import report_replay as replay
     from runner.export.gif import require_packages, require_states, write_gif
-    from runner.export.report_runs import shortcomings, state_of, write_new
+    from runner.export.places import write_new
+    from runner.export.report_runs import shortcomings, state_of
     from runner.recording.reader import open_recording
 
     require_packages()

@@ -46,7 +46,7 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     import time
 
-    from runner.export.report_runs import require_new
+    from runner.export.places import require_new
     from runner.export.rerun.viewer import require_rerun
     from runner.recording.reader import open_recording
 

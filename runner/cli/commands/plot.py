@@ -39,9 +39,10 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
       dualtaxi plot hyperparameters -o hyperparameters.png
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.series import groups_of, read_series
+    from runner.export.places import write_new
     from runner.export.plots import panels_of
     from runner.export.plots_figure import check_suffix, matplotlib_of, save_figure
-    from runner.export.report_runs import find_runs, shortcomings, state_of, write_new
+    from runner.export.report_runs import find_runs, shortcomings, state_of
     from runner.recording.reader import open_recording
     from runner.runs import recordings_folder
     from runner.sweep.state import is_sweep
@@ -65,7 +66,7 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
 
 
 def _draw_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
-    from runner.export.report_runs import write_new
+    from runner.export.places import write_new
     from runner.sweep.figure import save_figure
     from runner.sweep.plots import learning, panel_of, picture_of
     from runner.sweep.results import results_of

@@ -58,7 +58,7 @@ def command(
     if step is not None and episode is not None:
         raise click.UsageError("--step and --episode exclude each other: choose one.")
     from runner.analysis.qtable import at_moment, told_of
-    from runner.export.report_runs import require_new
+    from runner.export.places import require_new
     from runner.recording.reader import open_recording
 
     if output is not None:
@@ -80,7 +80,7 @@ def _write(path: Path, force: bool, tables: list[NDArray[Any]]) -> None:
     import numpy as np
 
     from runner.analysis.qtable import one_array
-    from runner.export.report_runs import write_new
+    from runner.export.places import write_new
 
     def write(fresh: Path) -> None:
         with fresh.open("wb") as stream:  # of a name, NumPy would make another one

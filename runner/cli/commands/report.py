@@ -64,8 +64,9 @@ def command(
       dualtaxi report hyperparameters -o hyperparameters.html
       dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.export.places import write_new
     from runner.export.report import require_packages, write_report
-    from runner.export.report_runs import find_runs, write_new
+    from runner.export.report_runs import find_runs
     from runner.runs import recordings_folder
     from runner.sweep.state import is_sweep
 
@@ -87,7 +88,7 @@ def command(
 
 
 def _report_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
-    from runner.export.report_runs import write_text_new
+    from runner.export.places import write_text_new
     from runner.sweep.page import render_sweep
     from runner.sweep.results import results_of
     from runner.sweep.state import read_sweep

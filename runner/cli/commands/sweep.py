@@ -174,7 +174,7 @@ def show(
     """  # noqa: D301 - Click wants the backspace itself
     from runner.cli.sections import print_sections, require_one_form
     from runner.errors import RunnerError
-    from runner.export.report_runs import require_new, write_text_new
+    from runner.export.places import require_new, write_text_new
     from runner.runs import recordings_folder
     from runner.sweep.results import SHOWN, results_of, sections
     from runner.sweep.state import read_sweep

@@ -75,7 +75,7 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     if len(run_names) > 2:
         raise click.UsageError(f"found {len(run_names)} runs, expected one or two.")
-    from runner.export.report_runs import require_new
+    from runner.export.places import require_new
     from runner.export.rerun.viewer import require_rerun
 
     require_rerun("view")
