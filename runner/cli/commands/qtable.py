@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 @click.option(
     "-o",
     "--output",
+    "--out",
+    "output",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE.npy",
     help="Write the whole table: float64 [states, actions], of several agents [agents, states, actions].",

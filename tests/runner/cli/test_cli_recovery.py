@@ -276,7 +276,7 @@ def test_what_cannot_be_repaired_stays(command, tmp_path, content):
 
 def test_qtable(recorded, recorded_run, tmp_path):
     out = tmp_path / "table.npy"
-    result = recorded("qtable", recorded_run.recording, "--step", 300, "-o", out)
+    result = recorded("qtable", recorded_run.recording, "--step", 300, "--out", out)
     assert result.exit_code == 0
     assert "after 300 training steps" in result.stdout
     with open_recording(recorded_run.recording) as recording:
