@@ -8,7 +8,6 @@ from typing import Any
 from runner.errors import RecordingError
 from runner.frames import agents_of, environment_of, evaluation_records, training_records
 from runner.recording.reader import Recording, open_recording
-from runner.recording.schema import EVAL_STEP, TRAIN_EPISODE, TRAIN_STEP
 from runner.runs import Run
 
 
@@ -31,9 +30,7 @@ def describe(run: Run, recording: Recording) -> dict[str, Any]:
         "bytes": recording.size,
         "content_digest": summary.get("content_digest"),
         "topic_digests": summary.get("topic_digests"),
-        "episodes": summary.get("episodes", recording.count(TRAIN_EPISODE)),
-        "train_steps": summary.get("train_steps", recording.count(TRAIN_STEP)),
-        "eval_steps": summary.get("eval_steps", recording.count(EVAL_STEP)),
+        **{key: summary.get(key, count) for key, count in recording.done().items()},
         "seconds": summary.get("seconds"),
         "config": _config(run, recording),
         "provenance": recording.provenance,

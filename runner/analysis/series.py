@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -38,6 +38,8 @@ class RunSeries:
     """(episode, readings) of every evaluation."""
     training: list[tuple[int, Readings]]
     """(episode, readings) of every report of training, those at evaluations among them."""
+    content_digest: str = ""
+    """Of its recording; empty if that did not come to its end."""
 
     @property
     def finished(self) -> bool:
@@ -51,6 +53,8 @@ class Group:
 
     label: str
     runs: tuple[RunSeries, ...]
+    left_out: tuple[str, ...] = ()
+    """The ids of runs that are one of these once more."""
 
     @property
     def described(self) -> str:
@@ -62,7 +66,8 @@ class Group:
         more = len(self.runs) - MOST_NAMED
         shown += f", and {more} more" if more > 0 else ""
         count = f"{len(self.runs)} runs: " if len(self.runs) > 1 else "run "
-        return f"{self.label} ({count}{shown})"
+        again = f"; left out, as they are the same: {_few(self.left_out)}" if self.left_out else ""
+        return f"{self.label} ({count}{shown}{again})"
 
 
 MOST_NAMED: Final = 6
@@ -115,6 +120,7 @@ def read_series(recording: Recording) -> RunSeries:
             for record in evaluations
         ],
         training=sorted(training, key=lambda entry: entry[0]),
+        content_digest=recording.result.get("content_digest", ""),
     )
 
 
@@ -138,6 +144,7 @@ def loop_series(recording: Recording) -> RunSeries:
         config=_without_seed(recording.config, int(recording.run["seed"])),
         evaluation=_loop_evaluations(recording),
         training=sorted(training.items()),
+        content_digest=recording.result.get("content_digest", ""),
     )
 
 
@@ -151,7 +158,12 @@ def trained_before(recording: Recording) -> NDArray[np.int64]:
 
 
 def groups_of(series: Sequence[RunSeries]) -> list[Group]:
-    """Return the runs by configuration, in the order given, labelled by name and by what differs."""
+    """Return the runs by configuration, in the order given, labelled by name and by what differs.
+
+    A run that was recorded twice counts once, lest it weigh twice in a median: of a job's runs of one seed
+    the finished and then the last given counts; of somebody's own loops, which a seed need not tell apart,
+    the last of those of one content.
+    """
     found: dict[str, list[RunSeries]] = {}
     for run in series:
         content = {key: value for key, value in run.config.items() if key not in ("seeds", "recording")}
@@ -159,7 +171,36 @@ def groups_of(series: Sequence[RunSeries]) -> list[Group]:
     flat = [dict(flat_config(runs[0].config)) for runs in found.values()]
     names = [runs[0].name for runs in found.values()]
     labels = [label_of(i, names, flat) for i in range(len(names))]
-    return [Group(label, tuple(runs)) for label, runs in zip(labels, found.values(), strict=True)]
+    once = [each_once(runs, _sameness) for runs in found.values()]
+    return [
+        Group(label, tuple(kept), tuple(run.run_id for run in runs if run not in kept))
+        for label, kept, runs in zip(labels, once, found.values(), strict=True)
+    ]
+
+
+def each_once(runs: Sequence[RunSeries], same: Callable[[RunSeries], Hashable]) -> list[RunSeries]:
+    """Return of the runs that are the same one run: a finished one if there is one, the last given."""
+    best: dict[Hashable, RunSeries] = {}
+    for run in runs:
+        key = same(run)
+        if key not in best or run.finished >= best[key].finished:
+            best[key] = run
+    return list(best.values())
+
+
+def left_out(groups: Sequence[Group]) -> list[str]:
+    """Return what is to be said of runs that are there twice: a sentence, or nothing."""
+    twice = [run_id for group in groups for run_id in group.left_out]
+    return [f"left out, as the same run is there: {_few(twice)}"] if twice else []
+
+
+def _few(run_ids: Sequence[str]) -> str:
+    more = len(run_ids) - MOST_NAMED
+    return ", ".join(run_ids[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _sameness(run: RunSeries) -> Hashable:
+    return run.content_digest or run.run_id if is_loop(run) else run.seed
 
 
 def is_loop(run: RunSeries) -> bool:

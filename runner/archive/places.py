@@ -91,7 +91,8 @@ def archive_of(run: Run) -> Iterator[Path]:
 
     said = str(run.archive.get("target", ""))
     beside = f"{default_target(run.folder.absolute().parent)}/{run.run_id}"
-    for place in dict.fromkeys((said, beside)):
+    places = list(dict.fromkeys((said, beside)))
+    for place in places:
         to, run_id = split_place(place)
         if run_id != run.run_id:
             continue
@@ -101,8 +102,8 @@ def archive_of(run: Run) -> Iterator[Path]:
                 yield folder
             return
     raise RecordingError(
-        f"run {run.run_id}: found no archive at {said} or {beside}; its recording was put into it. Mount or "
-        f"copy it there, or set {ARCHIVE_VARIABLE} to the folder that has it."
+        f"run {run.run_id}: found no archive at {' or '.join(places)}; its recording was put into it. "
+        f"Mount or copy it there, or set {ARCHIVE_VARIABLE} to the folder that has it."
     )
 
 

@@ -68,7 +68,7 @@ def archive_run(
     target = target_of(to)
     with owned(run, archived=True) as current:
         if current.status == "archived":
-            raise RunnerError(f"run {run.run_id} is archived already, in {current.archive.get('place')}.")
+            raise RunnerError(f"run {run.run_id} is archived already, in {current.archive['target']}.")
         return _Archiving(current, target, report).do(remove, dry_run)
 
 
@@ -85,7 +85,7 @@ class _Archiving:
         run, target = self._run, self._target
         existing = target.manifest(run.run_id)
         with _sound(run) as recording:
-            size = recording.size
+            size, came = recording.size, recording.done()
             if dry_run or existing is None:
                 manifest = self._write(recording, dry_run)
             elif _holds(existing, recording):
@@ -100,7 +100,7 @@ class _Archiving:
         if remove or existing is not None:
             with target.reading(run.run_id) as folder:
                 check(folder, self._report)
-        run = run.update(archive=_stub(target.place(run.run_id), manifest, size))
+        run = run.update(archive=_stub(target.place(run.run_id), manifest, size, came))
         if remove:
             run.recording.unlink()
         return Archived(run, target.place(run.run_id), manifest, existing is None, remove, size)
@@ -123,13 +123,14 @@ def _holds(manifest: Manifest, recording: Recording) -> bool:
     return stated is not None or manifest.digest == content_of(recording.path)
 
 
-def _stub(place: str, manifest: Manifest, recording_bytes: int) -> dict[str, Any]:
+def _stub(place: str, manifest: Manifest, recording_bytes: int, done: dict[str, int]) -> dict[str, Any]:
     """Return what a run's file says of its archive."""
     return {
         "target": place,
         "digest": manifest.digest,
         "bytes": manifest.size,
         "recording_bytes": recording_bytes,
+        "done": done,
         "version": manifest.version,
     }
 

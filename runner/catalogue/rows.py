@@ -99,7 +99,8 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         run: as its folder says now.
         size: bytes of its recording; None if there is none.
     """
-    facts, config, summary = run.facts, run.facts.get("config", {}), run.summary
+    facts, config = run.facts, run.facts.get("config", {})
+    summary = run.summary if "episodes" in run.summary else {**_recorded(run), **run.summary}
     last = _mapping(summary.get("last_evaluation"))
     made_by = _mapping(facts.get("provenance"))
     train, evaluation = whole(summary.get("train_steps")), whole(summary.get("eval_steps"))
@@ -114,7 +115,7 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         "note": text(run.note),
         "words": text("\n".join([run.run_id, run.name, called or "", *run.tags, run.note]), 3 * _TEXT),
         "created": math.floor(run.created.timestamp() * 1000),
-        "episodes": whole(summary["episodes"] if "episodes" in summary else _recorded_episodes(run)),
+        "episodes": whole(summary.get("episodes")),
         "episodes_to_do": whole(config.get("episodes")),
         "steps": None if train is None or evaluation is None else train + evaluation,
         "train_steps": train,
@@ -132,16 +133,16 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
     }
 
 
-def _recorded_episodes(run: Run) -> int | None:
-    """Return how far a run came that was ended before it could say so; None if nobody can tell, or yet."""
+def _recorded(run: Run) -> Mapping[str, Any]:
+    """Return how far a run came that was ended before it could say so; nothing if nobody can tell, or yet."""
     from runner.recording.reader import open_recording
-    from runner.recording.schema import TRAIN_EPISODE
 
-    if run.status not in ("interrupted", "failed") or not run.recording.exists():
-        return None
-    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        return recording.count(TRAIN_EPISODE)
-    return None
+    if run.status == "archived":
+        return _mapping(run.archive.get("done"))
+    if run.status in ("interrupted", "failed") and run.recording.exists():
+        with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+            return recording.done()
+    return {}
 
 
 def text(value: Any, most: int = _TEXT) -> str | None:

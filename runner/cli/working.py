@@ -72,7 +72,7 @@ def at_work(label: str, episodes: int) -> Iterator[tuple[Report, Interrupt]]:
 
 def run_as_json(run: Run) -> dict[str, Any]:
     """Return what programs want to know of a run that is over."""
-    summary = run.summary
+    summary = _told(run)
     known = ("content_digest", "episodes", "train_steps", "eval_steps", "seconds", "bytes", "last_evaluation")
     return {
         "run_id": run.run_id,
@@ -86,7 +86,7 @@ def run_as_json(run: Run) -> dict[str, Any]:
 
 def run_in_words(run: Run) -> dict[str, str]:
     """Return the facts of a run that is over, as text by name."""
-    summary = run.summary
+    summary = _told(run)
     took = "" if summary.get("seconds") is None else f", in {duration(summary['seconds'])}"
     return {
         "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
@@ -96,7 +96,15 @@ def run_in_words(run: Run) -> dict[str, str]:
     }
 
 
+def _told(run: Run) -> dict[str, Any]:
+    """Return what a run said at its end; of one that was killed, how far it came by its recording."""
+    from runner.recording.reader import open_recording
+
+    if "train_steps" in run.summary:
+        return run.summary
+    with open_recording(run.recording) as recording:
+        return {**recording.done(), **run.summary}
+
+
 def _steps_in_words(summary: dict[str, Any]) -> str:
-    if "train_steps" not in summary:
-        return UNKNOWN
     return f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation"

@@ -149,6 +149,16 @@ class Recording:
             "summary": {key: value for key, value in result.items() if key != "status"},
         }
 
+    def done(self) -> dict[str, int]:
+        """Return how many training episodes and steps of each phase were done: as told, else as counted."""
+        counted = {
+            "episodes": schema.TRAIN_EPISODE,
+            "train_steps": schema.TRAIN_STEP,
+            "eval_steps": schema.EVAL_STEP,
+        }
+        told = self.result
+        return {key: told[key] if key in told else self.count(topic) for key, topic in counted.items()}
+
     def metadata(self, name: str) -> dict[str, str]:
         """Return a metadata record's entries.
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from runner.analysis.series import SHARES, Group, RunSeries, flat_config, label_of
+from runner.analysis.series import SHARES, Group, RunSeries, each_once, flat_config, label_of
 from runner.errors import RunnerError, nearest
 
 _NOT_COMPARED = ("seeds", "recording", "name")
@@ -33,7 +33,7 @@ def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Gr
     key = _content if by is None else _value_at(by, series)
     for run in series:
         found.setdefault(key(run), []).append(run)
-    once = {name: list(_each_once(runs)) for name, runs in found.items()}
+    once = {name: each_once(runs, lambda run: (_content(run), run.seed)) for name, runs in found.items()}
     twice = [run.run_id for name, runs in found.items() for run in runs if run not in once[name]]
     notes = (
         [f"left out, as another run of the same configuration and seed is there: {', '.join(twice)}"]
@@ -122,16 +122,6 @@ def _paths(values: Any, prefix: str = "") -> dict[str, Any]:
         if isinstance(value, dict):
             found |= _paths(value, f"{prefix}{key}.")
     return found
-
-
-def _each_once(runs: Sequence[RunSeries]) -> list[RunSeries]:
-    """Return a run for each configuration and seed: a finished one if there is one, the last given."""
-    best: dict[tuple[str, int], RunSeries] = {}
-    for run in runs:
-        known = best.get((_content(run), run.seed))
-        if known is None or run.finished >= known.finished:
-            best[_content(run), run.seed] = run
-    return list(best.values())
 
 
 def _mixed(group: Group) -> list[str]:

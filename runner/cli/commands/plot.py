@@ -27,7 +27,8 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     """Draw every metric of one or several runs over episodes, in one figure; or a sweep.
 
     Runs that differ in nothing but the seed are drawn as one line, their median, with a band from the
-    lowest to the highest. The name of several runs stands for all of them.
+    lowest to the highest; one that was recorded twice counts once, which is said. The name of several runs
+    stands for all of them.
 
     The name of a sweep stands for it: its objective is drawn against each parameter and in parallel
     coordinates, and over episodes for the best and the median trial.
@@ -38,7 +39,7 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
       dualtaxi plot cooperative competitive -o comparison.pdf
       dualtaxi plot hyperparameters -o hyperparameters.png
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.analysis.series import groups_of, read_series
+    from runner.analysis.series import groups_of, left_out, read_series
     from runner.export.places import write_new
     from runner.export.plots import panels_of
     from runner.export.plots_figure import check_suffix, matplotlib_of, save_figure
@@ -60,9 +61,12 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
             if state_of(recording) != "finished":
                 say(shortcomings(recording)[0])
     groups = groups_of(series)
+    for note in left_out(groups):
+        say(f"{note[0].upper()}{note[1:]}.")
     panels = panels_of(groups)
     write_new(output, force, lambda path: save_figure(path, groups, panels))
-    click.echo(f"{output}: {len(panels)} metrics of {len(series)} run{'s' if len(series) > 1 else ''}")
+    drawn = sum(len(group.runs) for group in groups)
+    click.echo(f"{output}: {len(panels)} metrics of {drawn} run{'s' if drawn > 1 else ''}")
 
 
 def _draw_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:

@@ -161,6 +161,7 @@ def test_a_running_run_and_an_archived_one_are_refused(run, recordings, command)
     assert result.exit_code == 2
     assert "is running" in result.output
     done(command("archive", run.run_id, "--remove"))
+    assert f"is archived already, in {recordings.parent}" in command("archive", run.run_id).output
     for words in (("archive", run.run_id), ("resume", run.run_id), ("rerecord", run.run_id)):
         result = command(*words)
         assert result.exit_code == 2
@@ -192,11 +193,19 @@ def test_a_killed_run_is_archived_and_restored(run, recordings, command):
     (folder / "recording.mcap").write_bytes(left)
     said = json.loads((folder / "run.json").read_text())
     owner = {**this_process(), "process_started": -1.0}
-    (folder / "run.json").write_text(json.dumps(said | {"status": "running", "owner": owner}))
+    (folder / "run.json").write_text(json.dumps(said | {"status": "running", "owner": owner, "summary": {}}))
+    with open_recording(folder / "recording.mcap") as recording:
+        came = {"episodes": recording.count(schema.TRAIN_EPISODE)}
+        came["train_steps"] = recording.count(schema.TRAIN_STEP)
+    (before,) = json.loads(done(command("ls", "--json")))
+    assert {key: before[key] for key in came} == came
     done(command("archive", run.run_id, "--remove"))
-    assert [row["status"] for row in json.loads(done(command("ls", "--json")))] == ["archived"]
+    done(command("reindex"))
+    (row,) = json.loads(done(command("ls", "--json")))
+    assert row["status"] == "archived"
+    assert {key: row[key] for key in came} == came
     done(command("show", run.run_id))
-    done(command("restore", run.run_id))
+    assert f"steps   {came['train_steps']:,} of training" in done(command("restore", run.run_id))
     back = find_run(run.run_id, recordings)
     assert back.status == "interrupted"
     assert back.recording.exists()

@@ -9,13 +9,15 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.figure import Figure
 
-from runner.analysis.series import groups_of, read_series
+from runner.analysis.series import RunSeries, groups_of, read_series
 from runner.cli import cli
 from runner.errors import RunnerError
 from runner.export.plots import panels_of
 from runner.export.plots_figure import draw_figure, draw_panel
 from runner.frames import evaluation_records
 from runner.recording.reader import open_recording
+from runner.recording.rewriting import rewrite
+from runner.runs import find_run
 from tests.runner.recording.making import TAXIS, make_run
 
 
@@ -48,6 +50,37 @@ def test_seeds_are_one_group_with_median_and_band(seeds):
     assert curve.median.tolist() == [median(each) for each in zip(*lengths, strict=True)]
     assert curve.low.tolist() == [min(each) for each in zip(*lengths, strict=True)]
     assert curve.high.tolist() == [max(each) for each in zip(*lengths, strict=True)]
+
+
+def again(run, folder, run_id):
+    """Return the same content, recorded under another id."""
+    (folder / run_id).mkdir(parents=True)
+
+    def renamed(name, said):
+        return said | {"run_id": run_id} if name == "run" else said
+
+    rewrite(run.recording, folder / run_id / "recording.mcap", renamed)
+    return find_run(run_id, folder)
+
+
+def test_a_run_recorded_twice_counts_once_and_that_is_said(seeds, tmp_path):
+    copies = [again(seeds[0], tmp_path, run_id) for run_id in ("again111", "again222")]
+    (group,) = groups_of(series(*seeds, *copies))
+    assert sorted(run.seed for run in group.runs) == [1, 2, 3]
+    assert set(group.left_out) == {seeds[0].run_id, "again111"}
+    assert "left out" in group.described
+    done = plot(*(run.folder for run in (*copies, seeds[1])), "-o", tmp_path / "p.svg")
+    assert done.exit_code == 0, done.output
+    assert "Left out, as the same run is there: again111." in done.stderr
+    assert "of 2 runs" in done.stdout
+
+
+def test_loops_of_one_seed_are_all_drawn_unless_they_are_the_same():
+    config = {"made_by": "runner.record"}
+    runs = [RunSeries(f"loop{i}", "mine", 0, "finished", config, [], [], d) for i, d in enumerate("aab")]
+    (group,) = groups_of(runs)
+    assert [run.run_id for run in group.runs] == ["loop1", "loop2"]
+    assert group.left_out == ("loop0",)
 
 
 def test_every_metric_of_the_tutorial_and_every_event_has_a_panel(pictured):
