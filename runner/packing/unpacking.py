@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from runner.catalogue.finding import candidates
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.labels import LABELS_FILE
+from runner.labels import LABELS_FILE, read_labels
 from runner.packing.container import Manifest, Pack, PackError, opened
 from runner.packing.packing import facts_bytes, run_facts
+from runner.packing.present import Occupied, known, met
 from runner.recording.facts import json_object
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of, rewrite
-from runner.runs import RECORDING_FILE, RUN_FILE, Run, find_run, new_run_id, runs_in
+from runner.runs import RECORDING_FILE, RUN_FILE, Run, find_run, new_run_id
 
 
 @dataclass(frozen=True)
@@ -29,11 +29,13 @@ class Unpacked:
     run: Run
     manifest: Manifest
     already: bool
-    """Whether the same run with the same content was there before; then nothing was written."""
+    """Whether the same run was there before, with this content or as far and further; nothing was written."""
 
 
 def unpack(path: Path, recordings: Path, as_new: bool = False) -> Unpacked:
     """Unpack a run into a recordings folder, under its own id.
+
+    One of its id that is there, but did not come to its end, is gone on with, as `admit` does.
 
     Args:
         path: what `pack` wrote.
@@ -42,60 +44,45 @@ def unpack(path: Path, recordings: Path, as_new: bool = False) -> Unpacked:
 
     Raises:
         PackError: the file is damaged, no pack, or made to do harm; nothing was written.
-        RunnerError: another run of this id is there.
+        RunnerError: another run of this id is there, which this does not go on with.
         StorageError: the recordings folder cannot be written, or has no room.
     """
+    occupied = None
     with opened(path) as pack:
-        if not as_new and (run := _known_as(pack.manifest, recordings)) is not None:
+        try:
+            manifest = pack.manifest
+            run = None if as_new else known(manifest.run_id, manifest.content_digest, recordings)
+        except Occupied as error:
+            run, occupied = None, error
+        if run is not None:
             _take_all(pack, None)
-            return Unpacked(run, pack.manifest, already=True)
+            return Unpacked(run, manifest, already=True)
         with workplace(recordings) as folder:
             _check_room(path, folder)
             _take_all(pack, folder)
-            _check(path, folder, pack.manifest)
-            run_id = pack.manifest.run_id
-            if as_new:
-                run_id = _renamed(folder, recordings)
+            _check(path, folder, manifest)
+            if occupied is not None:
+                return Unpacked(*_met(occupied, folder, manifest))
+            run_id = _renamed(folder, recordings) if as_new else manifest.run_id
             folder.rename(recordings / run_id)
-        return Unpacked(find_run(f"{recordings}{os.sep}{run_id}", recordings), pack.manifest, False)
+        return Unpacked(find_run(f"{recordings}{os.sep}{run_id}", recordings), manifest, False)
 
 
-class Occupied(RunnerError):
-    """Another run of this id is there already: `run`."""
-
-    def __init__(self, run: Run, recordings: Path) -> None:
-        super().__init__(
-            f"{recordings}: found another run {run.run_id} ({run.name}, seed {run.seed}, {run.status}), "
-            "whose content is not that of the one to come"
-        )
-        self.run = run
-
-
-def known(run_id: str, content_digest: str, recordings: Path) -> Run | None:
-    """Return the run of this id that is there already with this content; None if its place is free.
+def _met(occupied: Occupied, folder: Path, manifest: Manifest) -> tuple[Run, Manifest, bool]:
+    """Return what came of unpacking a run where one of its id is, as `met` does.
 
     Raises:
-        Occupied: one of this id and other content is there.
-        StorageError: something that is no run has its place.
+        RunnerError: neither of the two holds the other.
     """
-    taken = next((run for run in candidates(recordings) if run.run_id == run_id), None)
-    found = taken and next(runs_in(Path(taken.root, taken.entry)), None)
-    if found is None:
-        if os.path.lexists(recordings / run_id):
-            raise StorageError(f"{recordings / run_id}: is there already and is no run; move it away.")
-        return None
-    with contextlib.suppress(RecordingError):
-        if content_of(found.recording) == content_digest:
-            return found
-    raise Occupied(found, recordings)
-
-
-def _known_as(manifest: Manifest, recordings: Path) -> Run | None:
-    """Return the run that is there already with the content of a packed one, as `known` does."""
+    facts = json_object((folder / RUN_FILE).read_bytes(), RUN_FILE)
     try:
-        return known(manifest.run_id, manifest.content_digest, recordings)
+        run, already = met(occupied, folder / RECORDING_FILE, facts, read_labels(folder))
     except Occupied as error:
-        raise RunnerError(f"{error} ({manifest.status}); --as-new unpacks it under another.") from error
+        raise RunnerError(
+            f"{error}, and neither goes on where the other ends ({manifest.status}); --as-new unpacks it "
+            "under a new id, beside the one that is there."
+        ) from error
+    return run, manifest, already
 
 
 def _take_all(pack: Pack, folder: Path | None) -> None:

@@ -25,7 +25,7 @@ from filelock import FileLock, Timeout
 
 from runner.documents import write_whole
 from runner.errors import RunnerError, RunNotFound, StorageError
-from runner.packing.admission import sync
+from runner.packing.present import sync
 from runner.runs import run_at_once
 from runner.service.appending import Appending, on_disk
 from runner.service.upload import (

@@ -136,7 +136,8 @@ def _taken(body: Path, completion: Completion, recordings: Path) -> Verdict:
     Raises:
         RunnerError: it is neither, is damaged, or another run has its id.
     """
-    from runner.packing.admission import admit, sync
+    from runner.packing.admission import admit
+    from runner.packing.present import sync
     from runner.packing.unpacking import unpack
 
     with body.open("rb") as stream:

@@ -20,7 +20,8 @@ def command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) ->
 
     Every byte is checked before the run appears: checksums, the content digest, and that the parts say
     the same. A file that is damaged, cut off or made to do harm is refused, and nothing is written. A run
-    that is there already with the same content is left as it is.
+    that is there already with the same content, or further on, is left as it is; an interrupted one that
+    FILE goes on with takes over what came.
 
     \b
     Examples:
@@ -32,18 +33,20 @@ def command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) ->
 
     unpacked = unpack(file, recordings_folder(recordings), as_new)
     run, manifest = unpacked.run, unpacked.manifest
+    digest = run.summary.get("content_digest") or manifest.content_digest
     if unpacked.already:
-        say(f"Run {run.run_id} is there already with this content; nothing was written.")
+        more = "" if digest == manifest.content_digest else " and more"
+        say(f"Run {run.run_id} is there already with this content{more}; nothing was written.")
     if as_json:
         told = {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status}
         told |= {"path": str(run.recording.absolute()), "already": unpacked.already}
-        print_json(told | {"content_digest": manifest.content_digest, "anonymous": manifest.anonymous})
+        print_json(told | {"content_digest": digest, "anonymous": manifest.anonymous})
         return
     draw(
         facts(
             {
                 "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
-                "digest": manifest.content_digest,
+                "digest": digest,
                 "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
                 "next": f"dualtaxi show {run.run_id}",
             }

@@ -117,6 +117,24 @@ def test_a_run_of_the_same_id_and_other_content_stays(lake, taxis, tmp_path):
     assert other.recording.read_bytes() == taxis.recording.read_bytes()
 
 
+def test_an_interrupted_run_is_gone_on_with_by_a_pack_of_its_end_and_not_set_back(taxis, tmp_path):
+    early = cut_off(taxis, tmp_path / "early", 20_000)
+    beginning, whole = (
+        pack(run, tmp_path / f"{name}.dualtaxi").path for run, name in ((early, "early"), (taxis, "whole"))
+    )
+    theirs = tmp_path / "theirs"
+    there = unpack(beginning, theirs).run
+    change_labels(there.folder, lambda _: Labels("mine", ("keep",), ""))
+    gone_on = unpack(whole, theirs)
+    assert (gone_on.already, gone_on.run.status, gone_on.run.name) == (False, "finished", "mine")
+    assert gone_on.run.recording.read_bytes() == taxis.recording.read_bytes()
+    assert verify(gone_on.run.recording).sound
+    back = unpack(beginning, theirs)
+    assert (back.already, back.run.status) == (True, "finished")
+    assert back.run.recording.read_bytes() == taxis.recording.read_bytes()
+    assert [path.name for path in theirs.iterdir()] == [taxis.run_id]
+
+
 @pytest.mark.parametrize("anonymous", [False, True])
 @pytest.mark.parametrize("missing", [400, 20_000])
 def test_a_killed_run_stays_interrupted(taxis, tmp_path, missing, anonymous):

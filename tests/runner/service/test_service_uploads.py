@@ -259,8 +259,8 @@ def test_a_run_that_was_gone_on_with_takes_the_place_of_its_beginning(uploads, s
     assert run.labels == Labels("mine", ("here", "there"), "seen")
     assert visible(tmp_path / "runs") == [run.run_id]
     assert not list(there.glob(".*"))
-    refused = send(uploads, early.recording.read_bytes()[:-1], status="interrupted")
-    assert refused.state == "refused"
+    older = send(uploads, early.recording.read_bytes()[:-1], status="interrupted")
+    assert (older.state, older.problem, older.already) == ("stored", "", True)
     assert find_run(whole.run_id, tmp_path / "runs").recording.read_bytes() == data
 
 
