@@ -14,8 +14,10 @@ import difflib
 import importlib
 import json
 import math
+import traceback
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -161,7 +163,9 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
     env = _make(env_id, dict(kwargs) | ({"competitive": True} if rewards == "individual" else {}))
     try:
         mdp = _read(env_id, kwargs, env, rewards)
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+    except EnvironmentNotUsable:
+        raise
+    except Exception as error:  # its attributes may raise anything
         raise EnvironmentNotUsable(
             f"environment {env_id!r}: what it tells of itself cannot be read "
             f"({type(error).__name__}: {error}); docs/architecture.md says what is expected."
@@ -241,11 +245,11 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
         except ModuleNotFoundError as error:
             raise EnvironmentNotUsable(
                 f"environment {env_id!r}: there is no module {error.name!r}; "
-                "install the package that brings it, or mend `env.id`."
+                "install the package that brings it, set PYTHONPATH to the folder it is in, or mend `env.id`."
             ) from error
-        except (ImportError, SyntaxError, TypeError, ValueError) as error:
+        except Exception as error:  # a module may raise anything
             raise EnvironmentNotUsable(
-                f"environment {env_id!r}: the module {module!r} cannot be imported ({error})."
+                f"environment {env_id!r}: the module {module!r} cannot be imported ({_raised(error)})."
             ) from error
     if name not in gymnasium.registry:
         stems = {known.rpartition("-v")[0]: known for known in gymnasium.registry}  # the newest comes last
@@ -257,11 +261,21 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
         raise EnvironmentNotUsable(f"environment {env_id!r}: Gymnasium knows no such id.{hint}")
     try:
         return gymnasium.make(name, disable_env_checker=True, **kwargs)
-    except (AssertionError, LookupError, TypeError, ValueError, gymnasium.error.Error, ImportError) as error:
+    except Exception as error:  # an environment may raise anything
         if "competitive" in kwargs and "keyword argument 'competitive'" in str(error):
             raise _one_reward_only(env_id) from error
         given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
-        raise EnvironmentNotUsable(f"environment {env_id!r} cannot be made with {given}: {error}") from error
+        speaks = isinstance(error, TypeError | ValueError | ImportError | gymnasium.error.Error)
+        raise EnvironmentNotUsable(
+            f"environment {env_id!r} cannot be made with {given}: {error if speaks else _raised(error)}"
+        ) from error
+
+
+def _raised(error: Exception) -> str:
+    """Return what somebody's code raised, and where: `KeyError: 'goal' (corridor.py, line 12)`."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    at = "" if isinstance(error, SyntaxError) else f" ({Path(place.filename).name}, line {place.lineno})"
+    return f"{type(error).__name__}: {error}{at}"
 
 
 def _transitions(env_id: str, base: Any) -> dict[str, NDArray[Any]]:

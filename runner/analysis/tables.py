@@ -112,10 +112,7 @@ class TableReplay:
         if stop < self.step:
             raise RecordingError(f"a replay at step {self.step} cannot go back to {stop}; begin another.")
         if stop > max(self._recorded, self.step):
-            raise RecordingError(
-                f"{self._recording.path}: found {self._recorded} training steps, expected at least {stop}"
-                + ("." if self._recorded else "; `dualtaxi rerecord` records them.")
-            )
+            raise self._missing(stop)
         for block in self._recording.blocks(schema.TRAIN_STEP, self.step, stop) if stop > self.step else ():
             if int(block["step"][0]) != self.step:
                 raise self._lost(int(block["step"][0]))
@@ -124,6 +121,21 @@ class TableReplay:
             self.step += len(block)
         if self.step < stop:
             raise self._lost(stop)
+
+    def _missing(self, stop: int) -> RecordingError:
+        recording = self._recording
+        kept = recording.config["recording"]["steps"] == "all"
+        taken = self._recorded if kept else recording.result.get("train_steps", stop)
+        if kept or taken < stop:
+            return RecordingError(
+                f"{recording.path}: found {taken} training steps, expected at least {stop}."
+            )
+        behind = next((snapshot.step for snapshot in recording.snapshots() if snapshot.step >= stop), None)
+        return RecordingError(
+            f"{recording.path}: was recorded without steps (recording.steps: none), and this takes the first "
+            f"{stop:,}; `dualtaxi rerecord` records them. The nearest Q-tables are those after {self.step:,}"
+            + (f" and {behind:,} steps." if behind is not None else " steps.")
+        )
 
     def _lost(self, found: int) -> RecordingError:
         return RecordingError(

@@ -26,6 +26,17 @@ _BRANCHES = frozenset(
 )
 """The names by which a location tells which branch of a union was taken; none is a key."""
 
+_ELSEWHERE = {
+    **dict.fromkeys(("alpha", "learning_rate", "lr"), "step_size"),
+    **dict.fromkeys(("gamma", "discount_factor"), "discount"),
+    **dict.fromkeys(("eps", "exploration_rate"), "epsilon"),
+    **dict.fromkeys(("environment", "env_id", "env_name"), "env"),
+    **dict.fromkeys(("eval", "eval_every"), "evaluation"),
+    **dict.fromkeys(("decay", "decay_rate"), "factor"),
+    **dict.fromkeys(("end", "min", "minimum"), "floor"),
+}
+"""What other programs and textbooks call a key."""
+
 
 def problems_in(error: ValidationError, value: object, schema: Schema | None = None) -> list[Problem]:
     """Return what is wrong with `value`, the mapping that was validated, and leave out what only follows.
@@ -98,9 +109,7 @@ def _problem(path: Path, detail: ErrorDetails, value: object, schema: Schema | N
     around = schema_at(detail["loc"][:-1], schema)
     if detail["type"] == _UNKNOWN:
         known = keys_of(around)
-        return Problem(
-            path, "unknown key." + (nearest(str(path[-1]), known) or f" Known: {', '.join(known)}")
-        )
+        return Problem(path, "unknown key." + (_hint(str(path[-1]), known) or f" Known: {', '.join(known)}"))
     if detail["type"] == "invalid_key":
         return Problem((*path[:-1], str(path[-1])), "unknown key, which is not even text")
     here = schema_at(detail["loc"], schema)
@@ -129,7 +138,13 @@ def _at(value: Any, path: Path) -> Any:
 
 
 def _meant(missing: Path, unknown: Path) -> bool:
-    return missing[:-1] == unknown[:-1] and bool(nearest(str(unknown[-1]), [str(missing[-1])]))
+    return missing[:-1] == unknown[:-1] and bool(_hint(str(unknown[-1]), [str(missing[-1])]))
+
+
+def _hint(key: str, known: Sequence[str]) -> str:
+    """Return which of the known keys is meant by one that others use, or that is nearly one."""
+    other = _ELSEWHERE.get(key.lower())
+    return f" Did you mean {other!r}?" if other in known else nearest(key, known)
 
 
 def _line(place: Place | None, problem: Problem) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import fields, replace
 
 import gymnasium
@@ -138,6 +139,35 @@ def test_an_environment_that_cannot_be_used_is_refused_with_the_reason(case):
     env_id, kwargs, message = REFUSED[case]
     with pytest.raises(EnvironmentNotUsable, match=f"(?s){message}"):
         load_mdp(env_id, kwargs)
+
+
+RAISING = {
+    "as it is imported": (
+        "names = {}\nnames['goal']",
+        r"cannot be imported \(KeyError: 'goal' \(town\.py, line 2\)",
+    ),
+    "as it is read": ("def (", r"cannot be imported \(SyntaxError: .*town\.py, line 1"),
+    "as it is made": (
+        "import gymnasium\ndef made():\n    raise KeyError('goal')\ngymnasium.register('Town-v0', made)",
+        r"cannot be made with no arguments: KeyError: 'goal' \(town\.py, line 3\)",
+    ),
+    "as it is made, by chance": (
+        "import gymnasium\ngymnasium.register('Town-v0', lambda: 1 / 0)",
+        r"cannot be made with no arguments: ZeroDivisionError",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", RAISING)
+def test_whatever_a_module_of_ones_own_raises_is_told_with_its_place(case, tmp_path, monkeypatch):
+    source, message = RAISING[case]
+    (tmp_path / "town.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "town", raising=False)
+    monkeypatch.setattr(gymnasium, "registry", dict(gymnasium.registry))
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", gymnasium.registry)
+    with pytest.raises(EnvironmentNotUsable, match=f"(?s){message}"):
+        load_mdp("town:Town-v0", {})
 
 
 def test_individual_rewards_need_an_environment_that_pays_its_agents_one_by_one():

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import runner
 from runner.analysis.tables import TableReplay, history_of, last_step, step_of_episode, tables_at
 from runner.errors import RecordingError
 from runner.learning.learner import Learner
@@ -134,6 +135,23 @@ def history_by_hand(recording, visits, state):
             steps[i, : len(changed)][changed] = record["step"]
             episodes[i, : len(changed)][changed] = record["episode"]
     return counts, steps, episodes
+
+
+def test_without_steps_it_is_said_what_is_missing_and_where_tables_are(tmp_path):
+    settings = ["episodes=20", "recording.steps=none", "snapshots.every=10"]
+    done = runner.run("configs/quick.yaml", recordings=tmp_path, overrides=settings)
+    with open_recording(done.recording) as recording:
+        _, middle, last = (snapshot.step for snapshot in recording.snapshots())
+        assert len(tables_at(recording, middle)) == 1
+        nearest = (
+            rf"without steps .* first {middle + 1:,}; `dualtaxi rerecord`.* {middle:,} and {last:,} steps"
+        )
+        with pytest.raises(RecordingError, match=nearest):
+            tables_at(recording, middle + 1)
+        with pytest.raises(
+            RecordingError, match=f"found {last} training steps, expected at least {last + 1}"
+        ):
+            tables_at(recording, last + 1)
 
 
 def test_what_is_not_there(run, steps):

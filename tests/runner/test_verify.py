@@ -205,6 +205,10 @@ def test_an_interrupted_recording_is_compared_to_its_end(run, tmp_path):
     with open_recording(cut) as recording:
         assert "result" not in survey(cut, keep_result=True).metadata
         last = len(recording.metrics("train")) - 1
+        counts = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
+    found = verify(cut)
+    assert found.sound, found.finding
+    assert (found.train_steps, found.eval_steps) == counts
     change = setting_in_message(last, mean_length=0.5)(schema.TRAIN_METRICS_TOPIC)
     with open_recording(cut):
         found = verify(altered_without_result(cut, path, change))

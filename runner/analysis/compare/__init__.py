@@ -118,8 +118,18 @@ def compare(
         moment=moment.described,
         groups={group.label: [run.run_id for run in group.runs] for group in groups},
         metrics=[_metric(groups, metric, line, moment) for metric, line in metrics],
-        notes=[*notes, *_untested(metrics), *_few(groups)],
+        notes=[*notes, *_worlds(groups), *_untested(metrics), *_few(groups)],
     )
+
+
+def _worlds(groups: Sequence[Group]) -> list[str]:
+    """Return a note if the groups were not trained in the same environment."""
+    jobs = [(group.label, run.config) for group in groups for run in group.runs if not is_loop(run)]
+    told = {label: config["env"]["id"] for label, config in jobs if "env" in config}
+    if len(set(told.values())) < 2:
+        return []
+    listed = ", ".join(f"{env_id} in {label}" for label, env_id in told.items())
+    return [f"the environments differ ({listed}): their figures do not measure the same"]
 
 
 def _untested(metrics: Sequence[tuple[str, str]]) -> list[str]:

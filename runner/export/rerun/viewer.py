@@ -219,8 +219,9 @@ def check_address(url: str) -> str:
             raise ValueError
         place = (parts.hostname, parts.port or (443 if parts.scheme.endswith("https") else 80))
     except ValueError:
-        raise ViewerError(
-            f"found {url!r}, expected a viewer's address such as rerun+http://127.0.0.1:9876/proxy"
+        raise RunnerError(
+            f"--live-url: found {url!r}, expected a viewer's address such as "
+            "rerun+http://127.0.0.1:9876/proxy"
         ) from None
     try:
         socket.create_connection(place, timeout=ANSWER_SECONDS).close()

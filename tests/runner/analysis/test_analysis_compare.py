@@ -113,6 +113,18 @@ def test_few_seeds_are_warned_of_and_have_no_iqm_below_four():
     assert of_loops.notes[0].endswith("as a hint; record more, each with a seed of its own")
 
 
+def test_other_environments_are_warned_of():
+    lake, cliff = {"id": "FrozenLake-v1", "kwargs": {}}, {"id": "CliffWalking-v1", "kwargs": {}}
+    others = [
+        run(seed, [0, 1], name=name, env=env)
+        for seed in range(5)
+        for name, env in zip("ab", (lake, cliff), strict=True)
+    ]
+    (note,) = result(others).notes
+    assert "FrozenLake-v1 in a, CliffWalking-v1 in b" in note
+    assert result(two_groups([1] * 5, [2] * 5, env=lake)).notes == []
+
+
 def test_runs_of_one_configuration_are_one_group_whatever_they_are_called():
     series = [run(0, [1, 2]), run(1, [1, 2], name="b"), run(2, [1, 2], discount=0.5)]
     groups, _ = grouped(series)

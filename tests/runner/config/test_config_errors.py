@@ -22,6 +22,12 @@ from runner.errors import ConfigError
         ),
         ("epsilonn: 0.5", "2:1: epsilonn: unknown key. Did you mean 'epsilon'?"),
         ("log: {evry_steps: 5}", "2:7: log.evry_steps: unknown key. Did you mean 'every_steps'?"),
+        ("gamma: 0.5", "2:1: gamma: unknown key. Did you mean 'discount'?"),
+        ("learning_rate: 0.5", "2:1: learning_rate: unknown key. Did you mean 'step_size'?"),
+        (
+            "epsilon: {schedule: exponential, start: 1, decay: 0.9}",
+            "2:44: epsilon.decay: unknown key. Did you mean 'factor'?",
+        ),
         ("snapshots: {x: 5}", "2:13: snapshots.x: unknown key. Known: every"),
         ("step_size: 0", "2:1: step_size: found 0, expected a number above 0 and at most 1"),
         ("step_size: .inf", "2:1: step_size: found .inf, expected a number above 0 and at most 1"),
