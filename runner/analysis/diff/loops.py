@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any, Final
 
@@ -38,14 +39,52 @@ def comparable(a: Recording, b: Recording) -> bool:
 
 
 def loop_parting(a: Recording, b: Recording, phase: str = "train") -> Parting | None:
-    """Return the first step of a phase at which two loops part, and the first field of it that differs."""
-    topics = [recording.topic(f"/{phase}/step") for recording in (a, b)]
-    if topics[0] not in a.dtypes:
+    """Return the first step of a phase at which two loops part, and the first field of it that differs.
+
+    If they part in what a reset observed, it is the step after it, and the field is `reset.observation`.
+    """
+    if a.topic(f"/{phase}/step") not in a.dtypes:
         return _message_parting(a, b, phase)
-    streams = [recording.blocks(topic) for recording, topic in zip((a, b), topics, strict=True)]
+    parting = _step_parting(a, b, phase)
+    if a.kind == "step":
+        return parting  # a step has the state before it
+    return _reset_parting(a, b, phase, math.inf if parting is None else parting.step) or parting
+
+
+def _step_parting(a: Recording, b: Recording, phase: str) -> Parting | None:
+    position = 0
+    for left, right in _abreast(a, b, f"/{phase}/step"):
+        if not (len(left) and len(right)):
+            return _end(left, right, position, phase)
+        row, name = _first_difference(left, right)
+        if name:
+            return _parting(left[row], right[row], name, phase)
+        position += len(left)
+    return None
+
+
+def _reset_parting(a: Recording, b: Recording, phase: str, last: float) -> Parting | None:
+    """Return where two loops part in what a reset observed, if that is before the end of the step `last`."""
+    for left, right in _abreast(a, b, f"/{phase}/reset"):
+        if not (len(left) and len(right)) or left["step"][0] > last:
+            return None
+        differs = _rows_differ(left["observation"], right["observation"])
+        if not differs.any():
+            continue
+        one, other = (block[int(differs.argmax())] for block in (left, right))
+        if one["step"] > last:
+            return None
+        part, mine, theirs = _part("reset.observation", one["observation"], other["observation"])
+        step, episode = int(one["step"]), int(one["episode"])
+        return Parting(phase, None, None, step, episode, 0, part, mine.tolist(), theirs.tolist(), None, None)
+    return None
+
+
+def _abreast(a: Recording, b: Recording, topic: str) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    """Yield the records of a topic of both, as many of each; last what one has more, beside nothing."""
+    streams = [recording.blocks(recording.topic(topic)) for recording in (a, b)]
     left: NDArray[Any] = np.empty(0)
     right: NDArray[Any] = np.empty(0)
-    position = 0
     while True:
         left, right = (
             block if len(block) else next(stream, block)
@@ -53,11 +92,10 @@ def loop_parting(a: Recording, b: Recording, phase: str = "train") -> Parting | 
         )
         n = min(len(left), len(right))
         if not n:
-            return _end(left, right, position, phase)
-        rows, name = _first_difference(left[:n], right[:n])
-        if name:
-            return _parting(left[rows], right[rows], name, phase)
-        left, right, position = left[n:], right[n:], position + n
+            yield left, right
+            return
+        yield left[:n], right[:n]
+        left, right = left[n:], right[n:]
 
 
 def _first_difference(left: NDArray[np.void], right: NDArray[np.void]) -> tuple[int, str]:

@@ -140,10 +140,11 @@ def _evaluations(difference: RunDiff) -> Section:
 
 def _of_loops(parting: Parting) -> str:
     phase = "training" if parting.phase == "train" else "evaluation"
-    return (
-        f"They part at {phase} step {parting.step:,}, of episode {parting.episode:,} at time {parting.t:,}: "
-        f"{spoken(parting.field)} is {_text(parting.a)} in A, {_text(parting.b)} in B."
-    )
+    where = f"at {phase} step {parting.step:,}, of episode {parting.episode:,} at time {parting.t:,}"
+    field = parting.field.removeprefix("reset.")
+    if field != parting.field:
+        where = f"in the reset before {phase} step {parting.step:,}, of episode {parting.episode:,}"
+    return f"They part {where}: {spoken(field)} is {_text(parting.a)} in A, {_text(parting.b)} in B."
 
 
 def _told(parting: Parting, cause: Cause) -> list[str]:

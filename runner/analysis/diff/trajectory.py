@@ -43,6 +43,7 @@ class Parting:
     """Training episode, or trial within the evaluation."""
     t: int
     field: str
+    """Of the step; or `reset.observation`, of the reset before it."""
     a: Any
     b: Any
     a_step: np.void | None

@@ -156,6 +156,41 @@ class Pictures(gymnasium.Env[Any, Any]):
         return {"picture": picture}, 0.0, True, False, {}
 
 
+class Starts(gymnasium.Env[Any, Any]):
+    """Begins one of its episodes where it is told, and otherwise is always the same."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, start: float) -> None:
+        self.start, self.episode = start, -1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.episode, self.t = self.episode + 1, 0
+        return np.full(2, self.start if self.episode == 2 else 0, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        return np.ones(2, np.float32), 0.0, self.t == 3, False, {}
+
+
+def test_diff_names_the_reset_in_which_loops_part(tmp_path):
+    for start, actions in ((0.25, 0), (0.75, 0), (0.5, 1)):
+        with runner.record(Starts(start), tmp_path, name=f"at{start:g}") as env:
+            for episode in range(4):
+                env.reset()
+                for _ in range(3):
+                    env.step(actions if episode == 2 else 0)
+    for other in ("at0.75", "at0.5"):  # the actions of the last differ too, but after the reset
+        told = dualtaxi(tmp_path, "diff", "at0.25", other)
+        assert (
+            f"in the reset before training step 6, of episode 2: observation is 0.25, 0.25 in A, {other[2:]}"
+            in (told.stdout.replace("[", "").replace("]", ""))
+        )
+    parted = json.loads(dualtaxi(tmp_path, "diff", "at0.25", "at0.5", "--json").stdout)["parting"]
+    assert (parted["step"], parted["episode"], parted["field"]) == (6, 2, "reset.observation")
+
+
 def test_diff_of_pictures_tells_the_number_that_differs(tmp_path):
     for number in (7, 8):
         with runner.record(Pictures(number), tmp_path, name=f"of{number}") as env:
