@@ -50,6 +50,16 @@ def read_labels(folder: Path) -> Labels:
     return labels_from(found)
 
 
+def are_readable(folder: Path) -> bool:
+    """Return whether it can be known what is said of the run in a folder: a damaged file may say `keep`."""
+    try:
+        return isinstance(read_object(folder / LABELS_FILE, MAX_LABELS_BYTES).get("tags", []), list)
+    except FileNotFoundError:
+        return True
+    except (OSError, ValueError):
+        return False
+
+
 def labels_from(found: Mapping[str, Any]) -> Labels:
     """Return what is said by a JSON object; what cannot be understood counts as not said."""
     name, tags, note = found.get("name"), found.get("tags"), found.get("note")

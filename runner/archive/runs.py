@@ -68,7 +68,7 @@ def archive_run(
     target = target_of(to)
     with owned(run, archived=True) as current:
         if current.status == "archived":
-            raise RunnerError(f"run {run.run_id} is archived already, in {current.archive['target']}.")
+            raise RunnerError(f"run {run.run_id} is archived already, in {current.archive.get('target')}.")
         return _Archiving(current, target, report).do(remove, dry_run)
 
 

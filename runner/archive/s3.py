@@ -75,7 +75,7 @@ class S3Target:
         """Upload the parts of every file, complete all of them, and put the manifest."""
         data = (folder / layout.MANIFEST).read_bytes()
         files = read_manifest(data, str(folder)).files
-        with self._reaching():
+        with self._reaching(" An upload that was cut off goes on when the same command is given again."):
             uploads = [
                 _Upload(self._client, self._bucket, self._key(run_id, name), folder / name, entry)
                 for name, entry in files.items()
@@ -122,15 +122,13 @@ class S3Target:
         return "/".join(part for part in (self._prefix, *parts) if part)
 
     @contextlib.contextmanager
-    def _reaching(self) -> Iterator[None]:
-        """Tell in our words that the storage cannot be reached, or refuses."""
+    def _reaching(self, advice: str = "") -> Iterator[None]:
+        """Tell in our words that the storage cannot be reached, or refuses; and what is to be done."""
         try:
             yield
         except (BotoCoreError, Boto3Error, ClientError, OSError, ValueError) as error:
-            raise StorageError(
-                f"{S3}{self._bucket}/{self._prefix}: {error}. An upload that was cut off goes on when the "
-                "same command is given again."
-            ) from error
+            told = str(error).removesuffix(".")
+            raise StorageError(f"{S3}{self._bucket}/{self._prefix}: {told}.{advice}") from error
 
 
 class _Upload:

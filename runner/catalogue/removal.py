@@ -22,7 +22,7 @@ from runner.catalogue.index import Index
 from runner.catalogue.rows import Row
 from runner.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
 from runner.errors import RunnerError, StorageError
-from runner.labels import KEEP
+from runner.labels import KEEP, LABELS_FILE, are_readable
 from runner.owning import owned
 from runner.runs import RECORDING_FILE, Run
 
@@ -177,6 +177,8 @@ def _protected(run: Run) -> str:
         return "it is running; wait for its end, or interrupt it"
     if KEEP in run.tags:
         return f"it is tagged {KEEP}; `dualtaxi tag {run.run_id} --remove {KEEP}` lets it go"
+    if not are_readable(run.folder):
+        return f"{run.folder / LABELS_FILE} cannot be read, and may say {KEEP}; mend it, or remove that file"
     return ""
 
 

@@ -12,6 +12,7 @@ from runner.cli.output import draw, facts, print_json, say, size
 
 if TYPE_CHECKING:
     from runner.archive.runs import Archived
+    from runner.runs import Run
 
 
 @click.command("archive")
@@ -53,7 +54,7 @@ def command(
     from runner.runs import recordings_folder
 
     target = to or default_target(recordings_folder(recordings))
-    for run in [find(name, recordings) for name in dict.fromkeys(run_names)]:
+    for run in _to_do([find(name, recordings) for name in dict.fromkeys(run_names)]):
         with announcing(), steps_line(f"archiving {run.run_id}") as report:
             done = archive_run(run, target, remove, report, dry_run)
         if as_json:
@@ -62,6 +63,17 @@ def command(
             draw(facts(_in_words(done)))
             if dry_run:
                 say("Nothing was kept: a dry run.")
+
+
+def _to_do(runs: list[Run]) -> list[Run]:
+    """Return the runs that are not in an archive alone; if all are, all, which is refused."""
+    left = [run for run in runs if run.status != "archived"]
+    if not left:
+        return runs
+    for run in runs:
+        if run not in left:
+            say(f"Run {run.run_id} is archived already, in {run.archive.get('target')}.")
+    return left
 
 
 def _as_json(done: Archived, dry_run: bool) -> dict[str, Any]:

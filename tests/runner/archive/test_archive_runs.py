@@ -15,7 +15,7 @@ from runner.owner import owner as this_process
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.runs import create_run, find_run, list_runs
-from tests.runner.recording.making import TAXIS, experiment
+from tests.runner.recording.making import TAXIS, experiment, make_run
 
 
 @pytest.fixture
@@ -168,6 +168,15 @@ def test_a_running_run_and_an_archived_one_are_refused(run, recordings, command)
         assert "is archived" in result.output
     done(command("restore", run.run_id))
     assert "is not archived" in command("restore", run.run_id).output
+
+
+def test_archiving_several_goes_on_behind_those_that_are_archived_already(run, recordings, command):
+    other = make_run(recordings, TAXIS, seed=1)
+    done(command("archive", run.run_id, "--remove"))
+    result = command("archive", run.run_id, other.run_id, "--remove")
+    assert f"Run {run.run_id} is archived already" in result.stderr
+    assert other.run_id in done(result)
+    assert find_run(other.run_id, recordings).status == "archived"
 
 
 def test_a_damaged_recording_is_refused_and_repair_is_named(run, recordings, command):

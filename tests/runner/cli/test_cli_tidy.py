@@ -220,6 +220,18 @@ def test_rm_refuses_what_is_to_stay_and_then_removes_nothing(command, make):
     assert there(command) == {run.run_id for run in (free, kept, busy, running)}
 
 
+@pytest.mark.parametrize("damaged", ['{"tags": ["keep"', '{"tags": 3}', "[]"])
+def test_what_may_have_been_tagged_keep_stays(command, make, damaged):
+    run = make()
+    (run.folder / "labels.json").write_text(damaged)
+    for words in (("rm", run.run_id, "--yes"), ("prune", "config:*", "--yes")):
+        assert "labels.json cannot be read, and may say keep" in " ".join(command(*words).stderr.split())
+    assert there(command) == {run.run_id}
+    (run.folder / "labels.json").unlink()
+    command("rm", run.run_id, "--yes")
+    assert there(command) == set()
+
+
 def test_rm_leaves_strange_files_unless_forced(command, make):
     run = make()
     (run.folder / "thesis.tex").write_text("years of work")
