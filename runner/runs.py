@@ -339,7 +339,12 @@ def the_one(name: str, runs: Sequence[AnyNamed], recordings: Path) -> AnyNamed:
             for run in found[:_TOLD]
         )
         more = f"\n  and {len(found) - _TOLD:,} more" if len(found) > _TOLD else ""
-        raise RunNotFound(f"{name!r} answers to {len(found)} runs; name one by its id:\n{several}{more}")
+        newest = (
+            f", or the newest of this name by {name}@latest" if any(run.name == name for run in found) else ""
+        )
+        raise RunNotFound(
+            f"{name!r} answers to {len(found)} runs; name one by its id{or_newest}:\n{several}{more}"
+        )
     hint = nearest(name, {run.name for run in runs} | {run.run_id for run in runs})
     raise RunNotFound(
         f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {len(runs):,} there are."

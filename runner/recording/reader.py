@@ -382,7 +382,10 @@ class Recording:
             last = self.episodes(phase, ended - 1, ended)
             start, stop = int(last[0]["last_step"]) + 1 if len(last) else 0, total
         if not 0 <= start < stop <= total:
-            raise RecordingError(f"{self.path}: has no {phase} episode {episode}; there are {ended}, from 0.")
+            phased = {"train": "training", "eval": "evaluation"}[phase]
+            raise RecordingError(
+                f"{self.path}: has no {phased} episode {episode}; there are {ended}, from 0."
+            )
         if (stop - start) * self.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
             raise RecordingError(
                 f"{self.path}: {phase} episode {episode} has {stop - start:,} steps, too many to be given "

@@ -45,7 +45,7 @@ class Repair:
     kept: dict[str, int] = field(default_factory=dict)
     """Messages kept, by topic."""
     lost: dict[str, list[list[int]]] = field(default_factory=dict)
-    """Messages lost, by topic: [first, behind the last] numbers of each hole."""
+    """Messages lost, now or in an earlier repair, by topic: [first, behind the last] numbers of each hole."""
     torn_steps: int = 0
     """Steps in a chunk that was cut off at the end."""
     lost_bytes: int = 0
@@ -68,7 +68,7 @@ def repair(path: Path) -> Repair:
     """
     with contextlib.suppress(RecordingError):
         check_integrity(path)
-        return Repair(path, was_whole=True)
+        return Repair(path, was_whole=True, lost=_lost_before(path))
     fresh = path.with_suffix(".repairing")
     try:
         fresh.unlink(missing_ok=True)
@@ -85,6 +85,13 @@ def repair(path: Path) -> Repair:
         _remove(fresh)
         raise
     return done
+
+
+def _lost_before(path: Path) -> dict[str, list[list[int]]]:
+    """Return what an earlier repair of a file could not save."""
+    with contextlib.suppress(RecordingError), open_recording(path) as recording:
+        return recording.lost
+    return {}
 
 
 def _salvaged(path: Path, fresh: Path) -> Repair:

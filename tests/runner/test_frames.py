@@ -90,7 +90,7 @@ def test_parts_are_read_alone(run):
     assert frames.steps(run, "eval", start=7, stop=19)["step"].tolist() == list(range(7, 19))
     assert frames.steps(run, "eval", episode=6).equals(every[every["episode"] == 6].reset_index(drop=True))
     assert frames.episodes(run, "train", 3, 5)["episode"].tolist() == [3, 4]
-    with pytest.raises(RecordingError, match="no eval episode 200"):
+    with pytest.raises(RecordingError, match="no evaluation episode 200"):
         frames.steps(run, "eval", episode=200)
 
 

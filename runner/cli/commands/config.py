@@ -29,7 +29,8 @@ def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     """Check the file CONFIG and print what it means, with every value spelled out.
 
     What is printed is a configuration again. Problems are told with file, line, column and key, all at
-    once; the exit code is then 2.
+    once; the exit code is then 2. Whether there is such an environment is not looked up: `dualtaxi run`
+    does so before it begins.
 
     \b
     Examples:

@@ -77,13 +77,14 @@ def command(
     from runner.export import report_replay as replay
     from runner.export.gif import require_packages, require_states, write_gif
     from runner.export.places import write_new
-    from runner.export.report_runs import shortcomings, state_of
+    from runner.export.report_runs import require_steps, shortcomings, state_of
     from runner.recording.reader import open_recording
 
     require_packages()
     said: list[int] = []
     with open_recording(find_recorded(run_name, recordings).recording) as recording:
         require_states(recording)
+        require_steps(recording)
         if episode is None and trial is None and replay.last_whole_evaluation(recording) is None:
             episode = replay.last_episode(recording)
             say(f"There is no whole evaluation: this is the last training episode, {episode:,}.")

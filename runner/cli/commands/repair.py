@@ -50,7 +50,7 @@ def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json:
     the middle was lost, the damaged file is kept beside it. What was lost is said; `dualtaxi resume`
     brings it back.
 
-    Exit code 1 if anything was lost.
+    Exit code 1 if anything was lost, also in an earlier repair.
 
     \b
     Examples:
@@ -89,8 +89,11 @@ def _tell_run(run: Run) -> None:
 
 def _in_words(done: Repair, run: Run | None) -> dict[str, str]:
     told = {"recording": str(done.path)}
-    if done.was_whole:
+    if done.was_whole and done.lossless:
         return told | {"verdict": "whole; there was nothing to do"}
+    if done.was_whole:
+        told["verdict"] = "repaired before, when not all could be saved; there was nothing to do"
+        return told | {"lost": "\n".join(_losses(done))} | _next(done, run)
     kept = [f"{count:,} {_WORDS[topic]}" for topic, count in done.kept.items() if topic != "/log"]
     told |= {
         "verdict": "repaired" if done.lossless else "repaired, but not all could be saved",
@@ -100,9 +103,14 @@ def _in_words(done: Repair, run: Run | None) -> dict[str, str]:
         told["lost"] = "\n".join(_losses(done))
     if done.original is not None:
         told["damaged"] = f"{done.original} is kept"
-    if run is not None and not done.lossless and "made_by" not in run.facts.get("config", {}):
-        told["next"] = f"dualtaxi resume {run.run_id}"
-    return told
+    return told | _next(done, run)
+
+
+def _next(done: Repair, run: Run | None) -> dict[str, str]:
+    """Return what brings back what was lost, if anything does: a loop cannot be done again here."""
+    if run is None or done.lossless or "made_by" in run.facts.get("config", {}):
+        return {}
+    return {"next": f"dualtaxi resume {run.run_id}"}
 
 
 def _losses(done: Repair) -> list[str]:

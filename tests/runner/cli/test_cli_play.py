@@ -70,7 +70,7 @@ def test_a_trial_of_an_evaluation(recorded, recorded_run, trial, number):
         (["--eval", "20:5"], "expected one from 0 to 4"),
         (["--eval", "x"], "expected N:TRIAL"),
         (["--eval", "3:x"], "expected N:TRIAL"),
-        (["--episode", "30"], "no train episode 30"),
+        (["--episode", "30"], "no training episode 30"),
         (["--episode", "-1"], "--episode"),
         (["--speed", "0"], "--speed"),
         (["--episode", "1", "--eval", "20:0"], "exclude each other"),

@@ -237,6 +237,11 @@ def test_repair_tells_what_was_lost_and_resume_brings_it_back(command, copied, r
     assert command.json("ls")[0]["status"] == "interrupted"
     assert command("show", copied.run_id).exit_code == 0
     assert command("verify", copied.run_id).exit_code == 1
+    again = command("repair", copied.run_id)
+    assert again.exit_code == 1
+    assert "repaired before" in again.stdout
+    assert "training steps 0 to " in again.stdout
+    assert f"dualtaxi resume {copied.run_id}" in again.stdout
     assert command("qtable", copied.run_id, "--step", 5).exit_code == 2
     told = command.json("resume", copied.run_id)
     assert told["content_digest"] == recorded_run.summary["content_digest"]

@@ -123,7 +123,9 @@ def test_an_interrupted_run_is_shown_as_far_as_it_got(pictured, tmp_path, share)
 
 def test_what_is_not_there_is_refused(pictured, tmp_path):
     path = tmp_path / "r.html"
-    assert "no train episode 999" in report(pictured("lake").recording, "--episode", 999, "-o", path).stderr
+    assert (
+        "no training episode 999" in report(pictured("lake").recording, "--episode", 999, "-o", path).stderr
+    )
     assert not path.exists()
     path.write_text("mine")
     assert "--force" in report(pictured("lake").recording, "-o", path).stderr
