@@ -339,7 +339,7 @@ def the_one(name: str, runs: Sequence[AnyNamed], recordings: Path) -> AnyNamed:
             for run in found[:_TOLD]
         )
         more = f"\n  and {len(found) - _TOLD:,} more" if len(found) > _TOLD else ""
-        newest = (
+        or_newest = (
             f", or the newest of this name by {name}@latest" if any(run.name == name for run in found) else ""
         )
         raise RunNotFound(

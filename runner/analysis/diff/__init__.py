@@ -198,9 +198,11 @@ def _notes(a: Recording, b: Recording) -> list[str]:
     for name, recording in (("A", a), ("B", b)):
         if recording.result.get("status") != "finished":
             notes.append(f"{name} is not finished: compared as far as it got")
-        if not recording.count(schema.TRAIN_STEP):
+        if recording.kind == "job" and recording.config["recording"]["steps"] == "none":
             again = f"`dualtaxi rerecord {recording.run['run_id']}` records them"
             notes.append(f"{name} holds no steps, so no trajectory is compared; {again}")
+        elif not recording.count(schema.TRAIN_STEP):
+            notes.append(f"{name} has no training steps, so no trajectory of training is compared")
         whole = unbroken(recording, "train")[0]
         if whole < recording.count(schema.TRAIN_STEP):
             notes.append(f"{name} lost steps from step {whole:,} on: training is compared up to there")

@@ -163,6 +163,12 @@ def test_without_steps_only_the_rest_is_compared(compare):
     assert difference.tables
 
 
+def test_what_never_trained_is_not_to_be_recorded_again(compare):
+    notes = " ".join(compare("episodes=0").notes)
+    assert "B has no training steps" in notes
+    assert "rerecord" not in notes
+
+
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_an_altered_step_is_the_first_difference(record, data):
