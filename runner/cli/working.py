@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import shlex
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -68,6 +70,14 @@ def at_work(label: str, episodes: int) -> Iterator[tuple[Report, Interrupt]]:
         announcing(),
     ):
         yield report, interrupt
+
+
+def in_folder(run: Run) -> str:
+    """Return what a command that is suggested needs to find a run: nothing, if it is in the usual folder."""
+    root = run.folder.parent
+    if root.absolute() == recordings_folder().absolute():
+        return ""
+    return f" --recordings {shlex.quote(os.fspath(root))}"
 
 
 def run_as_json(run: Run) -> dict[str, Any]:

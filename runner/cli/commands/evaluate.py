@@ -10,7 +10,7 @@ import click
 from runner.cli import INTERRUPTED
 from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, print_json, say
-from runner.cli.working import at_work, run_as_json, run_in_words
+from runner.cli.working import at_work, in_folder, run_as_json, run_in_words
 
 if TYPE_CHECKING:
     from runner.runs import Run
@@ -100,4 +100,4 @@ def _summarise(run: Run, origin: dict[str, object]) -> None:
         )
     told = run_in_words(run)
     told |= {"table": f"of run {origin['run']} after {origin['step']:,} training steps"}
-    draw(table, "", facts(told | {"next": f"dualtaxi play {run.run_id} --eval 0:0"}))
+    draw(table, "", facts(told | {"next": f"dualtaxi play {run.run_id} --eval 0:0{in_folder(run)}"}))

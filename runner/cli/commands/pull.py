@@ -42,6 +42,7 @@ def command(
       dualtaxi pull k3v9m2xq --server https://runs.example.org --token-file ~/.dualtaxi-token
     """  # noqa: D301 - Click wants the backspace itself
     from runner.cli.progress import bytes_line
+    from runner.cli.working import in_folder
     from runner.runs import recordings_folder
     from runner.service.address import found_token
     from runner.service.client import Client
@@ -67,7 +68,7 @@ def command(
                 "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
                 "digest": pulled.content_digest,
                 "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
-                "next": f"dualtaxi show {run.run_id}",
+                "next": f"dualtaxi show {run.run_id}{in_folder(run)}",
             }
         )
     )

@@ -14,7 +14,7 @@ import click
 from runner.cli import INTERRUPTED
 from runner.cli.options import config_argument, json_option, recordings_option, set_option
 from runner.cli.output import amount, duration, print_json, say, size
-from runner.cli.working import announcing, run_as_json
+from runner.cli.working import announcing, in_folder, run_as_json
 
 if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
     from rich.console import RenderableType
@@ -255,11 +255,12 @@ def _result(run: Run, evaluated: int | None) -> dict[str, str]:
     steps = (summary["train_steps"] + summary["eval_steps"]) * summary["steps_recorded"]
     each = f", {summary['bytes'] / steps:.0f} bytes a step" if steps else ""
     play = f"--eval {evaluated}:0" if evaluated is not None else "--episode 0"
+    folder = in_folder(run)
     return {
         "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
         "steps": f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation, "
         f"in {duration(summary['seconds'])}",
         "digest": summary["content_digest"],
         "file": f"{run.recording}  {size(summary['bytes'])}{each}",
-        "next": f"dualtaxi show {run.run_id}\ndualtaxi play {run.run_id} {play}",
+        "next": f"dualtaxi show {run.run_id}{folder}\ndualtaxi play {run.run_id} {play}{folder}",
     }

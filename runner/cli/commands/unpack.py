@@ -28,6 +28,7 @@ def command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) ->
       dualtaxi unpack quick-k3v9m2xq.dualtaxi
       dualtaxi unpack quick-k3v9m2xq.dualtaxi --as-new --recordings from_anna
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.working import in_folder
     from runner.packing.unpacking import unpack
     from runner.runs import recordings_folder
 
@@ -48,7 +49,7 @@ def command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) ->
                 "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
                 "digest": digest,
                 "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
-                "next": f"dualtaxi show {run.run_id}",
+                "next": f"dualtaxi show {run.run_id}{in_folder(run)}",
             }
         )
     )

@@ -6,6 +6,7 @@ import getpass
 import json
 import os
 import re
+import shlex
 import shutil
 import socket
 import tarfile
@@ -13,10 +14,12 @@ from pathlib import Path
 
 import pytest
 from blake3 import blake3
+from click.testing import CliRunner
 from mcap.reader import make_reader
 from mcap.records import Attachment, Message, Metadata
 from mcap.stream_reader import StreamReader
 
+from runner.cli import cli
 from runner.errors import RecordingError, RunnerError
 from runner.labels import Labels, change_labels, read_labels
 from runner.packing.packing import pack
@@ -225,11 +228,19 @@ def test_an_anonymous_pack_tells_of_a_path_that_belongs_to_the_job(lake, tmp_pat
     assert str(lake.recording) in note
 
 
+def test_what_is_suggested_finds_the_run_in_its_folder(lake, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DUALTAXI_RECORDINGS", "usual")
+    packed = str(pack(lake, tmp_path / "a.dualtaxi").path)
+    usual = CliRunner().invoke(cli, ["unpack", packed]).stdout
+    assert usual.splitlines()[-1] == f"next    dualtaxi show {lake.run_id}"
+    theirs = CliRunner().invoke(cli, ["unpack", packed, "--recordings", "of anna"]).stdout
+    words = shlex.split(" ".join(theirs.partition("dualtaxi ")[2].split()))
+    assert CliRunner().invoke(cli, words).exit_code == 0
+    assert words[-2] == "--recordings"
+
+
 def test_the_commands(lake, tmp_path, monkeypatch):
-    from click.testing import CliRunner
-
-    from runner.cli import cli
-
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("DUALTAXI_RECORDINGS", str(lake.folder.parent))
     told = CliRunner().invoke(cli, ["pack", lake.run_id, "--json"])
