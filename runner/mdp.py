@@ -9,6 +9,7 @@ knows which environment it was.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import importlib
@@ -162,7 +163,8 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
     """
     env = _make(env_id, dict(kwargs) | ({"competitive": True} if rewards == "individual" else {}))
     try:
-        mdp = _read(env_id, kwargs, env, rewards)
+        with contextlib.closing(env):
+            mdp = _read(env_id, kwargs, env, rewards)
     except EnvironmentNotUsable:
         raise
     except Exception as error:  # its attributes may raise anything
@@ -170,8 +172,6 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
             f"environment {env_id!r}: what it tells of itself cannot be read "
             f"({type(error).__name__}: {error}); docs/architecture.md says what is expected."
         ) from error
-    finally:
-        env.close()
     _check(mdp)
     if rewards == "individual" and mdp.rewards.shape[-1] != len(mdp.agents):
         raise _one_reward_only(env_id)

@@ -155,6 +155,18 @@ RAISING = {
         "import gymnasium\ngymnasium.register('Town-v0', lambda: 1 / 0)",
         r"cannot be made with no arguments: ZeroDivisionError",
     ),
+    "as it is asked": (
+        "import gymnasium\nfrom gymnasium.envs.toy_text import FrozenLakeEnv\n"
+        "class Town(FrozenLakeEnv):\n    @property\n    def agents(self):\n        raise OSError('shut')\n"
+        "gymnasium.register('Town-v0', Town)",
+        r"cannot be read \(OSError: shut\); docs/architecture",
+    ),
+    "as it is closed": (
+        "import gymnasium\nfrom gymnasium.envs.toy_text import FrozenLakeEnv\n"
+        "class Town(FrozenLakeEnv):\n    def close(self):\n        raise RuntimeError('shut')\n"
+        "gymnasium.register('Town-v0', Town)",
+        r"cannot be read \(RuntimeError: shut\); docs/architecture",
+    ),
 }
 
 
