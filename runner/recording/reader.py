@@ -372,8 +372,9 @@ class Recording:
         topic, episodes = self.topic(f"/{phase}/step"), self.topic(f"/{phase}/episode")
         stride = self.environments
         total, ended = self.count(topic), self.count(episodes)
+        phased = {"train": "training", "eval": "evaluation"}[phase]
         if not total:
-            raise RecordingError(f"{self.path}: has no {phase} steps.")
+            raise RecordingError(f"{self.path}: has no {phased} steps.")
         start = stop = 0
         if 0 <= episode < ended and len(records := self.episodes(phase, episode, episode + 1)):
             stop = int(records[0]["last_step"]) + 1
@@ -382,7 +383,6 @@ class Recording:
             last = self.episodes(phase, ended - 1, ended)
             start, stop = int(last[0]["last_step"]) + 1 if len(last) else 0, total
         if not 0 <= start < stop <= total:
-            phased = {"train": "training", "eval": "evaluation"}[phase]
             raise RecordingError(
                 f"{self.path}: has no {phased} episode {episode}; there are {ended}, from 0."
             )

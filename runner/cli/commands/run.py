@@ -254,7 +254,13 @@ def _result(run: Run, evaluated: int | None) -> dict[str, str]:
     summary = run.summary
     steps = (summary["train_steps"] + summary["eval_steps"]) * summary["steps_recorded"]
     each = f", {summary['bytes'] / steps:.0f} bytes a step" if steps else ""
-    play = f"--eval {evaluated}:0" if evaluated is not None else "--episode 0"
+    more = [f"show {run.run_id}"]
+    if not summary["steps_recorded"]:
+        more += [f"rerecord {run.run_id}"] * (run.status == "finished")
+    elif evaluated is not None:
+        more.append(f"play {run.run_id} --eval {evaluated}:0")
+    elif summary["train_steps"]:
+        more.append(f"play {run.run_id} --episode 0")
     folder = in_folder(run)
     return {
         "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
@@ -262,5 +268,5 @@ def _result(run: Run, evaluated: int | None) -> dict[str, str]:
         f"in {duration(summary['seconds'])}",
         "digest": summary["content_digest"],
         "file": f"{run.recording}  {size(summary['bytes'])}{each}",
-        "next": f"dualtaxi show {run.run_id}{folder}\ndualtaxi play {run.run_id} {play}{folder}",
+        "next": "\n".join(f"dualtaxi {one}{folder}" for one in more),
     }

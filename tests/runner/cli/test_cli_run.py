@@ -62,11 +62,21 @@ def test_the_summary_says_what_came_of_it_and_what_to_type_next(command, tiny):
     assert all(line == line.rstrip() for line in result.stdout.splitlines())
 
 
-def test_what_it_tells_to_type_next_works(command, tiny):
-    result = command("run", tiny)
+@pytest.mark.parametrize(
+    "settings", ["log.window=40", "recording.steps=none", "evaluation=null", "episodes=0"]
+)
+def test_what_it_tells_to_type_next_works(command, tiny, settings):
+    result = command("run", tiny, "--set", settings)
+    assert "dualtaxi show" in result.stdout
     for line in result.stdout.splitlines():
         if "dualtaxi " in line:
             assert command(*line.partition("dualtaxi ")[2].split()).exit_code == 0
+
+
+def test_what_has_no_episode_is_not_said_to_be_played(command, tiny):
+    assert (
+        "dualtaxi play" not in command("run", tiny, "--set", "evaluation=null", "--set", "episodes=0").stdout
+    )
 
 
 def test_an_environment_that_cannot_be_used_is_told_before_any_estimate(command, tiny):

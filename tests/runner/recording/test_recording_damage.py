@@ -126,7 +126,7 @@ def test_the_steps_of_an_episode_that_never_ended_are_given(tmp_path):
         assert len(steps) == recording.count(schema.TRAIN_STEP) > 100
         with pytest.raises(RecordingError, match="no training episode 1"):
             recording.episode_steps("train", 1)
-        with pytest.raises(RecordingError, match="no eval steps"):
+        with pytest.raises(RecordingError, match="no evaluation steps"):
             recording.episode_steps("eval", 0)
 
 
