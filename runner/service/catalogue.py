@@ -21,6 +21,8 @@ Found = TypeVar("Found")
 
 FRESH_SECONDS: Final = 1.0
 """Folders that were looked at so recently are not looked at again; up to five, where that takes long."""
+AGAIN_SECONDS: Final = 0.1
+"""A run that is not known is looked for in the folders, unless they were looked at so recently."""
 SHARE: Final = 20
 """One part in so many of the time is spent on looking."""
 MOST_SECONDS: Final = 5.0
@@ -83,7 +85,14 @@ class Catalogue:
             known = run_at_once(name, root)
             if known is not None:
                 return known
-        return _read(the_one(name, self._candidates(), self.roots[0]))
+        try:
+            found = the_one(name, self._candidates(), self.roots[0])
+        except RunNotFound:
+            if time.monotonic() - self._looked < AGAIN_SECONDS:
+                raise
+            self.changed()  # it may be newer than the last look
+            found = the_one(name, self._candidates(), self.roots[0])
+        return _read(found)
 
     def find_all(self, name: str) -> list[Run]:
         """Return all runs of a name, the oldest first; else the one that answers to it.

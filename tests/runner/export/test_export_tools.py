@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import warnings
 from pathlib import Path
@@ -50,6 +51,9 @@ def killed(folder, taxis):
 def export(tmp_path, monkeypatch):
     """The command, in an empty folder."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv(
+        "MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path}/mlflow.db"
+    )  # MLflow keeps stores open, by name
 
     def call(*words, code=0):
         result = CliRunner().invoke(cli, ["export", *map(str, words)])
@@ -205,7 +209,8 @@ def read_mlflow():
         warnings.simplefilter("ignore")
         from mlflow.tracking import MlflowClient
 
-        client = MlflowClient(tracking_uri="sqlite:///mlflow.db", registry_uri="sqlite:///mlflow.db")
+        store = os.environ["MLFLOW_TRACKING_URI"]
+        client = MlflowClient(tracking_uri=store, registry_uri=store)
         experiment = client.get_experiment_by_name("dualtaxi")
         return [read_run(client, run) for run in client.search_runs([experiment.experiment_id])]
 

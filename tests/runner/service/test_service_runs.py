@@ -6,6 +6,7 @@ import json
 
 from click.testing import CliRunner
 
+import runner
 from runner.cli import cli
 
 
@@ -50,3 +51,9 @@ def test_a_parameter_that_cannot_be_is_named(client):
     answer = client.get("/api/v1/runs", params={"limit": "many"})
     assert answer.status_code == 422
     assert answer.json()["error"]["problems"][0]["path"] == "query.limit"
+
+
+def test_a_run_begun_after_the_folders_were_looked_at_is_found_at_once(client, recordings):
+    assert client.get("/api/v1/runs/fresh").status_code == 404
+    runner.run({"name": "fresh", "env": {"id": "FrozenLake-v1"}, "episodes": 300}, recordings=recordings)
+    assert client.get("/api/v1/runs/fresh").json()["name"] == "fresh"
