@@ -22,7 +22,7 @@ Found = TypeVar("Found")
 FRESH_SECONDS: Final = 1.0
 """Folders that were looked at so recently are not looked at again; up to five, where that takes long."""
 AGAIN_SECONDS: Final = 0.1
-"""A run that is not known is looked for in the folders, unless they were looked at so recently."""
+"""A run that is not known is looked for in the folders so long after they were last looked at."""
 SHARE: Final = 20
 """One part in so many of the time is spent on looking."""
 MOST_SECONDS: Final = 5.0
@@ -88,8 +88,7 @@ class Catalogue:
         try:
             found = the_one(name, self._candidates(), self.roots[0])
         except RunNotFound:
-            if time.monotonic() - self._looked < AGAIN_SECONDS:
-                raise
+            time.sleep(max(0.0, self._looked + AGAIN_SECONDS - time.monotonic()))
             self.changed()  # it may be newer than the last look
             found = the_one(name, self._candidates(), self.roots[0])
         return _read(found)

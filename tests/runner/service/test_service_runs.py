@@ -56,4 +56,4 @@ def test_a_parameter_that_cannot_be_is_named(client):
 def test_a_run_begun_after_the_folders_were_looked_at_is_found_at_once(client, recordings):
     assert client.get("/api/v1/runs/fresh").status_code == 404
     runner.run({"name": "fresh", "env": {"id": "FrozenLake-v1"}, "episodes": 300}, recordings=recordings)
-    assert client.get("/api/v1/runs/fresh").json()["name"] == "fresh"
+    assert client.get("/api/v1/runs/fresh").status_code == 200
