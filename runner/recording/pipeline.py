@@ -2,11 +2,13 @@
 
     send(records) -> encoder threads (checksum, compression) -> writer thread (digest, file)
 
-Work reaches the digest and the file in the order it was sent; how much can be under way is bounded.
+Work reaches the digest and the file in the order it was sent; how much can be under way is bounded. Where
+there is one processor for all, whoever sends does it: handing it over would only cost.
 """
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -46,20 +48,28 @@ class Pipeline:
     Args:
         file: where chunks go; None for the digest alone.
         packing: how chunks are packed.
-        beat: called about once a second from the writer's thread.
+        beat: called about once a second from the writer's thread, or when something is sent.
+        threads: False has the sender do the work.
     """
 
-    def __init__(self, file: RecordingFile | None, packing: Packing, beat: Callable[[], None]) -> None:
+    def __init__(
+        self, file: RecordingFile | None, packing: Packing, beat: Callable[[], None], threads: bool = True
+    ) -> None:
         self.hash = ContentHash()
         self.failure: BaseException | None = None
-        """What went wrong in the writer's thread; from then on nothing more is written."""
+        """What went wrong while writing; from then on nothing more is written."""
         self._file = file
         self._packing = packing
         self._beat = beat
-        self._encoders = ThreadPoolExecutor(ENCODERS, thread_name_prefix="encoder")
+        self._closed = False
+        self._last_beat = self._last_sync = time.monotonic()
+        self._encoders: ThreadPoolExecutor | None = None
+        self._writer: threading.Thread | None = None
         self._work: queue.Queue[_Work | None] = queue.Queue(maxsize=WORK_UNDER_WAY)
-        self._writer = threading.Thread(target=self._run, name="recording-writer", daemon=True)
-        self._writer.start()
+        if threads:
+            self._encoders = ThreadPoolExecutor(ENCODERS, thread_name_prefix="encoder")
+            self._writer = threading.Thread(target=self._run, name="recording-writer", daemon=True)
+            self._writer.start()
 
     def send(
         self,
@@ -78,19 +88,19 @@ class Pipeline:
             log_times: nanoseconds, one a record.
             offsets: where each begins.
             write: False leaves them out of the file; the digest covers them all the same.
-            used: called when they were written, from the writer's thread.
+            used: called when they were written, by who writes.
         """
         chunk = None
         if write and self._file is not None:
             chunk = self._encode(encode_chunk, topic, records, log_times, offsets, self._packing)
-        self._work.put(_Work(topic, records, chunk, used))
+        self._hand_over(_Work(topic, records, chunk, used))
 
     def submit(self, topic: Topic, make: Callable[[], bytes], log_time: int) -> None:
         """Send one message of a topic on its way that is yet to be made; waits while too many are.
 
         Args:
             topic: its topic; the digest must not cover it.
-            make: returns the message; called by an encoder thread.
+            make: returns the message; called by who encodes.
             log_time: nanoseconds.
         """
         assert not topic.digested
@@ -101,31 +111,38 @@ class Pipeline:
             return encode_chunk(topic, record, times, np.zeros(1, np.uint64), self._packing)
 
         chunk = self._encode(encoded) if self._file is not None else None
-        self._work.put(_Work(topic, memoryview(b""), chunk, lambda: None))
+        self._hand_over(_Work(topic, memoryview(b""), chunk, lambda: None))
 
     @property
     def open(self) -> bool:
         """Whether it takes more: it was not closed."""
-        return self._writer.is_alive()
+        return not self._closed and (self._writer is None or self._writer.is_alive())
 
     def close(self) -> None:
         """Wait until everything sent is written, or was given up after a failure; stop the threads."""
-        if self._writer.is_alive():
+        self._closed = True
+        if self._writer is not None and self._writer.is_alive():
             self._work.put(None)
             self._writer.join()
-        self._encoders.shutdown(cancel_futures=True)
+        if self._encoders is not None:
+            self._encoders.shutdown(cancel_futures=True)
+
+    def _hand_over(self, work: _Work) -> None:
+        if self._writer is None:
+            self._do(work)
+        else:
+            self._work.put(work)
 
     def _encode(self, work: Callable[..., Chunk], *arguments: object) -> Future[Chunk]:
-        """Give work to an encoder thread; when the interpreter is exiting there are none, so do it here."""
-        try:
-            return self._encoders.submit(work, *arguments)
-        except RuntimeError:
-            done: Future[Chunk] = Future()
-            done.set_result(work(*arguments))
-            return done
+        """Give work to an encoder thread; there is none when the interpreter is exiting: then do it here."""
+        if self._encoders is not None:
+            with contextlib.suppress(RuntimeError):
+                return self._encoders.submit(work, *arguments)
+        done: Future[Chunk] = Future()
+        done.set_result(work(*arguments))
+        return done
 
     def _run(self) -> None:
-        last_beat = last_sync = time.monotonic()
         while True:
             try:
                 work = self._work.get(timeout=_BEAT_SECONDS)
@@ -134,19 +151,22 @@ class Pipeline:
                 continue
             if work is None:
                 return
-            now = time.monotonic()
-            try:
-                if self.failure is None:
-                    self._write(work)
-                    if now - last_sync > SYNC_SECONDS and self._file is not None:
-                        self._file.sync()
-                        last_sync = now
-            except BaseException as error:  # handed to the learner's thread
-                self.failure = error
-            work.used()
-            if now - last_beat > _BEAT_SECONDS:
-                self._beat()
-                last_beat = now
+            self._do(work)
+
+    def _do(self, work: _Work) -> None:
+        now = time.monotonic()
+        try:
+            if self.failure is None:
+                self._write(work)
+                if now - self._last_sync > SYNC_SECONDS and self._file is not None:
+                    self._file.sync()
+                    self._last_sync = now
+        except BaseException as error:  # handed to who records
+            self.failure = error
+        work.used()
+        if now - self._last_beat > _BEAT_SECONDS:
+            self._beat()
+            self._last_beat = now
 
     def _write(self, work: _Work) -> None:
         self.hash.update(work.topic, work.records)

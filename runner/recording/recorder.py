@@ -66,8 +66,9 @@ class Recorder:
         chunk_steps: the most steps in a chunk.
         record_steps: False keeps the steps' digest but not the steps.
         past: what the recording already holds.
-        beat: called about once a second while the recorder lives, from its own thread.
+        beat: called about once a second while the recorder lives, by who writes.
         sizes: the fixed-width topics of the recording; those of a job unless given.
+        threads: False packs and writes in the thread that records.
     """
 
     def __init__(
@@ -81,6 +82,7 @@ class Recorder:
         past: Past | None = None,
         beat: Callable[[], None] = lambda: None,
         sizes: Mapping[Topic, schema.Sizes] | None = None,
+        threads: bool = True,
     ) -> None:
         self._file = file
         self._past = past or Past()
@@ -101,7 +103,7 @@ class Recorder:
         self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
         """Messages committed so far, a topic."""
         self._last_flush = time.monotonic()
-        self._pipeline = Pipeline(file, packing or Packing(), beat)
+        self._pipeline = Pipeline(file, packing or Packing(), beat, threads)
         self._piles = Piles(self._pipeline.send)
 
     @property

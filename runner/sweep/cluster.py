@@ -105,7 +105,7 @@ class RayWorkers:
     def give(self, task: Task) -> None:
         """Have an idle worker do a task."""
         actor = self._idle.pop() if self._idle else self._actor.remote()
-        there = replace(task, elsewhere=self._elsewhere)
+        there = replace(task, elsewhere=self._elsewhere, threads=False)
         self._busy[actor.do.remote(there)] = actor, task
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:

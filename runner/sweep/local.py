@@ -6,6 +6,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+from dataclasses import replace
 from multiprocessing import connection
 from typing import Any, Final, Protocol, Self
 
@@ -54,14 +55,15 @@ class LocalWorkers:
 
     def give(self, task: Task) -> None:
         """Have an idle worker do a task."""
+        here = replace(task, threads=self._count < (os.cpu_count() or 1))
         while self._idle:
             worker = self._idle.pop()
-            if worker.ask(task):
+            if worker.ask(here):
                 break
             worker.end()
         else:
             worker = _Worker(self._context, self._stopping)
-            worker.ask(task)  # `collect` finds out if it is gone already
+            worker.ask(here)  # `collect` finds out if it is gone already
         self._busy[worker.pipe] = worker, task
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:

@@ -47,6 +47,8 @@ class Task:
     """Whether to go on with a run that other code began."""
     elsewhere: bool = False
     """Whether to record on the worker's own disk, and to move the run when it is whole."""
+    threads: bool = True
+    """Whether the worker has more than one processor, so that recording may go on beside learning."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ def _run(task: Task, stop: Callable[[], bool]) -> Run:
     run = create_run(Path(task.recordings), job.config, task.seed, task.name)
     with unless_empty(run):
         change_labels(run.folder, lambda _: Labels(tags=tuple(sorted(task.tags))))
-        return watch.labelled(run_job(job, run, watch.report, watch.stop, mdp=mdp))
+        return watch.labelled(run_job(job, run, watch.report, watch.stop, mdp=mdp, threads=task.threads))
 
 
 class _Watch:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import threading
 
 import numpy as np
 import pytest
@@ -179,6 +180,19 @@ def test_the_same_job_twice_is_the_same_content_and_every_seed_another(tmp_path)
     assert [run.seed for run in first] == [3, 4, 5]
 
 
+@pytest.mark.parametrize("parts", [{}, {"recording": {"steps": "none"}}])
+def test_recorded_without_threads_a_run_is_the_same_to_the_byte(parts, tmp_path):
+    config = experiment(TAXIS, parts)
+    beside, alone = (
+        run_job(Job(config, 0), create_run(tmp_path, config, 0), threads=threads) for threads in (True, False)
+    )
+    assert alone.summary["content_digest"] == beside.summary["content_digest"]
+    with open_recording(alone.recording) as one, open_recording(beside.recording) as other:
+        for topic in schema.ALL_TOPICS:
+            assert list(one.messages(topic)) == list(other.messages(topic))
+    assert {thread.name for thread in threading.enumerate()}.isdisjoint({"recording-writer"})
+
+
 def test_progress_is_told_with_every_evaluation(tmp_path):
     config = experiment(TAXIS)
     told = []
@@ -253,7 +267,8 @@ def test_an_error_of_whoever_listens_ends_the_run_as_failed(tmp_path):
     assert (failed.status, failed.summary["error"]) == ("failed", "by whoever listens")
 
 
-def test_an_error_of_whoever_listens_loses_no_step_that_was_taken(tmp_path):
+@pytest.mark.parametrize("threads", [True, False])
+def test_an_error_of_whoever_listens_loses_no_step_that_was_taken(threads, tmp_path):
     config = experiment(TAXIS, recording={"chunk_steps": 65_536})  # no chunk is full when it ends
     run = create_run(tmp_path, config, 0)
     taken = []
@@ -264,7 +279,7 @@ def test_an_error_of_whoever_listens_loses_no_step_that_was_taken(tmp_path):
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        run_job(Job(config, 0), run, report=report)
+        run_job(Job(config, 0), run, report=report, threads=threads)
     with open_recording(run.recording) as recording:
         assert (recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)) == taken[-1]
         assert min(taken[-1]) > 0

@@ -129,8 +129,8 @@ def test_no_room_even_to_describe_the_run(size, tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root may mount a disk")
-@pytest.mark.parametrize("kilobytes", [80, 120, 200])
-def test_a_disk_that_is_really_full(kilobytes, whole, tmp_path):
+@pytest.mark.parametrize(("kilobytes", "threads"), [(80, True), (120, True), (200, True), (120, False)])
+def test_a_disk_that_is_really_full(kilobytes, threads, whole, tmp_path):
     """Where the recording's blocks are gone, those of run.json are gone too."""
     mount = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(tmp_path)]
     if subprocess.run(mount, capture_output=True, check=False).returncode:
@@ -139,7 +139,7 @@ def test_a_disk_that_is_really_full(kilobytes, whole, tmp_path):
         config = experiment(LARGE)
         run = create_run(tmp_path, config, 0)
         with pytest.raises(StorageError, match="No space left"):
-            run_job(Job(config, 0), run)
+            run_job(Job(config, 0), run, threads=threads)
         kept = train_steps(run.recording)
         assert len(kept) > 10_000
         assert whole.startswith(kept)
@@ -147,7 +147,8 @@ def test_a_disk_that_is_really_full(kilobytes, whole, tmp_path):
         subprocess.run(["umount", str(tmp_path)], check=True)
 
 
-def test_a_system_that_cannot_keep_what_it_took_ends_the_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize("threads", [True, False])
+def test_a_system_that_cannot_keep_what_it_took_ends_the_run(threads, tmp_path, monkeypatch):
     """Some disks say that they are full only when asked to have written."""
 
     def full(self):
@@ -159,12 +160,13 @@ def test_a_system_that_cannot_keep_what_it_took_ends_the_run(tmp_path, monkeypat
     run = create_run(tmp_path, config, 0)
     told = []
     with pytest.raises(StorageError, match="No space left on device"):
-        run_job(Job(config, 0), run, report=lambda progress: told.append(progress.episode))
+        run_job(Job(config, 0), run, lambda progress: told.append(progress.episode), threads=threads)
     assert find_run(run.run_id, tmp_path).status == "failed"
     assert max(told, default=0) < 900_000, "it is told soon, not when all is done"
 
 
-def test_an_error_while_packing_ends_the_run(tmp_path, monkeypatch):
+@pytest.mark.parametrize("threads", [True, False])
+def test_an_error_while_packing_ends_the_run(threads, tmp_path, monkeypatch):
     def broken(*_):
         raise MemoryError("no memory")
 
@@ -172,7 +174,7 @@ def test_an_error_while_packing_ends_the_run(tmp_path, monkeypatch):
     config = experiment(TAXIS, episodes=10**6)
     run = create_run(tmp_path, config, 0)
     with pytest.raises(MemoryError):
-        run_job(Job(config, 0), run)
+        run_job(Job(config, 0), run, threads=threads)
     assert json.loads((run.folder / "run.json").read_text())["status"] == "failed"
 
 
