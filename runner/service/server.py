@@ -99,6 +99,9 @@ def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
+            connection = transport.get_extra_info("socket")
+            if connection is not None:  # asyncio does it for sockets that it made itself alone
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._await(limits.header_seconds)
 
         def connection_lost(self, exc: Exception | None) -> None:
