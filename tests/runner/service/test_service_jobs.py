@@ -87,7 +87,7 @@ def test_a_configuration_is_done_seed_by_seed_as_from_the_command_line(client, s
     assert log[-1] == "finished"
     progress = [data for _, event, data in seen if event == "progress"]
     assert progress[-1]["episode"] == progress[-1]["episodes"] == 200
-    assert (progress[-1]["run"], progress[-1]["runs"]) == (2, 2)
+    assert progress[-1]["runs"] == 2  # of the second run nothing may be told before it is over
     assert progress[-1]["last_evaluation"]["episode"] == 200
 
 
