@@ -13,7 +13,7 @@ import contextlib
 import multiprocessing
 import threading
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing import connection
 from pathlib import Path
 from typing import Any, Final, Self
@@ -50,7 +50,6 @@ class _Worker:
     outcome: Outcome | None = None
     stopped: float | None = None
     """When it was told to stop."""
-    progress: dict[str, Any] = field(default_factory=dict)
 
     def tell(self, word: str, value: Any = None) -> None:
         """Tell it something, if it lives."""
@@ -100,6 +99,8 @@ class Jobs:
         self.watchers = 0
         """How many are being told of events; of the routes that tell them."""
         self._busy: dict[int, _Worker] = {}
+        self._progress: dict[int, dict[str, Any]] = {}
+        """What the worker of each job said last, also after its end."""
         self._lock = threading.RLock()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
@@ -200,8 +201,12 @@ class Jobs:
     def progress(self, number: int) -> dict[str, Any] | None:
         """Return how far a job is that is running, as its worker last said; None if it has said nothing."""
         with self._lock:
-            worker = self._busy.get(number)
-            return worker.progress or None if worker else None
+            return self._progress.get(number) if number in self._busy else None
+
+    def last_progress(self, number: int) -> dict[str, Any] | None:
+        """Return how far a job was when its worker last said it, also after the end of either."""
+        with self._lock:
+            return self._progress.get(number)
 
     def events(self, number: int, place: int = 0) -> tuple[list[Event], int]:
         """Return a job's events from a place on; see `Queue.events`."""
@@ -265,6 +270,8 @@ class Jobs:
         process.start()
         theirs.close()
         self._busy[order.number] = _Worker(order.number, process, ours)
+        kept = {job.number for job in self.queue.jobs()} - {order.number}
+        self._progress = {number: said for number, said in self._progress.items() if number in kept}
         self._change(order.number, state="running", started=waiting.started or now())
 
     def _share(self) -> None:
@@ -315,7 +322,7 @@ class Jobs:
             worker.outcome = value
             self._settle(self.queue.job(worker.number), worker)
         elif word == "progress":
-            worker.progress = value
+            self._progress[worker.number] = value
         elif word == "slots":
             worker.taken = value
         else:

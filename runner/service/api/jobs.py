@@ -250,7 +250,7 @@ async def _events(jobs: Jobs, number: int, place: int, stopping: asyncio.Event) 
         progress, spoken = None, time.monotonic()
         while not stopping.is_set():
             job = jobs.queue.job(number)  # before its events, so that none of them is missed
-            before, progress = progress, jobs.progress(number)
+            before, progress = progress, jobs.last_progress(number)
             found, place = await run_sync(jobs.events, number, place)
             has_moved = progress is not None and progress is not before
             if progress is not None and has_moved:

@@ -6,6 +6,7 @@ import json
 import time
 
 import pytest
+from submitted import ENDLESS, ICY
 
 import runner
 from runner.config import from_mapping
@@ -13,14 +14,7 @@ from runner.runs import list_runs
 from runner.service import work
 from runner.service.work import Jobs
 
-CONFIG = {
-    "name": "icy",
-    "env": {"id": "FrozenLake-v1"},
-    "episodes": 200,
-    "evaluation": {"every": 100, "trials": 5},
-    "seeds": [0, 1],
-}
-ENDLESS = CONFIG | {"name": "endless", "episodes": 10**9, "seeds": [0], "recording": {"steps": "none"}}
+CONFIG = ICY | {"episodes": 200, "evaluation": {"every": 100, "trials": 5}}
 SWEEP = {
     "name": "small",
     "base": {"env": {"id": "FrozenLake-v1"}, "episodes": 60, "evaluation": {"every": 20, "trials": 5}},
@@ -87,7 +81,7 @@ def test_a_configuration_is_done_seed_by_seed_as_from_the_command_line(client, s
     assert log[-1] == "finished"
     progress = [data for _, event, data in seen if event == "progress"]
     assert progress[-1]["episode"] == progress[-1]["episodes"] == 200
-    assert progress[-1]["runs"] == 2  # of the second run nothing may be told before it is over
+    assert (progress[-1]["run"], progress[-1]["runs"]) == (2, 2)
     assert progress[-1]["last_evaluation"]["episode"] == 200
 
 
@@ -99,6 +93,13 @@ def test_a_watcher_comes_back_to_where_it_was(client, submit):
     assert [event for event in watched(client, number, last="nonsense") if event[0]] == seen
     end = client.get(f"/api/v1/jobs/{number}/events", headers={"Last-Event-ID": seen[-1][0]})
     assert end.status_code == 204
+
+
+def test_a_watcher_that_comes_after_the_end_is_told_how_far_the_job_came(client, submit):
+    number = submit(CONFIG)
+    until(client, number, lambda job: job["state"] == "finished" and job["progress"] is None)
+    (progress,) = [data for _, event, data in watched(client, number) if event == "progress"]
+    assert (progress["run"], progress["runs"], progress["episode"]) == (2, 2, 200)
 
 
 def test_a_running_job_is_cancelled_and_goes_on_when_it_is_resumed(client, submit, recordings):

@@ -6,6 +6,7 @@ import json
 import time
 
 import pytest
+from submitted import ENDLESS, ICY
 
 import runner
 from runner.recording.reader import open_recording
@@ -16,15 +17,6 @@ pytest.importorskip("ray")
 from runner.sweep.cluster import connect
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, about its future defaults and open files
-
-CONFIG = {
-    "name": "icy",
-    "env": {"id": "FrozenLake-v1"},
-    "episodes": 60,
-    "evaluation": {"every": 30, "trials": 5},
-    "seeds": [0, 1],
-}
-ENDLESS = CONFIG | {"name": "endless", "episodes": 10**9, "seeds": [0], "recording": {"steps": "none"}}
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +35,9 @@ def until(jobs, number, is_so):
 
 
 def test_a_job_is_done_by_ray_as_beside_the_server_and_can_be_cancelled(cluster, tmp_path):
-    here = runner.run_all(CONFIG, recordings=tmp_path / "here")
+    here = runner.run_all(ICY, recordings=tmp_path / "here")
     with Jobs(tmp_path / "far", 1, ray=cluster) as jobs:
-        number = jobs.submit(json.dumps(CONFIG), "job.yaml").number
+        number = jobs.submit(json.dumps(ICY), "job.yaml").number
         until(jobs, number, lambda job: job.is_over)
         assert jobs.queue.job(number).state == "finished", jobs.queue.job(number).error
         far = sorted(list_runs(tmp_path / "far"), key=lambda run: run.seed)
