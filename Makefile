@@ -15,6 +15,7 @@ help:  ## list the targets
 
 run: $(VENV)/.installed  ## train the tutorial's cooperative job, every step recorded
 	$(BIN)/dualtaxi run configs/tutorial_cooperative.yaml
+	@echo "        (for \`dualtaxi\` to be found: source $(BIN)/activate)"
 
 serve: $(VENV)/.installed-service  ## open the runs in the browser
 	$(BIN)/dualtaxi serve
