@@ -15,9 +15,9 @@ from runner.errors import Diverged, RunnerError, StorageError
 from runner.execution import Report, Session, Stop, describe, recorder_for, run_job, write_result
 from runner.job import Job
 from runner.learning.learner import Learner
+from runner.locking import locked
 from runner.mdp import load_mdp
 from runner.origin import address
-from runner.owning import owned
 from runner.provenance import provenance
 from runner.recording.contents import survey
 from runner.recording.reader import open_recording
@@ -45,7 +45,7 @@ def rerecord(run: Run, report: Report = lambda _: None, stop: Stop = lambda: Fal
         Diverged: the job gives another content here than it gave then; the recording stays as it is.
         KeyboardInterrupt: `stop` said so; the recording stays as it is.
     """
-    with owned(run) as current:
+    with locked(run) as current:
         if current.status != "finished":
             raise RunnerError(
                 f"run {run.run_id} is {current.status}; `dualtaxi resume {run.run_id}` finishes it first."

@@ -33,10 +33,10 @@ from runner.execution import (
 )
 from runner.job import Job
 from runner.learning.learner import Held, Learner
+from runner.locking import locked
 from runner.mdp import Mdp, load_mdp
 from runner.origin import configured_tables, settle
 from runner.owner import owner
-from runner.owning import owned
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.contents import Contents
@@ -89,7 +89,7 @@ def resume(
             f"{run.recording}: found a recording that stands alone, expected a run. To go on with it, put it "
             f"into a folder of its own as {runs.RECORDING_FILE}."
         )
-    with owned(run) as current:
+    with locked(run) as current:
         if is_finished(current):
             return _settled(current)
         return _go_on(current, accept_changes, report, stop)

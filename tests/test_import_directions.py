@@ -19,7 +19,7 @@ ORDER = """
     mdp
     words learning planning recording observer
     provenance runs
-    owning
+    locking
     catalogue
     frames packing
     description

@@ -19,7 +19,7 @@ from runner.archive.restoring import check
 from runner.archive.targets import Target, no_archive, split_place, target_of, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.owning import owned
+from runner.locking import locked
 from runner.recording.integrity import checked_survey, may_be_cut
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
@@ -66,7 +66,7 @@ def archive_run(
             f"{run.recording}: found a recording that stands alone, expected a run in a folder."
         )
     target = target_of(to)
-    with owned(run, archived=True) as current:
+    with locked(run, archived=True) as current:
         if current.status == "archived":
             raise RunnerError(f"run {run.run_id} is archived already, in {current.archive.get('target')}.")
         return _Archiving(current, target, report).do(remove, dry_run)
@@ -160,7 +160,7 @@ def restore_run(run: Run, report: Report = lambda _: None) -> Run:
         RecordingError: the archive is damaged, missing, or another's; nothing changes.
         StorageError: the recording cannot be written.
     """
-    with owned(run, archived=True) as current:
+    with locked(run, archived=True) as current:
         if current.status != "archived":
             raise RunnerError(f"run {run.run_id} is not archived: its recording is {current.recording}.")
         fresh = current.recording.with_suffix(".restoring")

@@ -23,7 +23,7 @@ from runner.catalogue.rows import Row
 from runner.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
 from runner.errors import RunnerError, StorageError
 from runner.labels import KEEP, LABELS_FILE, are_readable
-from runner.owning import owned
+from runner.locking import locked
 from runner.runs import RECORDING_FILE, Run
 
 _STRAY_SECONDS: Final = 60
@@ -84,13 +84,13 @@ def remove(removal: Removal, force: bool = False) -> None:
     run = removal.run
     if removal.refusal:
         raise RunnerError(f"run {run.run_id} stays: {removal.refusal}.")
-    with owned(run, archived=True):
+    with locked(run, archived=True):
         pass  # nobody else works on it
     hidden = removal.root / f"{REMOVED}{run.folder.name}-{secrets.token_hex(4)}"
     try:
         run.folder.rename(hidden)
         try:
-            with owned(replace(run, folder=hidden), archived=True):
+            with locked(replace(run, folder=hidden), archived=True):
                 pass  # nor did anybody begin to
         except RunnerError:
             hidden.rename(run.folder)

@@ -13,13 +13,13 @@ from typing import Any, Final
 
 from runner.cache import EXPORTS, RESTORED, cache_folder
 from runner.labels import KEEP, LABELS_FILE, LOCK_FILE
-from runner.owning import OWNER_LOCK
+from runner.locking import RUN_LOCK
 from runner.runs import RECORDING_FILE, RUN_FILE
 
 REMOVED: Final = ".removed-"
 """What the folder of a run is called from the moment it is removed until its files are."""
 
-_OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, OWNER_LOCK))
+_OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, RUN_LOCK))
 _LEFT_OVER: Final = re.compile(
     r"recording\.(anew|repairing|rerecording|restoring)|recording\.damaged-\d+\.mcap|(run|labels)\.[0-9a-f]{8}\.tmp"
 )

@@ -13,7 +13,7 @@ from runner.catalogue.finding import candidates
 from runner.documents import write_whole
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.labels import MAX_TAGS, Labels, change_labels
-from runner.owning import owned
+from runner.locking import locked
 from runner.recording.rewriting import content_of, continues
 from runner.runs import RECORDING_FILE, RUN_FILE, Run, find_run, runs_in
 
@@ -81,7 +81,7 @@ def _continued(occupied: Occupied, recording: Path, facts: Mapping[str, Any], la
     """
     if occupied.run.status not in UNFINISHED or occupied.run.stands_alone:
         raise occupied
-    with owned(occupied.run) as run:
+    with locked(occupied.run) as run:
         if run.status not in UNFINISHED or not continues(recording, run.recording):
             raise occupied
         change_labels(run.folder, lambda said: _merged(said, labels))
@@ -104,7 +104,7 @@ def settled(run: Run, facts: Mapping[str, Any]) -> Run:
     """Return a run that is there; if it has come to its end but does not say so, it does now."""
     if facts["status"] != "finished" or run.status not in UNFINISHED or run.stands_alone:
         return run
-    with owned(run) as there:
+    with locked(run) as there:
         return _with_facts(there, facts) if there.status in UNFINISHED else there
 
 

@@ -19,7 +19,7 @@ from typing import Final
 
 from runner.documents import read_object, write_whole
 from runner.errors import RunnerError
-from runner.owning import owned
+from runner.locking import locked
 from runner.runs import Run, list_runs
 from runner.service.address import found_token
 from runner.service.client import Client, Report
@@ -69,7 +69,7 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Sent:
         ServerError: the server refused it, or was away; it stays.
         RunnerError: another process is at it.
     """
-    with owned(run) as own:
+    with locked(run) as own:
         known = _read(own)
         same = known.get("server") == client.url and known.get("upload")
         sent = client.push(own, report, Sent(str(same), "receiving", 0) if same else None)

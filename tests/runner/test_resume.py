@@ -20,7 +20,7 @@ from runner.config import from_mapping
 from runner.errors import Diverged, RunnerError, StorageError
 from runner.execution import run_job
 from runner.job import Job
-from runner.owning import owned
+from runner.locking import locked
 from runner.recording import open as open_recording
 from runner.recording.contents import survey
 from runner.recording.repair import repair
@@ -433,6 +433,6 @@ def test_a_living_owner_is_left_alone(whole, tmp_path):
 
 def test_one_at_a_time(whole, tmp_path):
     run = copy_of(whole, tmp_path)
-    with owned(run), pytest.raises(RunnerError, match="another process"):
+    with locked(run), pytest.raises(RunnerError, match="another process"):
         resume(run)
     assert resume(run).status == "finished"

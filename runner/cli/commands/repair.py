@@ -76,9 +76,9 @@ def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json:
 
 def _kept(run: Run | None) -> contextlib.AbstractContextManager[Any]:
     """Return a context in which no other process writes to the run."""
-    from runner.owning import owned
+    from runner.locking import locked
 
-    return contextlib.nullcontext() if run is None else owned(run)
+    return contextlib.nullcontext() if run is None else locked(run)
 
 
 def _tell_run(run: Run) -> None:

@@ -18,7 +18,7 @@ import pytest
 from runner.cli import removing
 from runner.config import from_mapping
 from runner.labels import LABELS_FILE
-from runner.owning import owned
+from runner.locking import locked
 from runner.runs import RECORDING_FILE, RUN_FILE, create_run, list_runs
 
 CONFIG = from_mapping({"name": "some", "episodes": 5})
@@ -215,7 +215,7 @@ def test_rm_refuses_what_is_to_stay_and_then_removes_nothing(command, make):
         result = command("rm", free.run_id, run.run_id, "--yes")
         assert result.exit_code == 2
         assert told in result.stderr
-    with owned(busy):
+    with locked(busy):
         assert "worked on by another process" in command("rm", busy.run_id, "--yes").stderr
     assert there(command) == {run.run_id for run in (free, kept, busy, running)}
 

@@ -13,11 +13,11 @@ from filelock import FileLock, Timeout
 from runner.errors import RunnerError, StorageError
 from runner.runs import RECORDING_FILE, Run, find_run
 
-OWNER_LOCK: Final = "owner.lock"
+RUN_LOCK: Final = "owner.lock"
 
 
 @contextlib.contextmanager
-def owned(run: Run, archived: bool = False) -> Iterator[Run]:
+def locked(run: Run, archived: bool = False) -> Iterator[Run]:
     """Give a run as it is now, its folder kept from every other process that would write to it.
 
     Args:
@@ -28,7 +28,7 @@ def owned(run: Run, archived: bool = False) -> Iterator[Run]:
         RunnerError: it is running or archived, or another process has it in this way.
         StorageError: the folder cannot be written.
     """
-    lock = FileLock(run.folder / OWNER_LOCK)
+    lock = FileLock(run.folder / RUN_LOCK)
     try:
         lock.acquire(blocking=False)
     except Timeout as error:
