@@ -68,7 +68,8 @@ def require_steps(recording: Recording) -> None:
         RecordingError: it has none.
     """
     if not has_steps(recording):
-        raise RecordingError(
-            f"{recording.path}: found no steps (recording.steps: none), so there is no episode to show; "
-            "`dualtaxi rerecord` records them."
+        found = (
+            "no steps (recording.steps: none)" if recording.kind == "job" else "no step that its loop took"
         )
+        hint = "; `dualtaxi rerecord` records them" if recording.kind == "job" else ""
+        raise RecordingError(f"{recording.path}: found {found}, so there is no episode to show{hint}.")

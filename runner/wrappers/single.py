@@ -97,7 +97,7 @@ class Recorded(Generic[R]):
         """Close the recording with how the loop ended."""
         if error is None:
             self._loop.close()
-        elif isinstance(error, KeyboardInterrupt):
+        elif isinstance(error, KeyboardInterrupt) or (isinstance(error, SystemExit) and not error.code):
             self._loop.close("interrupted")
         else:
             self._loop.close("failed", f"{type(error).__name__}: {error}")

@@ -135,7 +135,7 @@ def instances(archetype: Any, n: int, **parts: NDArray[Any]) -> list[Any]:
 def column(descriptor: Any, n: int, values: NDArray[Any]) -> Any:
     """Return a component's column of n rows: text or numbers [n, instances], points [n, instances, 2]."""
     count = values.shape[1]
-    flat = values.reshape(n * count, *values.shape[2:])
+    flat = _aligned(values).reshape(n * count, *values.shape[2:])
     items = pa.FixedSizeListArray.from_arrays(flat.reshape(-1), type=_POINT) if flat.ndim == 2 else flat
     return _Column(descriptor, pa.ListArray.from_arrays(_offsets(n, count), pa.array(items)))
 
@@ -176,6 +176,11 @@ def images(values: NDArray[np.float32]) -> list[Any]:
     ranges = np.stack((low, np.where(high > low, high, low + 1)), axis=1).astype(np.float64)
     shown = rr.DepthImage.columns(depth_range=np.nan_to_num(ranges))
     return [_Column(rr.DepthImage.descriptor_buffer(), rows), *shown]
+
+
+def _aligned(values: NDArray[Any]) -> NDArray[Any]:
+    """Return values as Arrow wants them in memory; a lone record's field is contiguous but not aligned."""
+    return np.require(values, requirements=["C", "A"])
 
 
 def _offsets(count: int, size: int) -> pa.Array:

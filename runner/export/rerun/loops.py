@@ -164,7 +164,7 @@ class LoopExporter:
                 sender.static("return", rr.SeriesLines(names=names, colors=colours))
                 sender.static("length", rr.SeriesLines(names=phase, colors=_COLOURS[phase]))
             times = _times(block["log_time"], block["episode"])
-            sender.send("return", times, scalars(np.ascontiguousarray(block["returns"])))
+            sender.send("return", times, scalars(block["returns"]))
             sender.send("length", times, scalars(block["length"].astype(np.float64)[:, np.newaxis]))
 
     def _send_logged(self) -> None:
@@ -232,7 +232,7 @@ class LoopExporter:
                 dressed = True
             times = _times(steps["log_time"], steps["episode"])
             times.append(rr.TimeColumn("t", sequence=steps["t"].astype(np.int64)))
-            sender.send("reward", times, scalars(np.ascontiguousarray(steps["rewards"], np.float64)))
+            sender.send("reward", times, scalars(steps["rewards"]))
             for part, columns in lines.items():
                 values = [_column(steps, path) for _, path in columns]
                 sender.send(part, times, scalars(np.concatenate(values, axis=1)))

@@ -57,8 +57,7 @@ class StepWriter(Sender):
     def write(self, batch: Batch) -> None:
         """Send a batch of steps."""
         records, times = batch.records, batch.times()
-        rewards = np.ascontiguousarray(records["rewards"], dtype=np.float64)
-        self.send("reward", times, scalars(rewards))
+        self.send("reward", times, scalars(records["rewards"]))
         self._values.write(batch)
         self._events.write(batch)
         if self._grid:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -346,6 +348,17 @@ def test_an_interrupted_loop_is_not_resumed(tmp_path):
     assert env.run.recording.read_bytes() == before
 
 
+def test_a_loop_that_took_no_step_is_told_nothing_that_it_cannot_do(tmp_path):
+    with runner.record(make("FrozenLake-v1"), tmp_path, name="none") as env:
+        env.reset(seed=0)
+        env._loop.close("failed")
+    for words in (("rerecord", "none"), ("export", "gif", "none", "-o", str(tmp_path / "x.gif"))):
+        done = dualtaxi(tmp_path, *words)
+        assert done.exit_code == 2
+        assert "loop" in done.output
+        assert "dualtaxi re" not in done.output
+
+
 @pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
 def test_rerun_gets_what_a_loop_recorded(folder, name, tmp_path):
     from rerun.chunk import RrdReader
@@ -358,3 +371,14 @@ def test_rerun_gets_what_a_loop_recorded(folder, name, tmp_path):
     assert {"/train/return", "/eval/return", "/train/reward", "/logged/loss", "/log"} <= paths
     assert ("/train/grid/things" in paths) == (name == "lake")
     assert ("/train/observation" in paths) == (name == "pole")
+
+
+def test_rerun_gets_a_loop_of_a_single_step_and_episode(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path, name="single") as env:
+        env.reset(seed=0)
+        env.step(0)
+    words = [sys.executable, "-m", "runner", "export", "rerun", "single", "-o", str(tmp_path / "single.rrd")]
+    words += ["--recordings", str(tmp_path)]
+    exported = subprocess.run(words, check=False, capture_output=True, text=True)
+    assert exported.returncode == 0, exported.stderr
+    assert "1 of 1 training steps" in exported.stderr

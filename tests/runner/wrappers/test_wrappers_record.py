@@ -243,6 +243,19 @@ def test_an_error_in_the_loop_leaves_a_whole_recording_that_says_so(tmp_path):
     assert run.summary["train_steps"] == 1
 
 
+@pytest.mark.parametrize(("code", "status"), [(None, "interrupted"), (0, "interrupted"), (3, "failed")])
+def test_a_loop_that_leaves_its_process_failed_only_if_it_says_so(tmp_path, code, status):
+    def leave() -> None:
+        with runner.record(make("CartPole-v1"), tmp_path) as env:
+            env.reset(seed=0)
+            sys.exit(code)
+
+    with pytest.raises(SystemExit):
+        leave()
+    (run,) = list_runs(tmp_path)
+    assert run.status == status
+
+
 KILLED = """
 import os, signal, sys, time, gymnasium, runner
 env = runner.record(gymnasium.make("CartPole-v1"), sys.argv[1], chunk_steps=256)
