@@ -23,7 +23,7 @@ from blake3 import blake3
 
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
-from runner.runs import find_run
+from runner.finding import find_run
 from runner.service.client import Client
 from runner.service.parcel import Parcel
 from runner.verify import verify

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
     from runner.errors import RunnerError
+    from runner.finding import find_run
     from runner.recording.reader import Recording, open_recording
-    from runner.runs import Run, find_run, list_runs
+    from runner.runs import Run, list_runs
     from runner.wrappers.many import record_parallel, record_vector
     from runner.wrappers.single import record
 
@@ -48,7 +49,7 @@ _HOME = {
     "Recording": "runner.recording.reader",
     "Run": "runner.runs",
     "RunnerError": "runner.errors",
-    "find_run": "runner.runs",
+    "find_run": "runner.finding",
     "list_runs": "runner.runs",
     "open_recording": "runner.recording.reader",
     "record": "runner.wrappers.single",

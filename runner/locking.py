@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Final
 
 from filelock import FileLock, Timeout
 
 from runner.errors import RunnerError, StorageError
-from runner.runs import RECORDING_FILE, Run, find_run
+from runner.runs import RECORDING_FILE, Run, run_at
 
 RUN_LOCK: Final = "owner.lock"
 
@@ -37,8 +35,7 @@ def locked(run: Run, archived: bool = False) -> Iterator[Run]:
         raise StorageError(f"{run.folder}: cannot be written ({error.strerror}).") from error
     try:
         if run.facts.get("recording", RECORDING_FILE) == RECORDING_FILE:
-            now = find_run(os.fspath(run.folder.absolute()), run.folder.parent)
-            run = replace(now, folder=run.folder)  # called as it was: what is told of it names its path
+            run = run_at(run.folder)
         if run.status == "running":
             owner = run.facts.get("owner", {})
             raise RunnerError(

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from runner import runs
 from runner.analysis.tables import held_at
 from runner.archive.places import at_hand
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.model import RunTable
 from runner.errors import RunnerError
+from runner.finding import find_run
 from runner.job import Job
 from runner.learning.learner import Held
 from runner.mdp import Mdp
@@ -48,7 +48,7 @@ def settled(config: ExperimentConfig, recordings: Path, but: str = "") -> Experi
     start = config.initial_q
     if not isinstance(start, RunTable):
         return config
-    source, step = runs.find_run(start.run, recordings, but), start.step
+    source, step = find_run(start.run, recordings, but), start.step
     if step is None:
         with open_recording(at_hand(source).recording) as recording:
             step = _last_step(recording)
@@ -72,7 +72,7 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
     start = job.config.initial_q
     if not isinstance(start, RunTable):
         return None
-    source = runs.find_run(start.run, run.folder.parent, but=run.run_id)
+    source = find_run(start.run, run.folder.parent, but=run.run_id)
     with open_recording(at_hand(source).recording) as recording:
         held = held_at(recording, _last_step(recording) if start.step is None else start.step)
     joint = job.config.tables == "joint"

@@ -12,13 +12,11 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from runner import runs
 from runner.config import from_mapping
 from runner.config.model import RunTable
 from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, StorageError
@@ -45,7 +43,7 @@ from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import storage_error
 from runner.recording.writer import RecordingFile
-from runner.runs import Run
+from runner.runs import RECORDING_FILE, Run, run_at
 from runner.verify import differing_environment, differing_provenance, initial_tables
 
 DECISIVE: Final = (
@@ -84,10 +82,10 @@ def resume(
         RunnerError: the run is running; something decisive differs; or its folder cannot be used.
         Diverged: what is recorded is not what the job gives.
     """
-    if run.recording.name != runs.RECORDING_FILE:
+    if run.recording.name != RECORDING_FILE:
         raise RunnerError(
             f"{run.recording}: found a recording that stands alone, expected a run. To go on with it, put it "
-            f"into a folder of its own as {runs.RECORDING_FILE}."
+            f"into a folder of its own as {RECORDING_FILE}."
         )
     with locked(run) as current:
         if is_finished(current):
@@ -136,7 +134,7 @@ def _go_on(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
 def _mark_failed(run: Run, error: BaseException) -> None:
     """Say that a run failed, if `execute`, which says so itself, was not come to."""
     with contextlib.suppress(RunnerError):
-        now = runs.find_run(os.fspath(run.folder.absolute()), run.folder.parent)
+        now = run_at(run.folder)
         if now.facts["status"] == "running":
             now.update(status="failed", summary={"error": str(error)})
 

@@ -15,15 +15,15 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 from runner.documents import read_object, write_whole
-from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError, nearest
+from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.labels import Labels, change_labels, read_labels
 from runner.owner import lives, owner
 
@@ -39,9 +39,6 @@ RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"
 
 _ALPHABET: Final = "abcdefghjkmnpqrstvwxyz23456789"
 _ID_LENGTH: Final = 8
-_LATEST: Final = "@latest"
-_TOLD: Final = 20
-"""Runs that an error names."""
 _RUN_ID: Final = re.compile(r"[\w.-]{1,100}")
 
 
@@ -257,102 +254,13 @@ def run_entries(recordings: Path) -> list[str]:
         raise StorageError(f"{recordings}: cannot be read as a folder of runs ({error.strerror}).") from error
 
 
-class Named(Protocol):
-    """What a run can be named by."""
-
-    @property
-    def run_id(self) -> str:
-        """Its id."""
-
-    @property
-    def name(self) -> str:
-        """What it is called."""
-
-    @property
-    def seed(self) -> int:
-        """Its job's seed."""
-
-    @property
-    def created(self) -> datetime:
-        """When it began."""
-
-
-AnyNamed = TypeVar("AnyNamed", bound=Named)
-
-
-def find_run(name: str, recordings: Path, but: str = "") -> Run:
-    """Return the one run that answers to an id, a unique prefix of it, a name, a path or `@latest`.
-
-    `NAME@latest` is the newest run of that name.
-
-    Args:
-        name: what it must answer to.
-        recordings: the folder to look in.
-        but: the id of a run that does not answer: the one that is asking.
+def run_at(path: Path) -> Run:
+    """Return the run in a folder, or of a recording that may stand alone.
 
     Raises:
-        RunNotFound: none does, or several do.
+        RunNotFound: there is none.
+        RecordingError: it stands alone, and cannot be read.
     """
-    known = run_at_once(name, recordings)
-    if known is not None and known.run_id != but:
-        return known
-    return the_one(name, [run for run in list_runs(recordings) if run.run_id != but], recordings)
-
-
-def run_at_once(name: str, recordings: Path) -> Run | None:
-    """Return the run at a path, or in the folder called like its id; None if others must be looked at.
-
-    Raises:
-        RunNotFound: it is a path, and there is no run.
-    """
-    if os.sep in name or name.endswith(".mcap") or (os.altsep and os.altsep in name):
-        return _run_at(Path(name))
-    if _RUN_ID.fullmatch(name) and name.strip("."):
-        return next((run for run in runs_in(recordings / name) if run.run_id == name), None)
-    return None
-
-
-def the_one(name: str, runs: Sequence[AnyNamed], recordings: Path) -> AnyNamed:
-    """Return the one of these runs, the newest first, that answers to a name, but no path.
-
-    Raises:
-        RunNotFound: none does, or several do.
-    """
-    if not runs:
-        raise RunNotFound(
-            f"no run {name!r}: there are no runs in {recordings} yet. `dualtaxi run` makes one."
-        )
-    if not name:
-        raise RunNotFound("found an empty name, expected an id, the beginning of one, a name or @latest.")
-    if name.endswith(_LATEST):
-        stem = name.removesuffix(_LATEST)
-        newest = next((run for run in runs if stem in ("", run.name)), None)
-        if newest is not None:
-            return newest
-    exact = [run for run in runs if run.run_id == name]
-    found = exact or [run for run in runs if run.name == name or run.run_id.startswith(name)]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        several = "\n".join(
-            f"  {run.run_id}  {run.name}  seed {run.seed}  {run.created:%Y-%m-%d %H:%M}"
-            for run in found[:_TOLD]
-        )
-        more = f"\n  and {len(found) - _TOLD:,} more" if len(found) > _TOLD else ""
-        or_newest = (
-            f", or the newest of this name by {name}@latest" if any(run.name == name for run in found) else ""
-        )
-        raise RunNotFound(
-            f"{name!r} answers to {len(found)} runs; name one by its id{or_newest}:\n{several}{more}"
-        )
-    hint = nearest(name, {run.name for run in runs} | {run.run_id for run in runs})
-    raise RunNotFound(
-        f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {len(runs):,} there are."
-    )
-
-
-def _run_at(path: Path) -> Run:
-    """Return the run in a folder, or of a recording that may stand alone."""
     if path.is_dir():
         for run in runs_in(path):
             return run
@@ -360,8 +268,15 @@ def _run_at(path: Path) -> Run:
     if not path.is_file():
         raise RunNotFound(f"{path}: no such file or folder.")
     if path.name == RECORDING_FILE and (path.parent / RUN_FILE).is_file():
-        return _run_at(path.parent)
+        return run_at(path.parent)
     return _from_recording(path)
+
+
+def run_of_id(run_id: str, recordings: Path) -> Run | None:
+    """Return the run in the folder called like this id; None if there is none, or the text is no id."""
+    if not _RUN_ID.fullmatch(run_id) or not run_id.strip("."):
+        return None
+    return next((run for run in runs_in(recordings / run_id) if run.run_id == run_id), None)
 
 
 def runs_in(folder: Path) -> Iterator[Run]:
@@ -384,7 +299,7 @@ def relabel(run: Run, change: Callable[[Labels], Labels]) -> Labels:
     Raises:
         RunnerError: its recording stands alone, or what is to be said cannot be.
     """
-    if run.recording.name != RECORDING_FILE:
+    if run.stands_alone:
         raise RunnerError(
             f"{run.recording}: found a recording that stands alone, expected a run in a folder of its own."
         )

@@ -19,7 +19,7 @@ ORDER = """
     mdp
     words learning planning recording observer
     provenance runs
-    locking
+    finding locking
     catalogue
     frames packing
     description

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 from runner.catalogue.index import look
 from runner.errors import RunNotFound
-from runner.runs import Run, run_at_once, runs_in, the_one
+from runner.finding import run_at_once, the_one
+from runner.runs import Run, runs_in
 
 
 class Candidate(NamedTuple):
@@ -38,7 +39,7 @@ def candidates(recordings: Path, tell: Callable[[str], None] = lambda _: None) -
 
 
 def find_run(name: str, recordings: Path, tell: Callable[[str], None] = lambda _: None) -> Run:
-    """Return what `runner.runs.find_run` does, without reading every run's files.
+    """Return what `runner.finding.find_run` does, without reading every run's files.
 
     Raises:
         RunNotFound: no run answers to the name, or several do.

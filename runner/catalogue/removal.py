@@ -24,7 +24,7 @@ from runner.catalogue.usage import REMOVED, Contents, belongs, contents_of, stra
 from runner.errors import RunnerError, StorageError
 from runner.labels import KEEP, LABELS_FILE, are_readable
 from runner.locking import locked
-from runner.runs import RECORDING_FILE, Run
+from runner.runs import Run
 
 _STRAY_SECONDS: Final = 60
 _NAMED: Final = 5
@@ -163,7 +163,7 @@ def _reason(row: dict[str, Any], wish: Wish) -> str:
 
 def _misplaced(run: Run, root: Path) -> str:
     """Return why a run is none that can be removed from a recordings folder, or nothing."""
-    if run.recording.name != RECORDING_FILE:
+    if run.stands_alone:
         return f"{run.recording} stands alone; remove the file yourself"
     if run.folder.is_symlink():
         return f"{run.folder} is a link to {run.folder.readlink()}; remove the link yourself"

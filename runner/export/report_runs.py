@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from runner.errors import RecordingError
+from runner.finding import find_run
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.runs import Run, find_run, list_runs
+from runner.runs import Run, list_runs
 
 
 def find_runs(names: Iterable[str], recordings: Path) -> list[Run]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,7 +19,7 @@ from runner.packing.unpacking import workplace
 from runner.recording.integrity import is_merely_cut_off
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
-from runner.runs import MADE_BY, RECORDING_FILE, RUN_FILE, Run, find_run
+from runner.runs import MADE_BY, RECORDING_FILE, RUN_FILE, Run, run_at
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ def admit(recording: Path, said: Mapping[str, Any], labels: Labels, recordings: 
             sync(path)
         folder.rename(recordings / run_id)
         sync(recordings)
-    return Admitted(find_run(f"{recordings}{os.sep}{run_id}", recordings), digest, already=False)
+    return Admitted(run_at(recordings / run_id), digest, already=False)
 
 
 def _checked_facts(recording: Recording, said: Mapping[str, Any]) -> dict[str, Any]:

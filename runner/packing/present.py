@@ -15,7 +15,7 @@ from runner.errors import RecordingError, RunnerError, StorageError
 from runner.labels import MAX_TAGS, Labels, change_labels
 from runner.locking import locked
 from runner.recording.rewriting import content_of, continues
-from runner.runs import RECORDING_FILE, RUN_FILE, Run, find_run, runs_in
+from runner.runs import RECORDING_FILE, RUN_FILE, Run, run_at, runs_in
 
 UNFINISHED: Final = ("interrupted", "failed")
 """What the status of a run is that can be gone on with."""
@@ -112,7 +112,7 @@ def _with_facts(run: Run, facts: Mapping[str, Any]) -> Run:
     """Return a run that says of itself what came; what is its folder's own, it keeps."""
     kept = {key: value for key, value in run.facts.items() if key not in ("owner", "proof", "summary")}
     write_whole(run.folder / RUN_FILE, kept | dict(facts))
-    return find_run(os.fspath(run.folder.absolute()), run.folder.parent)
+    return run_at(run.folder)
 
 
 def _merged(said: Labels, more: Labels) -> Labels:

@@ -19,7 +19,7 @@ from runner.packing.present import Occupied, known, met
 from runner.recording.facts import json_object
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of, rewrite
-from runner.runs import RECORDING_FILE, RUN_FILE, Run, find_run, new_run_id
+from runner.runs import RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def unpack(path: Path, recordings: Path, as_new: bool = False) -> Unpacked:
                 return Unpacked(*_met(occupied, folder, manifest))
             run_id = _renamed(folder, recordings) if as_new else manifest.run_id
             folder.rename(recordings / run_id)
-        return Unpacked(find_run(f"{recordings}{os.sep}{run_id}", recordings), manifest, False)
+        return Unpacked(run_at(recordings / run_id), manifest, False)
 
 
 def _met(occupied: Occupied, folder: Path, manifest: Manifest) -> tuple[Run, Manifest, bool]:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from runner.catalogue.finding import Candidate
 from runner.catalogue.index import Version, look, version
 from runner.errors import RunNotFound
-from runner.runs import Run, run_at_once, runs_in, the_one
+from runner.finding import the_one
+from runner.runs import Run, run_of_id, runs_in
 
 if TYPE_CHECKING:
     from runner.catalogue.index import Index
@@ -82,7 +83,7 @@ class Catalogue:
         """
         _refuse_path(name)
         for root in self.roots:
-            known = run_at_once(name, root)
+            known = run_of_id(name, root)
             if known is not None:
                 return known
         try:

@@ -10,7 +10,6 @@ which is one renaming, or refused. The folder is the truth: a server that was ki
 from __future__ import annotations
 
 import contextlib
-import re
 import secrets
 import shutil
 import threading
@@ -26,7 +25,7 @@ from filelock import FileLock, Timeout
 from runner.documents import write_whole
 from runner.errors import RunnerError, RunNotFound, StorageError
 from runner.packing.present import sync
-from runner.runs import run_at_once
+from runner.runs import run_of_id
 from runner.service.appending import Appending, on_disk
 from runner.service.upload import (
     BODY_FILE,
@@ -276,9 +275,7 @@ class Uploads:
 
     def _run(self, run_id: str) -> dict[str, Any] | None:
         """Return the summary of a run, None if there is none."""
-        if not re.fullmatch(r"[\w.-]{1,100}", run_id):
-            return None
-        run = run_at_once(run_id, self._recordings)
+        run = run_of_id(run_id, self._recordings)
         return None if run is None else run.summary
 
     def _check_room(self, size: int | None) -> None:

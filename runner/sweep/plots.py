@@ -14,8 +14,8 @@ from runner.analysis.series import Group, read_series
 from runner.archive.places import at_hand
 from runner.errors import RunnerError
 from runner.export.plots import Panel, panels_of
+from runner.finding import find_run
 from runner.recording.reader import open_recording
-from runner.runs import find_run
 from runner.sweep.model import Range
 from runner.sweep.results import Ranked, Results, spoken
 

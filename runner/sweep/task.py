@@ -16,12 +16,13 @@ from runner.archive.places import at_hand
 from runner.config import from_mapping
 from runner.errors import RunnerError
 from runner.execution import Progress, run_job
+from runner.finding import find_run
 from runner.job import Job
 from runner.labels import Labels, change_labels
 from runner.mdp import Mdp, load_mdp
 from runner.recording.reader import open_recording
 from runner.resume import resume
-from runner.runs import Run, create_run, find_run, list_runs, unless_empty
+from runner.runs import Run, create_run, list_runs, unless_empty
 from runner.sweep.model import Objective
 from runner.sweep.readings import Curve, curve_of, hopeless, readings
 from runner.sweep.state import PRUNED, is_over

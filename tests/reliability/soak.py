@@ -38,13 +38,14 @@ from mcap.reader import make_reader
 from runner.config import ExperimentConfig
 from runner.errors import RecordingError, RunnerError
 from runner.execution import run_job
+from runner.finding import find_run
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.recorder import Recorder
 from runner.recording.repair import repair
 from runner.resume import resume
-from runner.runs import Run, create_run, find_run, list_runs
+from runner.runs import Run, create_run, list_runs
 from runner.verify import verify
 from tests.runner.recording.making import SMALL_MAP, experiment
 

@@ -10,10 +10,11 @@ from runner.again import evaluate, rerecord
 from runner.analysis.tables import tables_at
 from runner.errors import Diverged, RecordingError, RunnerError
 from runner.execution import run_job
+from runner.finding import find_run
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording import schema
-from runner.runs import create_run, find_run, list_runs
+from runner.runs import create_run, list_runs
 from runner.verify import verify
 from tests.runner.recording.making import TAXIS, experiment, make_run
 

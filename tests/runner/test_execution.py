@@ -15,12 +15,13 @@ import runner
 from runner.config import ConfigError
 from runner.errors import EnvironmentNotUsable, RunnerError, RunNotFound
 from runner.execution import run_job
+from runner.finding import find_run
 from runner.job import Job, jobs_of
 from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
-from runner.runs import create_run, find_run, list_runs
+from runner.runs import create_run, list_runs
 from tests.runner.learning.oracle import Twin
 from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
 

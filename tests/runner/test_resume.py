@@ -19,6 +19,7 @@ from runner.again import evaluate
 from runner.config import from_mapping
 from runner.errors import Diverged, RunnerError, StorageError
 from runner.execution import run_job
+from runner.finding import find_run
 from runner.job import Job
 from runner.locking import locked
 from runner.recording import open as open_recording
@@ -27,7 +28,7 @@ from runner.recording.repair import repair
 from runner.recording.schema import BLOCK_TOPICS, EVAL_STEP, TRAIN_STEP
 from runner.recording.writer import RecordingFile
 from runner.resume import resume
-from runner.runs import Run, create_run, find_run, list_runs
+from runner.runs import Run, create_run, list_runs
 from tests.runner.recording.making import SAMPLED, SMALL_MAP, TAXIS, make_run
 
 REPOSITORY = Path(__file__).parents[2]

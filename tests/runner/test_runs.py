@@ -10,7 +10,8 @@ import pytest
 from runner import runs
 from runner.config import from_mapping
 from runner.errors import RunNotFound, StorageError
-from runner.runs import RUN_FILE, create_run, find_run, list_runs, recordings_folder
+from runner.finding import find_run
+from runner.runs import RUN_FILE, create_run, list_runs, recordings_folder
 
 CONFIG = from_mapping({"name": "some", "episodes": 5})
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
 from runner.errors import RunnerError
-from runner.runs import Run, find_run
+from runner.runs import Run, run_at
 from runner.service.queue import CONFIG_FILE
 
 TELL_SECONDS: Final = 0.25
@@ -79,4 +79,4 @@ def wait_for_others(runs: Iterable[Run], stop: Callable[[], bool]) -> None:
                     "resume the job when that has come to its end."
                 )
             time.sleep(TELL_SECONDS)
-            run = find_run(str(run.folder.absolute()), run.folder.parent)  # noqa: PLW2901
+            run = run_at(run.folder)  # noqa: PLW2901

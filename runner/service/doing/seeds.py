@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from runner.documents import write_whole
 from runner.errors import RunnerError
-from runner.runs import Run, find_run, new_run_id
+from runner.runs import Run, new_run_id, run_at
 from runner.service.doing.order import (
     MAX_TEXT,
     TELL_SECONDS,
@@ -79,7 +79,7 @@ def _run_of(order: Order, seed: int) -> Run | None:
         (order.recordings / run_id).rmdir()  # made, and killed before anything was in it
         return None
     with contextlib.suppress(RunnerError):
-        return find_run(str((order.recordings / run_id).absolute()), order.recordings)
+        return run_at(order.recordings / run_id)
     return None
 
 

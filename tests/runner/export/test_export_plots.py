@@ -14,10 +14,10 @@ from runner.cli import cli
 from runner.errors import RunnerError
 from runner.export.plots import panels_of
 from runner.export.plots_figure import draw_figure, draw_panel
+from runner.finding import find_run
 from runner.frames import evaluation_records
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
-from runner.runs import find_run
 from tests.runner.recording.making import TAXIS, make_run
 
 

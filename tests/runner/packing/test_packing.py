@@ -21,11 +21,12 @@ from mcap.stream_reader import StreamReader
 
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError
+from runner.finding import find_run
 from runner.labels import Labels, change_labels, read_labels
 from runner.packing.packing import pack
 from runner.packing.unpacking import unpack
 from runner.recording.reader import open_recording
-from runner.runs import find_run, list_runs
+from runner.runs import list_runs
 from runner.verify import verify
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 

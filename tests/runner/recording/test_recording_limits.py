@@ -15,11 +15,12 @@ import pytest
 
 from runner.errors import StorageError
 from runner.execution import run_job
+from runner.finding import find_run
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording import pipeline, schema
 from runner.recording.writer import RecordingFile
-from runner.runs import create_run, find_run
+from runner.runs import create_run
 from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
 
 LONG_RUN = """

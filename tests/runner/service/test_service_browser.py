@@ -20,8 +20,8 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 import runner
 from runner.export.svg import Drawing, transform
+from runner.finding import find_run
 from runner.recording.reader import open_recording
-from runner.runs import find_run
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 CHROMEDRIVER = shutil.which("chromedriver")

@@ -7,8 +7,8 @@ import re
 
 import pytest
 
+from runner.finding import find_run
 from runner.recording.reader import open_recording
-from runner.runs import find_run
 from runner.words import states_in_words
 from tests.runner.export.outline import Outline
 

@@ -25,10 +25,11 @@ from restarting import Server
 
 import runner
 from runner.cli import cli
+from runner.finding import find_run
 from runner.labels import change_labels
 from runner.packing.packing import pack
 from runner.recording.rewriting import rewrite
-from runner.runs import find_run, list_runs
+from runner.runs import list_runs
 from runner.service import client as client_module
 from runner.service.address import checked_url, found_token
 from runner.service.client import Client

@@ -20,7 +20,7 @@ from serving import serving
 
 from runner.cli import cli
 from runner.errors import RunnerError
-from runner.runs import find_run
+from runner.finding import find_run
 from runner.service import logs
 from runner.service.app import create_app
 from runner.service.guard import POLICY

@@ -15,12 +15,13 @@ from blake3 import blake3
 
 from runner.errors import RunnerError, RunNotFound, StorageError
 from runner.execution import run_job
+from runner.finding import find_run
 from runner.job import Job
 from runner.labels import Labels, change_labels
 from runner.packing.packing import pack
 from runner.recording.rewriting import rewrite
 from runner.resume import resume
-from runner.runs import create_run, find_run, list_runs
+from runner.runs import create_run, list_runs
 from runner.service.upload import (
     Announcement,
     Completion,

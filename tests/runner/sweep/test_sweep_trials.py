@@ -17,9 +17,10 @@ from runner.again import rerecord
 from runner.config import from_mapping
 from runner.errors import RunnerError
 from runner.execution import run_job
+from runner.finding import find_run
 from runner.job import Job
 from runner.labels import read_labels
-from runner.runs import create_run, find_run, list_runs
+from runner.runs import create_run, list_runs
 from runner.sweep import local, state
 from runner.sweep.loading import from_values
 from runner.sweep.local import LocalWorkers

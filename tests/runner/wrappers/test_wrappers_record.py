@@ -17,10 +17,11 @@ from gymnasium.error import ResetNeeded
 
 import runner
 from runner.errors import ConfigError, EnvironmentNotUsable, RecordingError, RunnerError
+from runner.finding import find_run
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
-from runner.runs import find_run, list_runs
+from runner.runs import list_runs
 from tests.runner.wrappers.loops import NAMES, Rooms, make, play, recorded
 
 STEPS = 700
