@@ -81,30 +81,44 @@ def _restore_kept(run: Run, kept: Path, digest: str, report: Report) -> None:
 
 @contextlib.contextmanager
 def archive_of(run: Run) -> Iterator[Path]:
-    """Give the archive of a run: where it was put, or beside the recordings if they moved together.
+    """Give the archive of a run.
 
     Raises:
-        RecordingError: it is at neither place.
+        RecordingError: there is none where it should be.
         StorageError: its place cannot be read.
     """
     from runner.archive.targets import split_place, target_of
 
-    said = str(run.archive.get("target", ""))
-    beside = f"{default_target(run.folder.absolute().parent)}/{run.run_id}"
-    places = list(dict.fromkeys((said, beside)))
-    for place in places:
+    place = archive_place(run)
+    if place is None:
+        raise RecordingError(
+            f"run {run.run_id}: found no archive at {' or '.join(_places(run))}; its recording was put into "
+            f"it. Mount or copy it there, or set {ARCHIVE_VARIABLE} to the folder that has it."
+        )
+    with target_of(split_place(place)[0]).reading(run.run_id) as folder:
+        yield folder
+
+
+def archive_place(run: Run) -> str | None:
+    """Return where the archive of a run is; None if it is nowhere that is known.
+
+    Raises:
+        RecordingError: what is there is no archive.
+        StorageError: its place cannot be read.
+    """
+    from runner.archive.targets import split_place, target_of
+
+    for place in _places(run):
         to, run_id = split_place(place)
-        if run_id != run.run_id:
-            continue
-        target = target_of(to)
-        if target.manifest(run_id) is not None:
-            with target.reading(run_id) as folder:
-                yield folder
-            return
-    raise RecordingError(
-        f"run {run.run_id}: found no archive at {' or '.join(places)}; its recording was put into it. "
-        f"Mount or copy it there, or set {ARCHIVE_VARIABLE} to the folder that has it."
-    )
+        if run_id == run.run_id and target_of(to).manifest(run_id) is not None:
+            return place
+    return None
+
+
+def _places(run: Run) -> list[str]:
+    """Return where the archive of a run may be: where it was put, or beside recordings that moved with it."""
+    beside = f"{default_target(run.folder.absolute().parent)}/{run.run_id}"
+    return list(dict.fromkeys((str(run.archive.get("target", "")), beside)))
 
 
 def restore_to(folder: Path, path: Path, digest: Any, report: Report) -> None:

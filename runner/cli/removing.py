@@ -13,6 +13,7 @@ from runner.errors import RunnerError
 
 if TYPE_CHECKING:
     from runner.catalogue.removal import Removal
+    from runner.runs import Run
 
 yes_option: Final = click.option("--yes", "-y", is_flag=True, help="Do not ask.")
 force_option: Final = click.option(
@@ -107,7 +108,20 @@ def _draw(removals: Sequence[Removal]) -> None:
     draw(drawn)
     for removal in removals:
         if removal.run.archive:
-            say(
-                f"The archive of {removal.run.run_id} at {removal.run.archive.get('target', 'its place')} "
-                "stays; only what points to it goes."
-            )
+            say(_archive_in_words(removal.run))
+
+
+def _archive_in_words(run: Run) -> str:
+    """Return what is left of a run in its archive; object storage is not asked: it may take minutes to fail."""
+    from runner.archive.places import archive_place
+
+    said = str(run.archive.get("target", ""))
+    if "://" in said:
+        return f"The archive of {run.run_id} at {said} is left alone."
+    try:
+        place = archive_place(run)
+    except RunnerError as error:
+        return f"Whether run {run.run_id} is still in its archive cannot be told: {error}"
+    if place is None:
+        return f"Run {run.run_id} was archived at {said}, but is not there: nothing of it will be left."
+    return f"The archive of {run.run_id} at {place} stays."

@@ -191,6 +191,8 @@ def opened(path: Path) -> Iterator[Pack]:
         PackError: there is none, it cannot be read, or it is no pack.
     """
     try:
+        if path.is_dir():
+            raise PackError(f"{path}: found a folder, expected the file that `dualtaxi pack` writes.")
         if not path.is_file():  # to open a pipe would wait for its writer
             raise PackError(f"{path}: found no such file, expected a packed run.")
         with path.open("rb") as stream:

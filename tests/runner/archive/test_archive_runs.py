@@ -155,6 +155,15 @@ def test_recordings_and_archive_may_move_together(run, recordings, command, tmp_
     assert "found no archive at" in lost.output
 
 
+def test_rm_tells_whether_the_archive_is_there(run, recordings, command):
+    done(command("archive", run.run_id, "--remove"))
+    place = recordings.parent / "archive" / run.run_id
+    remove = ("rm", run.run_id, "--dry-run")
+    assert f"The archive of {run.run_id} at {place} stays." in command(*remove).output
+    place.rename(recordings.parent / "mislaid")
+    assert f"was archived at {place}, but is not there: nothing of it will be left" in command(*remove).output
+
+
 def test_a_running_run_and_an_archived_one_are_refused(run, recordings, command):
     config = experiment(TAXIS)
     running = create_run(recordings, config, 0)

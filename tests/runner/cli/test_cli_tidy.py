@@ -187,7 +187,7 @@ def test_an_archived_run_stays_listed(command, make):
         assert command("reindex").exit_code == 0
     assert command("prune", "--older-than", "0s", "--yes").stderr.startswith("Left alone: 1 archived.")
     result = command("rm", run.run_id, "--yes")
-    assert "/archives/a stays" in result.stderr
+    assert "was archived at /archives/a, but is not there: nothing of it will be left" in result.stderr
     assert there(command) == set()
 
 

@@ -140,8 +140,8 @@ def test_what_is_no_pack(packed, tmp_path, lake):
     }.items():
         (tmp_path / name).write_bytes(data)
         refused(tmp_path / name, tmp_path)
-    refused(tmp_path, tmp_path)
     refused(tmp_path / "missing", tmp_path)
+    refused(tmp_path, tmp_path, "found a folder, expected the file that `dualtaxi pack` writes")
 
 
 def test_cut_anywhere(packed, tmp_path):
