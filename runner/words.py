@@ -1,4 +1,4 @@
-"""States, joint actions and events of an environment, said in words.
+"""States, joint actions, events and trials, said in words.
 
 The words come from the scene that the environment, or the recording, brings along:
 
@@ -64,6 +64,11 @@ def event_in_words(name: str) -> str:
 def spoken(name: str) -> str:
     """Return a name as people write it: `drop_off` is `drop-off`, `illegal_pickup` is `illegal pickup`."""
     return name.replace("drop_off", "drop-off").replace("_", " ")
+
+
+def trial_in_words(after: int, number: int) -> str:
+    """Return what a trial, counted from 0, is called: that of the evaluation after so many episodes."""
+    return f"trial {number:,} of the evaluation after {after:,} episodes"
 
 
 def _thing_in_words(

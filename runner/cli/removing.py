@@ -112,7 +112,7 @@ def _draw(removals: Sequence[Removal]) -> None:
 
 
 def _archive_in_words(run: Run) -> str:
-    """Return what is left of a run in its archive; object storage is not asked: it may take minutes to fail."""
+    """Return what is left of a run in its archive. Object storage is not asked: that may take minutes."""
     from runner.archive.places import archive_place
 
     said = str(run.archive.get("target", ""))

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.analysis.tables import TableReplay, check_steps, tables_at
 from runner.errors import RecordingError
 from runner.export.report_runs import require_steps
@@ -19,7 +20,14 @@ from runner.frames import agents_of
 from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.words import action_names, actions_in_words, agent_actions, event_in_words, states_in_words
+from runner.words import (
+    action_names,
+    actions_in_words,
+    agent_actions,
+    event_in_words,
+    states_in_words,
+    trial_in_words,
+)
 
 MOST_STEPS: Final = 1000
 """Steps of an episode that a page shows; the page says so where an episode has more."""
@@ -106,48 +114,17 @@ def trial(recording: Recording, after: int, number: int, most: int = MOST_STEPS,
         RecordingError: there is no such evaluation or trial, or no steps.
     """
     require_steps(recording)
-    evaluation = evaluation_after(recording, after)
-    trials = int(evaluation["trials"])
-    if not 0 <= number < trials:
-        raise RecordingError(
-            f"{recording.path}: the evaluation after {after:,} episodes has no trial {number}; "
-            f"it has {trials}, from 0."
-        )
-    title = f"trial {number} of the evaluation after {after:,} episodes"
-    index = first_trial(recording, evaluation) + number
+    where = str(recording.path)
+    evaluation = evaluation_after(evaluations_of(recording), after, where)
+    index = evaluation.trial(number, where)
     shown = range(first, first + most)
-    return _episode(recording, "eval", index, title, shown, int(evaluation["step"]))
-
-
-def evaluation_after(recording: Recording, after: int) -> dict[str, Any]:
-    """Return the metrics of the evaluation after so many training episodes.
-
-    Raises:
-        RecordingError: there is none.
-    """
-    evaluations = recording.metrics("eval")
-    for metrics in evaluations:
-        if metrics["episode"] == after:
-            return metrics
-    known = [metrics["episode"] for metrics in evaluations]
-    near = min(known, key=lambda episode: abs(episode - after)) if known else None
-    raise RecordingError(
-        f"{recording.path}: has no evaluation after {after} episodes; "
-        + ("it has none at all." if near is None else f"it has {len(known)}, the nearest after {near}.")
-    )
-
-
-def first_trial(recording: Recording, evaluation: dict[str, Any]) -> int:
-    """Return the number, among all evaluation episodes, of an evaluation's first trial."""
-    before = [m["trials"] for m in recording.metrics("eval") if m["evaluation"] < evaluation["evaluation"]]
-    return int(sum(before))
+    return _episode(recording, "eval", index, trial_in_words(after, number), shown, evaluation.train_step)
 
 
 def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
     """Return the worst, the median and the best trial of an evaluation: by success, return and length."""
-    evaluation = evaluation_after(recording, after)
-    first = first_trial(recording, evaluation)
-    records = recording.episodes("eval", first, first + int(evaluation["trials"]))
+    evaluation = evaluation_after(evaluations_of(recording), after, str(recording.path))
+    records = recording.episodes("eval", evaluation.start, evaluation.stop)
     order = np.lexsort(
         (-records["length"].astype(np.int64), records["returns"].sum(axis=1), records["success"])
     )
@@ -187,15 +164,19 @@ def last_episode(recording: Recording) -> int:
 def last_whole_evaluation(recording: Recording) -> int | None:
     """Return the training episodes before the last evaluation all of whose trials are there.
 
-    A recording that was cut off may have an evaluation's metrics without its trials.
+    A recording that was cut off may have an evaluation's metrics without its trials. A loop has none: where
+    its evaluations end nobody said.
     """
-    ends, after = 0, None
+    if recording.kind != "job":
+        return None
     episodes, steps = recording.count(schema.EVAL_EPISODE), recording.count(schema.EVAL_STEP)
-    for metrics in recording.metrics("eval"):
-        ends += int(metrics["trials"])
-        if ends <= episodes and recording.episodes("eval", ends - 1, ends)[0]["last_step"] < steps:
-            after = int(metrics["episode"])
-    return after
+    for one in reversed(evaluations_of(recording)):
+        if (
+            one.stop <= episodes
+            and recording.episodes("eval", one.stop - 1, one.stop)[0]["last_step"] < steps
+        ):
+            return one.after
+    return None
 
 
 def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -97,47 +96,20 @@ def _chosen(recording: Recording, episode: int | None, trial: tuple[int, int] | 
     """Return phase, number and title of the episode that is meant.
 
     Raises:
-        RecordingError: the recording has no such evaluation or trial, or no episode at all.
+        RecordingError: the recording has no such evaluation or trial.
     """
-    from runner.errors import RecordingError
+    from runner.analysis.evaluations import evaluation_after, evaluations_of
     from runner.recording.schema import TRAIN_EPISODE
+    from runner.words import trial_in_words
 
-    if episode is not None:
-        return "train", episode, f"training episode {episode:,}"
-    evaluations = _evaluations(recording)
+    evaluations = [] if episode is not None else evaluations_of(recording)
     if trial is None and not evaluations:
-        last = max(recording.count(TRAIN_EPISODE) - 1, 0)
-        return "train", last, f"training episode {last:,}"
-    after, number = trial or (evaluations[-1][0], 0)
-    for episodes, first, trials in evaluations:
-        if episodes == after and number < trials:
-            return "eval", first + number, f"evaluation after {after:,} training episodes, trial {number}"
-        if episodes == after:
-            raise RecordingError(f"--eval: found trial {number}, expected one from 0 to {trials - 1}.")
-    known = [episodes for episodes, _, _ in evaluations]
-    nearest = min(known, key=lambda one: abs(one - after), default=None)
-    if nearest is None:
-        raise RecordingError("--eval: the run has no evaluations; --episode plays a training episode.")
-    raise RecordingError(
-        f"--eval: no evaluation after {after:,} training episodes; the nearest of {len(known)} is after "
-        f"{nearest:,}."
-    )
-
-
-def _evaluations(recording: Recording) -> list[tuple[int, int, int]]:
-    """Return of each evaluation the training episodes before it, its first episode's number, its trials."""
-    if recording.kind == "job":
-        return [
-            (metrics["episode"], metrics["evaluation"] * metrics["trials"], metrics["trials"])
-            for metrics in recording.metrics("eval")
-        ]
-    from runner.analysis.series import trained_before
-
-    counts: dict[int, int] = {}
-    for episodes in trained_before(recording).tolist():
-        counts[episodes] = counts.get(episodes, 0) + 1
-    firsts = accumulate(counts.values(), initial=0)
-    return [(episodes, first, counts[episodes]) for episodes, first in zip(counts, firsts, strict=False)]
+        number = max(recording.count(TRAIN_EPISODE) - 1, 0) if episode is None else episode
+        return "train", number, f"training episode {number:,}"
+    after, number = trial or (evaluations[-1].after, 0)
+    where = str(recording.path)
+    index = evaluation_after(evaluations, after, where).trial(number, where)
+    return "eval", index, trial_in_words(after, number)
 
 
 def _show(played: Episode, speed: float) -> None:

@@ -13,6 +13,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from runner.analysis.evaluations import Evaluation
 from runner.errors import RecordingError
 from runner.export.rerun.classes import vocabulary_of
 from runner.export.rerun.columns import Batch, Sender, no_thoughts, scalars
@@ -23,7 +24,6 @@ from runner.export.rerun.metrics import EVAL_COLOUR, TRAIN_COLOUR
 from runner.export.rerun.scene import TRAIL_STEPS, marks_of, scene_of
 from runner.export.rerun.selection import (
     SPREAD_STEPS,
-    Evaluation,
     Request,
     Selection,
     Span,

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.evaluations import Evaluation, evaluation_after
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -52,19 +53,6 @@ class Episodes:
     def count(self) -> int:
         """Episodes that have steps."""
         return len(self.first_step) - 1
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """One evaluation's trials."""
-
-    after: int
-    """Training episodes before it."""
-    train_step: int
-    """Training steps before it."""
-    start: int
-    """First trial, counted over all evaluations."""
-    stop: int
 
 
 @dataclass(frozen=True)
@@ -113,7 +101,7 @@ def select(recording: Recording, request: Request) -> Selection:
         _without_steps(recording, request, selection)
         return selection
     train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
-    evaluations = evaluations_of(recording, train, evals)
+    evaluations = evaluations_with_steps(recording, train, evals)
     numbers = _training_episodes(recording, request, train)
     selection.train = spans_of(train, numbers)
     wanted = _evaluations(recording, request, evaluations)
@@ -146,7 +134,7 @@ def episodes_of(recording: Recording, phase: str) -> Episodes:
     return Episodes(phase, np.append(first, total) if total > first[-1] else first, ended)
 
 
-def evaluations_of(recording: Recording, train: Episodes, evals: Episodes) -> list[Evaluation]:
+def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episodes) -> list[Evaluation]:
     """Return the evaluations that have steps, one that was cut off among them."""
     if not evals.count:
         return []
@@ -207,17 +195,11 @@ def _evaluations(
     """Return the evaluations that are meant."""
     if request.everything:
         return list(evaluations)
-    by_episode = {one.after: one for one in evaluations}
-    for after in request.evaluations:
-        if after not in by_episode:
-            known = ", ".join(str(number) for number in by_episode)
-            shown = known if len(by_episode) <= 12 else f"{known[:60].rpartition(',')[0]}, ..."
-            raise RecordingError(
-                f"{recording.path}: found no evaluation after {after} training episodes, "
-                f"expected one of {shown or 'none: this run has no evaluations'}."
-            )
-    last = {evaluations[-1].after} if request.is_default and evaluations else set()
-    return [by_episode[after] for after in sorted(last | set(request.evaluations))]
+    where = str(recording.path)
+    asked = [evaluation_after(evaluations, after, where) for after in request.evaluations]
+    if request.is_default:
+        asked += evaluations[-1:]
+    return sorted(set(asked), key=lambda one: one.after)
 
 
 def _has_no_steps(recording: Recording) -> bool:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from runner.analysis.diff import can_compare_steps
 from runner.analysis.diff.sections import where_in_words
 from runner.analysis.diff.trajectory import evaluation_partings, training_parting
+from runner.analysis.evaluations import evaluation_after
 from runner.errors import RecordingError
-from runner.export.rerun.selection import Evaluation, Request, episodes_of, evaluations_of, select
+from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
@@ -83,21 +84,11 @@ def _train_step(recording: Recording, episode: int, t: int) -> tuple[str, int, R
 
 def _eval_step(recording: Recording, after: int, trial: int, t: int) -> tuple[str, int, Request]:
     train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
-    for one in evaluations_of(recording, train, evals):
-        if one.after == after:
-            number = _trial(recording, one, trial)
-            step = _within(recording, evals.first_step[number], evals.first_step[number + 1], t)
-            return "eval", step, Request(evaluations=(after,))
-    raise RecordingError(f"{recording.path}: found no evaluation after {after} training episodes.")
-
-
-def _trial(recording: Recording, one: Evaluation, trial: int) -> int:
-    if one.start + trial >= one.stop:
-        raise RecordingError(
-            f"{recording.path}: found no trial {trial} of the evaluation after {one.after} episodes; "
-            f"there are {one.stop - one.start}, from 0."
-        )
-    return one.start + trial
+    where = str(recording.path)
+    evaluation = evaluation_after(evaluations_with_steps(recording, train, evals), after, where)
+    number = evaluation.trial(trial, where)
+    step = _within(recording, evals.first_step[number], evals.first_step[number + 1], t)
+    return "eval", step, Request(evaluations=(after,))
 
 
 def _within(recording: Recording, first: int, stop: int, t: int) -> int:

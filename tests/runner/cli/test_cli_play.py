@@ -52,7 +52,7 @@ def test_frames_come_one_after_another_without_waiting(recorded):
 
 
 def test_the_last_evaluation_is_played_unless_told(recorded):
-    assert "evaluation after 30 training episodes, trial 0" in recorded("play", "tiny").stdout
+    assert "trial 0 of the evaluation after 30 episodes" in recorded("play", "tiny").stdout
 
 
 @pytest.mark.parametrize(("trial", "number"), [("20:3", 3), ("20", 0)])
@@ -66,8 +66,8 @@ def test_a_trial_of_an_evaluation(recorded, recorded_run, trial, number):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (["--eval", "21:0"], "the nearest of 4 is after 20"),
-        (["--eval", "20:5"], "expected one from 0 to 4"),
+        (["--eval", "21:0"], "found no evaluation after 21 episodes; it has 4, the nearest after 20"),
+        (["--eval", "20:5"], "found no trial 5 of the evaluation after 20 episodes; it has 5, from 0"),
         (["--eval", "x"], "expected N:TRIAL"),
         (["--eval", "3:x"], "expected N:TRIAL"),
         (["--episode", "30"], "no training episode 30"),
@@ -86,7 +86,7 @@ def test_without_evaluations_the_last_episode_is_played(command, tiny):
     command("run", tiny, "--set", "evaluation=null")
     assert "training episode 29" in command("play", "@latest").stdout
     result = command("play", "@latest", "--eval", "0:0")
-    assert "the run has no evaluations; --episode plays" in result.stderr
+    assert "found no evaluation after 0 episodes; it has none at all" in result.stderr
 
 
 def test_without_a_scene_states_are_numbers(command, tiny):

@@ -81,7 +81,7 @@ def test_without_a_choice_it_is_the_median_trial(pictured, tmp_path):
 REFUSED = {
     "no such episode": (("--episode", 9999), "no training episode 9999"),
     "no such evaluation": (("--eval", "7:0"), r"no evaluation after 7 episodes.*nearest after 0"),
-    "no such trial": (("--eval", "40:99"), "no trial 99; it has 6, from 0"),
+    "no such trial": (("--eval", "40:99"), "no trial 99 of the evaluation after 40 episodes; it has 6"),
     "no trial at all": (("--eval", "x"), "expected N:TRIAL"),
     "both": (("--eval", "0:0", "--episode", 0), "exclude each other"),
 }

@@ -254,7 +254,7 @@ def test_an_evaluation_of_a_loop_is_played(folder):
     done = dualtaxi(folder, "play", "lake", "--eval", f"{trained}:1", "--json")
     assert done.exit_code == 0, done.output
     assert [json.loads(line)["state"] for line in done.stdout.splitlines()] == second
-    assert f"the nearest of 1 is after {trained}" in dualtaxi(folder, "play", "lake", "--eval", "1").output
+    assert f"it has 1, the nearest after {trained}" in dualtaxi(folder, "play", "lake", "--eval", "1").output
 
 
 def test_the_grid_of_a_loop_is_played(folder):
