@@ -11,7 +11,7 @@ from pathlib import Path
 from runner.analysis.tables import held_at
 from runner.archive.places import at_hand
 from runner.config import ExperimentConfig, from_mapping
-from runner.config.model import RunTable
+from runner.config.sections import RunTable
 from runner.errors import RunnerError
 from runner.finding import find_run
 from runner.job import Job

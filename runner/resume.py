@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.config import from_mapping
-from runner.config.model import RunTable
+from runner.config.sections import RunTable
 from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, StorageError
 from runner.execution import (
     Report,

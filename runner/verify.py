@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.tables import initially_held
 from runner.config import from_mapping
-from runner.config.model import RunTable
+from runner.config.sections import RunTable
 from runner.errors import ConfigError, Diverged, RecordingError
 from runner.execution import Report, Session, recorder_for
 from runner.job import Job

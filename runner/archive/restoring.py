@@ -21,7 +21,7 @@ from runner.archive.reading import Archive
 from runner.archive.replay import Meetings, Tables
 from runner.archive.rows import message_payload
 from runner.config import from_mapping
-from runner.config.model import Recording as Plan
+from runner.config.sections import Recording as Plan
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES, Packing

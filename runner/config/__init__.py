@@ -5,12 +5,14 @@
 Everything that can be wrong is told in one `ConfigError`, a line for each problem.
 """
 
+from runner.config.file import ExperimentFile
 from runner.config.loading import from_mapping, from_text, load
-from runner.config.model import (
+from runner.config.model import ExperimentConfig
+from runner.config.schedules import Exponential, Linear, Piecewise, Schedule
+from runner.config.schema import json_schema
+from runner.config.sections import (
     Environment,
     Evaluation,
-    ExperimentConfig,
-    ExperimentFile,
     Log,
     Quirks,
     RandomTable,
@@ -19,8 +21,6 @@ from runner.config.model import (
     Snapshots,
     UniformRange,
 )
-from runner.config.schedules import Exponential, Linear, Piecewise, Schedule
-from runner.config.schema import json_schema
 from runner.errors import ConfigError
 
 __all__ = [

@@ -14,15 +14,14 @@ from typing import Any
 from pydantic import ValidationError
 
 from runner.config.document import Document, Place, Problem, read_yaml
+from runner.config.file import ExperimentFile, SeedRange
 from runner.config.model import (
     LEARNERS,
     NAME_EXPECTED,
     NAME_PATTERN,
     OWN_SECTIONS,
     ExperimentConfig,
-    ExperimentFile,
     Rewards,
-    SeedRange,
     Tables,
 )
 from runner.config.overrides import override

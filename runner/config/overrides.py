@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from runner.config.document import Document, Place, Problem, read_yaml
-from runner.config.model import ExperimentFile
+from runner.config.file import ExperimentFile
 from runner.config.values import MAX_DEPTH, Path, Section
 from runner.errors import ConfigError
 

@@ -7,7 +7,8 @@ import functools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from runner.config.model import KEYS, ExperimentFile
+from runner.config.file import ExperimentFile
+from runner.config.model import KEYS
 
 Schema = Mapping[str, Any]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig
-from runner.config.model import RandomTable
+from runner.config.sections import RandomTable
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.learning import algorithms, kernel
 from runner.learning.algorithms import Rules, Tables

@@ -11,7 +11,8 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from runner.config import ExperimentConfig
-from runner.config.model import Name, Seed, SeedRange, Seeds
+from runner.config.file import SeedRange
+from runner.config.model import Name, Seed, Seeds
 from runner.config.values import Count, Section, refusal
 
 Strategy = Literal["grid", "random", "tpe", "genetic"]

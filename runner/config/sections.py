@@ -1,0 +1,232 @@
+"""The sections of an experiment: the mappings that each say one thing, such as `evaluation`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal, Self
+
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    Tag,
+    WithJsonSchema,
+    model_validator,
+)
+
+from runner.config.schedules import Probability, StepSize
+from runner.config.values import Count, FrozenMapping, Section, frozen, plain, refusal
+
+
+def _environment_arguments(value: object) -> FrozenMapping:
+    if not isinstance(value, Mapping):
+        raise ValueError
+    if "competitive" in value:
+        message = "is never set by hand: it follows from `mode` (or `rewards`). Remove it and set `mode`"
+        raise refusal(("competitive",), message)
+    arguments = frozen(value)
+    assert isinstance(arguments, FrozenMapping)
+    return arguments
+
+
+class Environment(Section):
+    """Which environment, and what it is made with."""
+
+    id: str = Field(
+        default="dualtaxi:DualTaxi-v1",
+        min_length=1,
+        description="The Gymnasium id; what stands before a colon is the module to import for it.",
+    )
+    kwargs: Annotated[
+        FrozenMapping,
+        PlainValidator(_environment_arguments),
+        PlainSerializer(plain),
+        WithJsonSchema({"type": "object", "propertyNames": {"not": {"const": "competitive"}}, "default": {}}),
+    ] = Field(
+        default_factory=lambda: FrozenMapping({}),
+        description="Arguments of the environment. `competitive` is not one: it follows from the rewards.",
+    )
+
+
+class UniformRange(Section):
+    """Where random initial values are drawn from: uniform in [low, high)."""
+
+    low: float = Field(default=0.0, description="The lowest value.")
+    high: float = Field(default=1.0, description="The bound above; never drawn itself.")
+
+    @model_validator(mode="after")
+    def _has_width(self) -> Self:
+        if not self.low < self.high:
+            raise refusal(("high",), f"found {self.high:g}, expected a number above low, {self.low:g}")
+        return self
+
+
+class RandomTable(Section):
+    """Initial values drawn at random, each cell on its own."""
+
+    random: UniformRange = Field(description="Where the values are drawn from.")
+
+
+class RunTable(Section):
+    """Initial values taken from a recorded run."""
+
+    run: str = Field(min_length=1, description="The recorded run: its name, id or file.")
+    step: Annotated[int, Field(ge=0, le=10**12)] | None = Field(
+        default=None, description="The training step to take the table at; null is the last."
+    )
+
+
+def _table_kind(value: object) -> str | None:
+    if isinstance(value, Section):
+        return type(value).__name__
+    if isinstance(value, Mapping) and value:
+        return "RandomTable" if "random" in value else "RunTable"
+    return "number" if isinstance(value, int | float) else None
+
+
+def _spelled_out(value: object) -> object:
+    return {"random": {}} if value == "random" else value
+
+
+_InitialTable = Annotated[
+    Annotated[float, Tag("number")]
+    | Annotated[RandomTable, Tag("RandomTable")]
+    | Annotated[RunTable, Tag("RunTable")],
+    Discriminator(_table_kind),
+]
+InitialTable = Annotated[
+    _InitialTable,
+    BeforeValidator(_spelled_out, json_schema_input_type=Literal["random"] | _InitialTable),
+]
+
+
+def _trial_start(value: object) -> object:
+    state = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31
+    if value in ("random", "each") or state:
+        return value
+    raise refusal((), f"found {value!r:.60}, expected 'random', 'each', or a state's number from 0")
+
+
+TrialStart = Annotated[
+    Literal["random", "each"] | int,
+    PlainValidator(_trial_start),
+    WithJsonSchema({"anyOf": [{"enum": ["random", "each"]}, {"type": "integer", "minimum": 0}]}),
+]
+
+
+class Evaluation(Section):
+    """When the greedy policy is tried out, and how often each time."""
+
+    every: Count = Field(description="Training episodes between evaluations.")
+    trials: Annotated[int, Field(ge=1, le=10**6)] = Field(description="Greedy episodes in an evaluation.")
+    start: TrialStart = Field(
+        default="random",
+        description="The states that trials start in: random, as training episodes do; each of the "
+        "environment's start states in turn; or the state of this number.",
+    )
+    exact: bool = Field(
+        default=False,
+        description="Whether the greedy policy is measured exactly besides, over all start states and "
+        "against the optimum, from the environment's transition table. Needs a discount below 1 for "
+        "discounted values; with 1 these are not a number.",
+    )
+
+
+class Log(Section):
+    """When training reports on itself, and over what."""
+
+    every_steps: Count = Field(default=50_000, description="Training steps between reports.")
+    window: Annotated[int, Field(ge=1, le=10**8)] = Field(
+        default=50_000, description="How many of the last training steps the reward distribution counts."
+    )
+    episodes: Annotated[int, Field(ge=1, le=10**6)] = Field(
+        default=50, description="How many of the last episodes the mean length is taken over."
+    )
+
+
+class Snapshots(Section):
+    """When the Q-tables are written to the recording as they are."""
+
+    every: Count | None = Field(
+        default=None,
+        description="Training episodes between snapshots; null takes only those before and after training. "
+        "A table at any other step is computed from the nearest snapshot and the recorded steps.",
+    )
+
+
+class Recording(Section):
+    """What the recording holds, and how it is packed."""
+
+    steps: Literal["all", "none"] = Field(
+        default="all", description="Whether environment steps are recorded: all, or none (measures only)."
+    )
+    compression: Literal["zstd", "lz4", "none"] = Field(
+        default="zstd", description="How the chunks of a recording are compressed."
+    )
+    level: Annotated[int, Field(ge=-7, le=19)] | None = Field(
+        default_factory=lambda chosen: 3 if chosen.get("compression") == "zstd" else None,
+        description="The level of zstd, from -7 (fast) to 19 (small); 3 unless given. Only with zstd.",
+    )
+    index: Literal["message", "chunk"] = Field(
+        default="message",
+        description="message: every message, as some readers need. chunk: only chunks, 16 bytes a step less.",
+    )
+    chunk_steps: Annotated[int, Field(ge=256, le=65_536)] = Field(
+        default=16_384, description="The most steps in one chunk; fewer when chunks are flushed by the clock."
+    )
+
+    @model_validator(mode="after")
+    def _level_goes_with_zstd(self) -> Self:
+        if self.level is None and self.compression == "zstd":
+            raise refusal(("level",), "found null, expected a whole number from -7 to 19: zstd has a level")
+        if self.level is not None and self.compression != "zstd":
+            message = (
+                f"found {self.level}, but compression is {self.compression}: only zstd has levels. Remove it"
+            )
+            raise refusal(("level",), message)
+        return self
+
+
+class Quirks(Section):
+    """Where the code of the published tutorial differs from its text; each off unless asked for."""
+
+    epsilon_exploits: bool = Field(
+        default=False,
+        description="Take epsilon as the probability of exploiting: the agents explore with 1 - epsilon.",
+    )
+    second_table_uses_first_action: bool = Field(
+        default=False,
+        description="Update the second agent's table at the first agent's action. Needs tables: per_agent.",
+    )
+    bootstrap_after_termination: bool = Field(
+        default=False,
+        description="Add the discounted value of the next state to the target even after termination.",
+    )
+
+
+class Hysteretic(Section):
+    """Hysteretic Q-learning's second step size; the first is `step_size`."""
+
+    decrease: Probability = Field(
+        default=0.01,
+        description="The step size of updates that lower a value, from 0 to 1; those that raise it take "
+        "`step_size`, which is to be the greater.",
+    )
+
+
+class WolfPhc(Section):
+    """How fast WoLF-PHC moves its policy towards the greedy action: it wins or learns fast."""
+
+    win: StepSize = Field(
+        default=0.05,
+        description="How much probability an update moves while the policy wins; at most `lose`.",
+    )
+    lose: StepSize = Field(default=0.2, description="How much it moves while the policy loses.")
+
+    @model_validator(mode="after")
+    def _wins_slowly(self) -> Self:
+        if isinstance(self.win, float) and isinstance(self.lose, float) and self.win > self.lose:
+            raise refusal(("win",), f"found {self.win:g}, expected at most lose, {self.lose:g}")
+        return self
