@@ -9,8 +9,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from runner.catalogue.database import Version, version
 from runner.catalogue.finding import Candidate
-from runner.catalogue.index import Version, look, version
+from runner.catalogue.index import look
 from runner.errors import RunNotFound
 from runner.finding import the_one
 from runner.runs import Run, run_of_id, runs_in

@@ -102,8 +102,8 @@ def _found(
     order = order_of(sort)
 
     def work(index: Index) -> tuple[list[dict[str, Any]], int]:
-        rows = with_originals(index.select(chosen, *order, limit=limit or None, offset=offset), index)
-        return rows, index.count(chosen) if limit or offset else len(rows)
+        rows, total = index.page(chosen, *order, limit=limit or None, offset=offset)
+        return with_originals(rows, index), total
 
     return look(recordings, work, say)
 

@@ -39,7 +39,8 @@ def command(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
       dualtaxi reindex
       dualtaxi reindex --recordings /data/runs --recordings recordings
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.catalogue.index import index_path, look
+    from runner.catalogue.database import index_path
+    from runner.catalogue.index import look
 
     began = time.monotonic()
     found = look(recordings, _found, say, anew=True)

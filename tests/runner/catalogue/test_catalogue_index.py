@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -15,9 +16,11 @@ from pathlib import Path
 import pytest
 
 import runner
+from runner.catalogue.database import index_path, opened
 from runner.catalogue.filters import Filter, parse
 from runner.catalogue.finding import find_run
-from runner.catalogue.index import index_path, look
+from runner.catalogue.folders import Folders
+from runner.catalogue.index import look
 from runner.config import from_mapping
 from runner.errors import RunNotFound
 from runner.labels import LABELS_FILE, Labels, change_labels, read_labels
@@ -94,13 +97,14 @@ def test_what_changes_is_seen_at_once(folder):
     assert ids(folder, "tag:keep note:why") == [runs[1].run_id]
 
 
-def test_only_what_changed_is_read(folder, monkeypatch):
+def test_only_what_changed_is_read(folder):
     for seed in range(5):
         create_run(folder, CONFIG, seed).update(status="finished")
     aged(folder)
     changed = list_runs(folder)[2].update(status="failed")
-    read = look([folder], lambda index: index.read)
-    assert [entry for _, entry in read] == [changed.run_id]
+    with contextlib.closing(opened(pytest.fail)) as database:
+        (news,) = Folders(database, [str(folder)]).news()
+    assert [row["entry"] for row in news.changed] == [changed.run_id]
     assert ids(folder, "status:failed") == [changed.run_id]
 
 

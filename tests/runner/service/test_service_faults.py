@@ -18,7 +18,7 @@ import httpx2 as httpx
 import pytest
 from serving import serving
 
-from runner.catalogue.index import index_path
+from runner.catalogue.database import index_path
 from runner.service.app import create_app
 from runner.service.server import bind, serve
 from runner.service.settings import Limits
