@@ -1,11 +1,13 @@
-"""Sizes, times and numbers in words, as a table or a page shows them."""
+"""Sizes, times, numbers and long lists in words, as a table or a page shows them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 UNKNOWN: Final = "–"
+MOST_LISTED: Final = 6
 
 
 def size(count: float) -> str:
@@ -57,3 +59,9 @@ def age(seconds: float) -> str:
 def number(value: float | None, digits: int = 1) -> str:
     """Return a number with some digits after the point; what is unknown (None, NaN) as a dash."""
     return UNKNOWN if value is None or math.isnan(value) else f"{value:,.{digits}f}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return the first of some names, and how many more there are: `a, b, c, d, e, f and 3 more`."""
+    more = len(names) - MOST_LISTED
+    return ", ".join(names[:MOST_LISTED]) + (f" and {more:,} more" if more > 0 else "")

@@ -71,7 +71,8 @@ def plot(*runs: Run) -> Shown:
         MissingExtra: Matplotlib is not installed.
         RecordingError: a recording cannot be read.
     """
-    from runner.analysis.series import groups_of, read_series
+    from runner.analysis.groups import groups_of
+    from runner.analysis.readings import read_series
     from runner.archive.places import at_hand
     from runner.export.plots import panels_of
     from runner.export.plots_figure import draw_figure

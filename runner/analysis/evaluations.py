@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runner.analysis.series import trained_before
+from runner.analysis.readings import trained_before
 from runner.errors import RecordingError
 from runner.recording.reader import Recording
 from runner.recording.schema import TRAIN_EPISODE

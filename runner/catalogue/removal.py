@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+from runner.amounts import listed
 from runner.catalogue.filters import Filter
 from runner.catalogue.index import Index
 from runner.catalogue.rows import Row
@@ -27,7 +28,6 @@ from runner.locking import locked
 from runner.runs import Run
 
 _STRAY_SECONDS: Final = 60
-_NAMED: Final = 5
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,8 @@ def plan(run: Run, root: Path, force: bool = False) -> Removal:
         except OSError as error:
             refusal = f"its folder cannot be read ({error.strerror})"
     if contents.strange and not force:
-        more = f" and {len(contents.strange) - _NAMED} more" if len(contents.strange) > _NAMED else ""
         refusal = (
-            f"its folder also has {', '.join(contents.strange[:_NAMED])}{more}, which no run writes; "
+            f"its folder also has {listed(contents.strange)}, which no run writes; "
             "move that away, or remove it as well with --force"
         )
     return Removal(run, root, contents, refusal)

@@ -8,8 +8,8 @@ from typing import Any
 
 from runner.analysis.compare import Comparison, MetricResult
 from runner.analysis.compare.sections import EXPLANATION, in_short, metric_section
+from runner.analysis.groups import Group
 from runner.analysis.sections import Grid
-from runner.analysis.series import Group
 from runner.errors import RunnerError
 from runner.export.plots import panels_of
 from runner.export.plots_compare import intervals_svg, letter, profile_svg

@@ -17,8 +17,9 @@ from runner.analysis.diff.sections import (
     where_in_words,
 )
 from runner.analysis.diff.tables import common_snapshots
+from runner.analysis.groups import Group
+from runner.analysis.readings import read_series
 from runner.analysis.sections import Grid, Section
-from runner.analysis.series import Group, read_series
 from runner.errors import RunnerError
 from runner.export import svg, svg_maps
 from runner.export.plots import Panel, panels_of

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.series import LOGGED, SHARES, TITLES, Group, points_of, title_of
+from runner.analysis.groups import Group
+from runner.analysis.series import LOGGED, SHARES, TITLES, points_of, title_of
 from runner.errors import RunnerError
 
 

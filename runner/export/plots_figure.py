@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from runner.analysis.series import SHARES, Group, is_loop
+from runner.analysis.groups import Group
+from runner.analysis.series import SHARES, is_loop
 from runner.errors import MissingExtra, RunnerError
 from runner.export.plots import Curve, Panel
 

@@ -13,7 +13,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.analysis.series import RunSeries, groups_of, read_series
+from runner.analysis.groups import groups_of
+from runner.analysis.readings import read_series
+from runner.analysis.series import RunSeries
 from runner.errors import MissingExtra, RecordingError
 from runner.export import svg, svg_maps
 from runner.export.plots import panels_of

@@ -38,7 +38,8 @@ def curves(path: Path, chosen: Sequence[str], start: int, stop: int | None, poin
         stop: behind the last; None: to the end.
         points: at most so many of a curve; of more, the lowest and the highest of each stretch are given.
     """
-    from runner.analysis.series import read_series, title_of
+    from runner.analysis.readings import read_series
+    from runner.analysis.series import title_of
 
     with open_recording(path) as recording:
         series = read_series(recording)
@@ -173,7 +174,7 @@ def plot(paths: Sequence[Path], form: str) -> bytes:
     """
     import tempfile
 
-    from runner.analysis.series import groups_of
+    from runner.analysis.groups import groups_of
     from runner.export.plots import panels_of
     from runner.export.plots_figure import matplotlib_of, save_figure
 
@@ -244,7 +245,7 @@ def as_json(value: Any) -> bytes:
 
 
 def _series(paths: Sequence[Path]) -> list[RunSeries]:
-    from runner.analysis.series import read_series
+    from runner.analysis.readings import read_series
 
     found = []
     for path in paths:

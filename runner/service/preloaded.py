@@ -4,5 +4,5 @@ from __future__ import annotations
 
 import runner.analysis.diff
 import runner.analysis.qtable
-import runner.analysis.series
+import runner.analysis.readings
 import runner.service.computed  # noqa: F401

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.series import Group
+from runner.analysis.groups import Group
 from runner.export.plots import Panel
 from runner.export.plots_figure import (
     COLOURS,

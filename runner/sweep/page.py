@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from runner.analysis.series import Group
+from runner.analysis.groups import Group
 from runner.export.plots_figure import COLOURS, footnote, is_wide, panel_svg
 from runner.export.report import TEMPLATES, require_packages, templates
 from runner.sweep.figure import parallel_svg, parameter_svgs

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from runner.analysis.compare.statistics import NEVER
-from runner.analysis.series import Group, read_series
+from runner.analysis.groups import Group
+from runner.analysis.readings import read_series
 from runner.archive.places import at_hand
 from runner.errors import RunnerError
 from runner.export.plots import Panel, panels_of

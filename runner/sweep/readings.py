@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from runner.analysis.compare.statistics import NEVER
-from runner.analysis.series import evaluation_readings, exact_readings, training_readings
+from runner.analysis.readings import evaluation_readings, exact_readings, training_readings
 from runner.errors import RunnerError, nearest
 from runner.frames import agents_of, evaluation_record, event_names_of
 from runner.recording.reader import Recording

@@ -15,10 +15,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from runner.amounts import listed
 from runner.analysis.compare import statistics
 from runner.analysis.compare.moments import Moment, higher_is_better, value_of
 from runner.analysis.compare.statistics import Estimate, Values
-from runner.analysis.series import Group, is_loop, points_of, title_of
+from runner.analysis.groups import Group
+from runner.analysis.series import is_loop, points_of, title_of
 
 THRESHOLDS: Final = 101
 
@@ -128,8 +130,8 @@ def _worlds(groups: Sequence[Group]) -> list[str]:
     told = {label: config["env"]["id"] for label, config in jobs if "env" in config}
     if len(set(told.values())) < 2:
         return []
-    listed = ", ".join(f"{env_id} in {label}" for label, env_id in told.items())
-    return [f"the environments differ ({listed}): their figures do not measure the same"]
+    where = ", ".join(f"{env_id} in {label}" for label, env_id in told.items())
+    return [f"the environments differ ({where}): their figures do not measure the same"]
 
 
 def _untested(metrics: Sequence[tuple[str, str]]) -> list[str]:
@@ -183,13 +185,8 @@ def _values(
             without.setdefault(reason, []).append(run.run_id)
         else:
             values[run.seed] = run.run_id, value
-    notes += [f"{group.label}, left out: {_few_of(runs)} ({reason})" for reason, runs in without.items()]
+    notes += [f"{group.label}, left out: {listed(runs)} ({reason})" for reason, runs in without.items()]
     return dict(sorted(values.items()))
-
-
-def _few_of(names: Sequence[str]) -> str:
-    more = len(names) - 5
-    return ", ".join(names[:5]) + (f" and {more} more" if more > 0 else "")
 
 
 def _ends(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> list[str]:
@@ -205,11 +202,11 @@ def _ends(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> li
     told = {label: max(points) for label, points in curves}
     if len(set(told.values())) < 2:
         return []
-    listed = ", ".join(f"after {end:,} episodes in {label}" for label, end in told.items())
+    ends = ", ".join(f"after {end:,} episodes in {label}" for label, end in told.items())
     last = "report of training" if metric.startswith("training.") else "evaluation"
     shared = set.intersection(*(set(points) for _, points in curves))
     again = f"; --at {max(shared)} compares after as many" if shared else ""
-    return [f"the last {last} is {listed}{again}"]
+    return [f"the last {last} is {ends}{again}"]
 
 
 def _reached(present: Sequence[tuple[str, dict[int, tuple[str, float]]]], moment: Moment) -> list[str]:

@@ -6,7 +6,8 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from runner.analysis.series import SHARES, Group, RunSeries, each_once, flat_config, label_of
+from runner.analysis.groups import Group, each_once, flat_config, label_of
+from runner.analysis.series import SHARES, RunSeries
 from runner.errors import RunnerError, nearest
 
 _NOT_COMPARED = ("seeds", "recording", "name")

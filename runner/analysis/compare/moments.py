@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.compare.statistics import NEVER
-from runner.analysis.series import Group, RunSeries, has_goal, points_of
+from runner.analysis.groups import Group
+from runner.analysis.series import RunSeries, has_goal, points_of
 from runner.errors import RunnerError
 
 _HIGHER_IS_BETTER: Final = {

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from runner.amounts import listed
 from runner.analysis.compare import Comparison, GroupResult, MetricResult, PairResult
 from runner.analysis.compare.statistics import Estimate
 from runner.analysis.sections import Grid, Section
@@ -23,7 +24,7 @@ EXPLANATION = (
 
 def sections(comparison: Comparison) -> list[Section]:
     """Return what is to be said of a comparison."""
-    rows = [(label, str(len(ids)), _few(ids)) for label, ids in comparison.groups.items()]
+    rows = [(label, str(len(ids)), listed(ids)) for label, ids in comparison.groups.items()]
     said = [*in_short(comparison), *(f"Note: {note}." for note in comparison.notes)]
     first = Section("Groups", said, [Grid(("group", "runs", ""), rows)])
     return [
@@ -84,9 +85,9 @@ def unpaired(pairs: Sequence[PairResult]) -> list[str]:
     for pair in pairs:
         for own, other, seeds in ((pair.a, pair.b, pair.left_out_a), (pair.b, pair.a, pair.left_out_b)):
             if seeds:
-                listed = _few([str(seed) for seed in seeds])
+                left_out = listed([str(seed) for seed in seeds])
                 said.append(
-                    f"{pair.a} against {pair.b} without seed {listed}, which {own} has and {other} has not"
+                    f"{pair.a} against {pair.b} without seed {left_out}, which {own} has and {other} has not"
                 )
     return said
 
@@ -131,8 +132,3 @@ def interval(estimate: Estimate, signed: bool = False) -> str:
     if math.isnan(estimate.low):
         return "–"
     return f"[{number(estimate.low, signed)}, {number(estimate.high, signed)}]"
-
-
-def _few(names: Sequence[str]) -> str:
-    more = len(names) - 6
-    return ", ".join(names[:6]) + (f" and {more} more" if more > 0 else "")

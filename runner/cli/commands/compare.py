@@ -14,7 +14,8 @@ from runner.cli.sections import print_sections, require_one_form, require_page
 
 if TYPE_CHECKING:
     from runner.analysis.compare import Comparison
-    from runner.analysis.series import Group, RunSeries
+    from runner.analysis.groups import Group
+    from runner.analysis.series import RunSeries
 
 
 @click.command("compare")
@@ -98,7 +99,7 @@ def command(
 
 def _read(names: tuple[str, ...], recordings: Path | None) -> list[RunSeries]:
     """Return the metrics of all runs that answer to the names."""
-    from runner.analysis.series import read_series
+    from runner.analysis.readings import read_series
     from runner.export.report_runs import find_runs
     from runner.recording.reader import open_recording
     from runner.runs import recordings_folder

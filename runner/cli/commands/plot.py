@@ -39,7 +39,8 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
       dualtaxi plot cooperative competitive -o comparison.pdf
       dualtaxi plot hyperparameters -o hyperparameters.png
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.analysis.series import groups_of, left_out, read_series
+    from runner.analysis.groups import groups_of, left_out
+    from runner.analysis.readings import read_series
     from runner.export.places import write_new
     from runner.export.plots import panels_of
     from runner.export.plots_figure import check_suffix, matplotlib_of, save_figure

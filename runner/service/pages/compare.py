@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Query, Request, Response
 
 from runner import amounts
-from runner.analysis.series import flat_config
+from runner.analysis.groups import flat_config
 from runner.errors import RunnerError
 from runner.runs import Run
 from runner.service import played

@@ -14,8 +14,9 @@ from runner.analysis.compare import compare, statistics
 from runner.analysis.compare.groups import grouped, metrics_of
 from runner.analysis.compare.moments import Moment
 from runner.analysis.compare.sections import in_short, sections
+from runner.analysis.groups import groups_of
 from runner.analysis.sections import markdown
-from runner.analysis.series import RunSeries, groups_of
+from runner.analysis.series import RunSeries
 from runner.errors import RunnerError
 from runner.export.plots import panels_of
 

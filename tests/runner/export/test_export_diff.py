@@ -13,7 +13,7 @@ from runner.analysis.compare import compare
 from runner.analysis.compare.groups import grouped, metrics_of
 from runner.analysis.compare.moments import Moment
 from runner.analysis.diff import diff
-from runner.analysis.series import read_series
+from runner.analysis.readings import read_series
 from runner.cli import cli
 from runner.export.compare_page import render_comparison
 from runner.export.diff_page import render_diff

@@ -9,7 +9,9 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.figure import Figure
 
-from runner.analysis.series import RunSeries, groups_of, read_series
+from runner.analysis.groups import groups_of
+from runner.analysis.readings import read_series
+from runner.analysis.series import RunSeries
 from runner.cli import cli
 from runner.errors import RunnerError
 from runner.export.plots import panels_of
