@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from runner.analysis.compare.moments import first_crossing
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.readings import evaluation_readings, exact_readings, training_readings
 from runner.errors import RunnerError, nearest
@@ -27,11 +27,10 @@ def curve_of(recording: Recording, metric: str) -> Curve:
         RunnerError: the metric is in none of them.
     """
     agents, events = agents_of(recording), event_names_of(recording)
-    exact = list(recording.optimality())
+    exact = {measures["evaluation"]: measures for measures in recording.optimality()}
     found = [
-        (metrics["episode"], readings(metrics, measures, agents, events))
-        for metrics, measures in itertools.zip_longest(recording.metrics("eval"), exact)
-        if metrics is not None
+        (metrics["episode"], readings(metrics, exact.get(metrics["evaluation"]), agents, events))
+        for metrics in recording.metrics("eval")
     ]
     curve = {episode: read[metric] for episode, read in found if metric in read}
     if not curve:
@@ -97,13 +96,8 @@ def value_of(objective: Objective, curve: Curve) -> float:
             return float(np.trapezoid(values, episodes)) / (episodes[-1] - episodes[0])
         case "first_over":
             assert objective.level is not None
-            rising = values[0] < objective.level
-            crossed = (
-                episode
-                for episode in episodes
-                if (curve[episode] >= objective.level if rising else curve[episode] <= objective.level)
-            )
-            return float(next(crossed, NEVER))
+            at = first_crossing(curve, objective.level)
+            return NEVER if at is None else float(at)
 
 
 def hopeless(objective: Objective, curve: Curve, bounds: Mapping[int, float]) -> bool:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from sweeping import described
 
+from runner.recording.reader import Recording, open_recording
 from runner.sweep.model import Objective, SweepFile
-from runner.sweep.readings import hopeless, value_of
+from runner.sweep.readings import curve_of, hopeless, value_of
 from runner.sweep.search import Search, bounds
 
 CURVE = {0: 0.0, 100: 40.0, 200: 80.0, 300: 60.0}
@@ -110,3 +111,18 @@ def test_a_run_is_hopeless_when_its_best_is_worse_than_most():
     down = Objective(direction="minimize")
     assert hopeless(down, {100: 30.0}, {100: 20.0})
     assert not hopeless(down, {100: 10.0}, {100: 20.0})
+
+
+def test_exact_measures_belong_to_their_own_evaluation(done, monkeypatch):
+    """One that was lost in a repair leaves the others where they are."""
+    folder, *_ = done
+    recording_path = next(folder.glob("*/recording.mcap"))
+    measures = [
+        {"evaluation": number, "finish_percent": 10.0 * number, "optimal_finish_percent": 100.0}
+        | {"mean_length": 1.0, "optimal_mean_length": 1.0, "optimal_value": 1.0}
+        | {"values": [0.5], "best_responses": [0.5]}
+        for number in range(4)
+    ]
+    monkeypatch.setattr(Recording, "optimality", lambda _: iter(measures[1:]))
+    with open_recording(recording_path) as recording:
+        assert curve_of(recording, "exact.finish_percent") == {20: 10.0, 40: 20.0, 60: 30.0}
