@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ORDER = """
-    amounts errors
+    amounts errors hashing
     cache compiled documents
     config owner labels
     job toy_text scene estimate

@@ -12,13 +12,13 @@ from blake3 import blake3
 
 from runner.archive.layout import FORMAT, MANIFEST, VERSION
 from runner.errors import RecordingError
+from runner.hashing import hash_of
 from runner.recording import schema
 from runner.recording.digest import combine
 from runner.scene import is_whole
 
 MAX_MANIFEST_BYTES: Final = 1 << 20
 _MOST: Final = 2**53
-_PIECE: Final = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -128,12 +128,7 @@ def entry_of(path: Path) -> Entry:
     Raises:
         OSError: it cannot be read.
     """
-    size, hashed = 0, blake3()
-    with path.open("rb") as stream:
-        while piece := stream.read(_PIECE):
-            hashed.update(piece)
-            size += len(piece)
-    return Entry(size, hashed.hexdigest())
+    return Entry(*hash_of(path))
 
 
 def entries_of(folder: Path) -> dict[str, Entry]:

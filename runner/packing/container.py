@@ -23,6 +23,7 @@ from blake3 import blake3
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from runner.errors import RunnerError
+from runner.hashing import hash_of
 from runner.labels import LABELS_FILE, MAX_LABELS_BYTES
 from runner.runs import RECORDING_FILE, RUN_FILE
 
@@ -86,14 +87,10 @@ def member_of(path: Path, name: str) -> Member:
         PackError: it is larger than such a file can be.
         OSError: it cannot be read.
     """
-    digest, size = blake3(), 0
-    with path.open("rb") as stream:
-        while piece := stream.read(_PIECE):
-            digest.update(piece)
-            size += len(piece)
+    size, digest = hash_of(path)
     if size > MOST_BYTES[name]:
         raise PackError(f"{path}: found {size:,} bytes, expected {MOST_BYTES[name]:,} at most.")
-    return Member.model_validate({"name": name, "size": size, "blake3": digest.hexdigest()})
+    return Member.model_validate({"name": name, "size": size, "blake3": digest})
 
 
 def write_pack(target: BinaryIO, manifest: Manifest, sources: Mapping[str, Path]) -> None:

@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 from urllib.parse import urlsplit
 
 from runner.errors import MissingExtra, RunnerError
+from runner.hashing import hash_of
 from runner.runs import Run
 from runner.service import watching
 from runner.service.address import checked_url
-from runner.service.parcel import Parcel, Sent, ServerAway, ServerError, digest_of
+from runner.service.parcel import Parcel, Sent, ServerAway, ServerError
 from runner.service.watching import Happened, JobThere
 
 if TYPE_CHECKING:
@@ -339,7 +340,7 @@ def _may_pass(error: ServerError) -> bool:
 
 def _size_and_digest(path: Path) -> tuple[int, str]:
     try:
-        return path.stat().st_size, digest_of(path)
+        return hash_of(path)
     except OSError as error:
         raise RunnerError(f"{path}: cannot be read ({error.strerror}).") from error
 

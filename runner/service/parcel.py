@@ -5,14 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
-
-from blake3 import blake3
+from typing import Any
 
 from runner.errors import RunnerError
 from runner.runs import Run
-
-_READ: Final = 1 << 20
 
 
 class ServerError(RunnerError):
@@ -74,16 +70,3 @@ class Sent:
     run_id: str = ""
     already: bool = False
     problem: str = ""
-
-
-def digest_of(path: Path) -> str:
-    """Return the BLAKE3 of a file; read, not mapped, so that little of it is in memory at a time.
-
-    Raises:
-        OSError: it cannot be read.
-    """
-    digest = blake3()
-    with path.open("rb") as stream:
-        while piece := stream.read(_READ):
-            digest.update(piece)
-    return digest.hexdigest()

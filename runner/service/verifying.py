@@ -22,8 +22,8 @@ from filelock import FileLock
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RunnerError, StorageError
+from runner.hashing import hash_of
 from runner.labels import labels_from
-from runner.service.parcel import digest_of
 from runner.service.upload import BODY_FILE, Completion, read_upload
 
 PATIENCE_SECONDS: Final = 120.0
@@ -117,7 +117,7 @@ def judge(folder: Path, recordings: Path) -> Verdict:
     with FileLock(folder / _LOCK_FILE):  # of a server that was killed, the verification may still go on
         try:
             completion = read_upload(folder).completion
-            if completion is None or digest_of(body) != completion.digest:
+            if completion is None or hash_of(body)[1] != completion.digest:
                 return Verdict(
                     problem="found another digest than was said: bytes changed on their way; send it again."
                 )
