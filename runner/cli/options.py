@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
 from runner.cli.parameters import RunName, TrialName
 from runner.errors import RunnerError
+
+if TYPE_CHECKING:
+    from runner.runs import Run
 
 run_argument: Final = click.argument("run_name", metavar="RUN", type=RunName())
 
@@ -78,7 +82,6 @@ token_file_option: Final = click.option(
     help="A file with the token; unlike --token, no other user can see it.",
 )
 
-
 server_option: Final = click.option(
     "--server",
     metavar="URL",
@@ -87,7 +90,7 @@ server_option: Final = click.option(
 )
 
 
-def find(name: str, recordings: Path | None) -> Any:
+def find(name: str, recordings: Path | None) -> Run:
     """Return the run of a name, or of a path, in the chosen folder."""
     from runner.catalogue.finding import find_run
     from runner.cli.output import say
@@ -96,12 +99,28 @@ def find(name: str, recordings: Path | None) -> Any:
     return find_run(name, recordings_folder(recordings), say)
 
 
-def find_recorded(name: str, recordings: Path | None) -> Any:
+def find_recorded(name: str, recordings: Path | None) -> Run:
     """Return the run of a name with its recording at hand: restored into the cache if it is archived."""
     return recorded(find(name, recordings))
 
 
-def recorded(run: Any) -> Any:
+def find_all_recorded(names: Iterable[str], recordings: Path | None) -> list[Run]:
+    """Return the runs that answer to the names, each once, with their recordings at hand.
+
+    A name stands for all runs of that name.
+    """
+    from runner.runs import list_runs, recordings_folder
+
+    known = list_runs(recordings_folder(recordings))
+    found: dict[Path, Run] = {}
+    for name in names:
+        alike = [run for run in reversed(known) if run.name == name]
+        for run in alike or [find(name, recordings)]:
+            found.setdefault(run.recording.absolute(), run)
+    return [recorded(run) for run in found.values()]
+
+
+def recorded(run: Run) -> Run:
     """Return a run with its recording at hand: restored into the cache if it is archived, and said so.
 
     Raises:
@@ -113,7 +132,7 @@ def recorded(run: Any) -> Any:
     return run
 
 
-def _without_recording(run: Any) -> str:
+def _without_recording(run: Run) -> str:
     """Return what can be done about a run whose recording is missing."""
     if run.status == "running":
         return f"run {run.run_id} has no recording yet: it has just begun."
@@ -125,7 +144,7 @@ def _without_recording(run: Any) -> str:
     )
 
 
-def restored(run: Any) -> Any:
+def restored(run: Run) -> Run:
     """Return a run, restored into the cache if it is archived, and said so."""
     if run.status != "archived":
         return run

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import MissingExtra, RunnerError
+from runner.export.contents import status_of
 from runner.export.scalars import created, measures, seconds_of
 from runner.recording.reader import Recording
 
@@ -155,7 +156,7 @@ def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) 
         client.log_artifact(run_id, str(path))
     if with_recording:
         client.log_artifact(run_id, str(recording.path))
-    status = _STATUS.get(recording.result.get("status", "interrupted"), "KILLED")
+    status = _STATUS.get(status_of(recording), "KILLED")
     client.set_terminated(run_id, status, round(max(last, began) * 1000))
     notes += [
         f"{_short(name)} is called {_short(key)}: MLflow takes no such name."
@@ -193,7 +194,7 @@ def _tags(recording: Recording) -> dict[str, str]:
         DIGEST_TAG: _digest(recording),
         "dualtaxi.job": run["job"],
         "dualtaxi.seed": run["seed"],
-        "dualtaxi.status": recording.result.get("status", "interrupted"),
+        "dualtaxi.status": status_of(recording),
     }
 
 

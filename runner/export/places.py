@@ -10,9 +10,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from runner.errors import MissingExtra, RecordingError, RunnerError, StorageError
-from runner.export.report_runs import has_steps
-from runner.recording.reader import Recording
+from runner.errors import MissingExtra, RunnerError, StorageError
 
 
 def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
@@ -109,26 +107,3 @@ def require_pyarrow(purpose: str) -> None:
         import pyarrow  # noqa: F401
     except ImportError as error:
         raise MissingExtra("pyarrow", "archive", purpose) from error
-
-
-def require_steps(recording: Recording) -> None:
-    """Refuse a recording without steps.
-
-    Raises:
-        RecordingError: it has none.
-    """
-    if not has_steps(recording):
-        hint = "; `dualtaxi rerecord` records them" if recording.kind == "job" else ""
-        raise RecordingError(f"{recording.path}: found no steps to export{hint}.")
-
-
-def shortcomings(recording: Recording) -> list[str]:
-    """Return what whoever exports a run should know of it, a sentence each."""
-    said = []
-    status = recording.result.get("status", "interrupted")
-    if status != "finished":
-        said.append(
-            f"The run did not finish ({status}): exported is what there is, up to its last whole chunk."
-        )
-    said += [f"Of {topic} some messages were lost in a repair; they are missing." for topic in recording.lost]
-    return said

@@ -18,6 +18,7 @@ from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries
 from runner.errors import MissingExtra, RecordingError
 from runner.export import svg, svg_maps
+from runner.export.contents import has_steps, shortcomings, status_of, why_no_steps
 from runner.export.plots import panels_of
 from runner.export.plots_figure import footnote, is_wide, matplotlib_of, panel_svg
 from runner.export.report_maps import MapRow, maps_of, stages_of
@@ -29,7 +30,6 @@ from runner.export.report_replay import (
     training_episode,
     trial,
 )
-from runner.export.report_runs import has_steps, shortcomings, state_of
 from runner.frames import agents_of, environment_of, evaluation_records
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
@@ -113,7 +113,7 @@ def _run(recording: Recording, series: RunSeries, number: int, chosen: Sequence[
         "id": recording.run["run_id"],
         "name": recording.run["name"],
         "seed": recording.run["seed"],
-        "state": state_of(recording),
+        "state": status_of(recording),
         "agents": [agent.replace("_", " ") for agent in environment["agents"]],
         "learners": agents_of(recording),
         "environment": environment,
@@ -125,10 +125,25 @@ def _run(recording: Recording, series: RunSeries, number: int, chosen: Sequence[
         "broad": drawing is not None and drawing.width > BROAD,
         "config": _flat(recording.config),
         "provenance": recording.provenance,
-        "notes": shortcomings(recording),
+        "notes": _notes(recording),
         "maps": _maps(recording, episodes),
         "replay": _replay(recording, episodes, drawing),
     }
+
+
+def _notes(recording: Recording) -> list[str]:
+    """Return what a reader should know that is missing, a sentence each."""
+    run, notes = recording.run["run_id"], shortcomings(recording)
+    if recording.kind != "job":
+        notes.append(
+            f"Run {run} was recorded from a loop: what it learned is not known, so no episode is shown with "
+            "it; `dualtaxi view` shows what was recorded."
+        )
+    elif not has_steps(recording):
+        notes.append(
+            f"No episode of run {run} can be replayed, as there are no steps: {why_no_steps(recording)}."
+        )
+    return notes
 
 
 def _last_of_loop(series: RunSeries) -> dict[str, Any] | None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.analysis.tables import TableReplay, check_steps, tables_at
 from runner.errors import RecordingError
-from runner.export.report_runs import require_steps
+from runner.export.contents import require_steps
 from runner.frames import agents_of
 from runner.mdp import Mdp
 from runner.recording import schema
@@ -100,7 +100,7 @@ def training_episode(recording: Recording, number: int, most: int = MOST_STEPS, 
     Raises:
         RecordingError: there is no such episode, or no steps.
     """
-    require_steps(recording)
+    require_steps(recording, "show")
     title = f"training episode {number:,}"
     return _episode(recording, "train", number, title, range(first, first + most))
 
@@ -113,7 +113,7 @@ def trial(recording: Recording, after: int, number: int, most: int = MOST_STEPS,
     Raises:
         RecordingError: there is no such evaluation or trial, or no steps.
     """
-    require_steps(recording)
+    require_steps(recording, "show")
     where = str(recording.path)
     evaluation = evaluation_after(evaluations_of(recording), after, where)
     index = evaluation.trial(number, where)
@@ -149,7 +149,7 @@ def typical_trial(recording: Recording) -> tuple[int, int]:
     Raises:
         RecordingError: there is no evaluation, or no steps.
     """
-    require_steps(recording)
+    require_steps(recording, "show")
     after = last_whole_evaluation(recording)
     if after is None:
         raise RecordingError(f"{recording.path}: has no whole evaluation; choose a training episode.")

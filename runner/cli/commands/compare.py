@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.options import json_option, recorded, recordings_option, runs_argument
+from runner.cli.options import find_all_recorded, json_option, recordings_option, runs_argument
 from runner.cli.output import print_json, say
 from runner.cli.sections import print_sections, require_one_form, require_page
 
@@ -100,12 +100,10 @@ def command(
 def _read(names: tuple[str, ...], recordings: Path | None) -> list[RunSeries]:
     """Return the metrics of all runs that answer to the names."""
     from runner.analysis.readings import read_series
-    from runner.export.report_runs import find_runs
     from runner.recording.reader import open_recording
-    from runner.runs import recordings_folder
 
     found = []
-    for run in map(recorded, find_runs(names, recordings_folder(recordings))):
+    for run in find_all_recorded(names, recordings):
         with open_recording(run.recording) as recording:
             found.append(read_series(recording))
     return found

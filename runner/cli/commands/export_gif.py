@@ -75,16 +75,16 @@ def command(
     if episode is not None and trial is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
     from runner.export import report_replay as replay
+    from runner.export.contents import require_steps, shortcomings
     from runner.export.gif import require_packages, require_states, write_gif
     from runner.export.places import write_new
-    from runner.export.report_runs import require_steps, shortcomings, state_of
     from runner.recording.reader import open_recording
 
     require_packages()
     said: list[int] = []
     with open_recording(find_recorded(run_name, recordings).recording) as recording:
         require_states(recording)
-        require_steps(recording)
+        require_steps(recording, "show")
         if episode is None and trial is None and replay.last_whole_evaluation(recording) is None:
             episode = replay.last_episode(recording)
             say(f"There is no whole evaluation: this is the last training episode, {episode:,}.")
@@ -94,8 +94,8 @@ def command(
             after, number = trial or replay.typical_trial(recording)
             shown = replay.trial(recording, after, number, steps)
         write_new(output, force, lambda path: said.append(write_gif(path, recording, shown, speed, width)))
-        if state_of(recording) != "finished":
-            say(shortcomings(recording)[0])
+        for shortcoming in shortcomings(recording):
+            say(shortcoming)
     if shown.steps < shown.length:
         say(f"Shown are the first {shown.steps:,} of {shown.length:,} steps; --steps shows more.")
     click.echo(f"{output}: {shown.title}, {said[0]} frames, {size(output.stat().st_size)}")

@@ -53,13 +53,14 @@ def command(
       dualtaxi export minari @latest --phase eval
       dualtaxi export minari k3v9m2xq --episodes 49000: -o datasets
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.export.contents import require_steps, shortcomings
     from runner.export.minari import OURS, dataset_id, require_packages, write_dataset
-    from runner.export.places import new_folder, require_steps, shortcomings
+    from runner.export.places import new_folder
     from runner.recording.reader import open_recording
 
     require_packages()
     with open_recording(find_recorded(run_name, recordings).recording) as recording:
-        require_steps(recording)
+        require_steps(recording, "export")
         path = output / dataset_id(recording)
         total = recording.count(recording.topic(f"/{phase}/episode"))
         with new_folder(path, force, OURS) as folder, counting("episodes", total) as report:

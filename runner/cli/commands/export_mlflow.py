@@ -37,8 +37,8 @@ def command(
       dualtaxi export mlflow @latest
       dualtaxi export mlflow k3v9m2xq --tracking-uri http://127.0.0.1:5000 --with-recording
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.export.contents import shortcomings
     from runner.export.mlflow import export, require_packages
-    from runner.export.places import shortcomings
     from runner.recording.reader import open_recording
 
     require_packages()

@@ -67,7 +67,8 @@ def _export(
     recordings: Path | None,
     gz: bool,
 ) -> None:
-    from runner.export.places import new_folder, require_pyarrow, require_steps, shortcomings
+    from runner.export.contents import require_steps, shortcomings
+    from runner.export.places import new_folder, require_pyarrow
 
     require_pyarrow(f"export {form}")
     from runner.export.tables import OURS, Choice, left_out, write_tables
@@ -77,7 +78,7 @@ def _export(
     path = output or Path(f"{run.facts['name']}-{run.run_id}-{form}")
     choice = Choice(phase or ("train" if episodes else ""), episodes or ())
     with open_recording(run.recording) as recording:
-        require_steps(recording)
+        require_steps(recording, "export")
         total = int(recording.result.get("train_steps", 0)) + int(recording.result.get("eval_steps", 0))
         with new_folder(path, force, OURS) as folder, counting("steps", total) as report:
             rows = write_tables(recording, folder, form, choice, gz, report)

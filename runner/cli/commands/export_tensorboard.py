@@ -32,7 +32,8 @@ def command(run_name: str, output: Path | None, force: bool, recordings: Path | 
       dualtaxi export tensorboard @latest
       dualtaxi export tensorboard k3v9m2xq -o logs/patient --force
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.export.places import new_folder, shortcomings
+    from runner.export.contents import shortcomings
+    from runner.export.places import new_folder
     from runner.export.tensorboard import OURS, require_packages, write_events
     from runner.recording.reader import open_recording
 

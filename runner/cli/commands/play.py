@@ -63,11 +63,12 @@ def command(
     if episode is not None and trial is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
     from runner.cli.episode import Episode
+    from runner.export.contents import require_steps
     from runner.recording.reader import open_recording
 
     run = find_recorded(run_name, recordings)
     with open_recording(run.recording) as recording:
-        _require_steps(recording)
+        require_steps(recording, "play")
         phase, number, title = _chosen(recording, episode, trial)
         played = Episode(recording, phase, number, f"{run.name}, seed {run.seed}: {title}")
     if as_json:
@@ -75,21 +76,6 @@ def command(
             print_json(step, indent=None)
     else:
         _show(played, speed)
-
-
-def _require_steps(recording: Recording) -> None:
-    """Refuse a recording that was made without steps.
-
-    Raises:
-        RecordingError: it was.
-    """
-    from runner.errors import RecordingError
-
-    if recording.config["recording"]["steps"] == "none":
-        raise RecordingError(
-            f"{recording.path}: was recorded without steps (recording.steps: none), so there is nothing to "
-            f"play. `dualtaxi rerecord {recording.run['run_id']}` records them."
-        )
 
 
 def _chosen(recording: Recording, episode: int | None, trial: tuple[int, int] | None) -> tuple[str, int, str]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import recorded, recordings_option, runs_argument
+from runner.cli.options import find_all_recorded, recordings_option, runs_argument
 from runner.cli.output import say
 
 
@@ -41,10 +41,10 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.groups import groups_of, left_out
     from runner.analysis.readings import read_series
+    from runner.export.contents import shortcomings
     from runner.export.places import write_new
     from runner.export.plots import panels_of
     from runner.export.plots_figure import check_suffix, matplotlib_of, save_figure
-    from runner.export.report_runs import find_runs, shortcomings, state_of
     from runner.recording.reader import open_recording
     from runner.runs import recordings_folder
     from runner.sweep.state import is_sweep
@@ -56,11 +56,11 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
         _draw_sweep(run_names[0], folder, output, force)
         return
     series = []
-    for run in map(recorded, find_runs(run_names, folder)):
+    for run in find_all_recorded(run_names, folder):
         with open_recording(run.recording) as recording:
             series.append(read_series(recording))
-            if state_of(recording) != "finished":
-                say(shortcomings(recording)[0])
+            for shortcoming in shortcomings(recording):
+                say(shortcoming)
     groups = groups_of(series)
     for note in left_out(groups):
         say(f"{note[0].upper()}{note[1:]}.")

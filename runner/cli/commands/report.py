@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import recorded, recordings_option, runs_argument
+from runner.cli.options import find_all_recorded, recordings_option, runs_argument
 from runner.cli.output import say, size
 from runner.cli.parameters import TrialName
 
@@ -66,7 +66,6 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     from runner.export.places import write_new
     from runner.export.report import require_packages, write_report
-    from runner.export.report_runs import find_runs
     from runner.runs import recordings_folder
     from runner.sweep.state import is_sweep
 
@@ -79,7 +78,7 @@ def command(
         return
     chosen = [("train", number, 0) for number in episodes]
     chosen += [("eval", *trial) for trial in trials]
-    paths = [run.recording for run in map(recorded, find_runs(run_names, folder))]
+    paths = [run.recording for run in find_all_recorded(run_names, folder)]
     said: list[str] = []
     write_new(output, force, lambda path: said.extend(write_report(path, paths, chosen)))
     for sentence in said:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.evaluations import Evaluation
 from runner.errors import RecordingError
+from runner.export.contents import shortcomings
 from runner.export.rerun.classes import vocabulary_of
 from runner.export.rerun.columns import Batch, Sender, no_thoughts, scalars
 from runner.export.rerun.events import EventWriter
@@ -28,7 +29,6 @@ from runner.export.rerun.selection import (
     Selection,
     Span,
     chosen_spans,
-    interrupted,
 )
 from runner.frames import agents_of
 from runner.recording import schema
@@ -55,9 +55,7 @@ def select_loop(recording: Recording, request: Request) -> Selection:
         raise RecordingError(
             f"{recording.path}: a loop has no numbered evaluations; --all exports all steps."
         )
-    selection = Selection()
-    if recording.result.get("status") != "finished":
-        selection.warnings.append(interrupted(recording))
+    selection = Selection(warnings=shortcomings(recording))
     if recording.kind == "variable":
         selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
     total = recording.count(schema.TRAIN_STEP)

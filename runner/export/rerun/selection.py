@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.evaluations import Evaluation, evaluation_after
 from runner.errors import RecordingError
+from runner.export.contents import has_steps, require_steps, shortcomings, why_no_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
 
@@ -92,13 +93,15 @@ def select(recording: Recording, request: Request) -> Selection:
         from runner.export.rerun.loops import select_loop
 
         return select_loop(recording, request)
-    selection = Selection()
-    if not recording.finished or recording.result.get("status", "interrupted") != "finished":
-        selection.warnings.append(interrupted(recording))
+    selection = Selection(warnings=shortcomings(recording))
     if recording.mdp.scene is None or recording.mdp.scene_cells is None:
         selection.warnings.append("The environment has no scene: state and action are shown as series.")
-    if _has_no_steps(recording):
-        _without_steps(recording, request, selection)
+    if not has_steps(recording):
+        if not request.is_default:
+            require_steps(recording, "export")
+        selection.warnings.append(
+            f"Only metrics are exported, as there are no steps: {why_no_steps(recording)}."
+        )
         return selection
     train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
     evaluations = evaluations_with_steps(recording, train, evals)
@@ -200,28 +203,6 @@ def _evaluations(
     if request.is_default:
         asked += evaluations[-1:]
     return sorted(set(asked), key=lambda one: one.after)
-
-
-def _has_no_steps(recording: Recording) -> bool:
-    return recording.config["recording"]["steps"] == "none" or not any(
-        recording.count(topic) for topic in (schema.TRAIN_STEP, schema.EVAL_STEP)
-    )
-
-
-def _without_steps(recording: Recording, request: Request, selection: Selection) -> None:
-    if recording.config["recording"]["steps"] != "none":
-        selection.warnings.append("No step was recorded before the run ended: only metrics are exported.")
-        return
-    hint = "`dualtaxi rerecord` runs the job again and records them"
-    if not request.is_default:
-        raise RecordingError(f"{recording.path}: was recorded without steps; {hint}.")
-    selection.warnings.append(f"The run was recorded without steps: only metrics are exported; {hint}.")
-
-
-def interrupted(recording: Recording) -> str:
-    """Return what is to be said of a run that did not finish."""
-    status = recording.result.get("status", "interrupted")
-    return f"The run did not finish ({status}): exported is what there is, up to its last whole chunk."
 
 
 def _tell(

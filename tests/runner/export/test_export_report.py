@@ -117,8 +117,8 @@ def test_an_interrupted_run_is_shown_as_far_as_it_got(pictured, tmp_path, share)
     cut.write_bytes(whole.read_bytes()[: int(whole.stat().st_size * share)])
     result = report(cut, "-o", tmp_path / "r.html")
     assert result.exit_code == 0, result.output
-    assert "was interrupted" in result.stderr
-    assert "was interrupted" in (tmp_path / "r.html").read_text()
+    assert "did not finish (interrupted)" in result.stderr
+    assert "did not finish (interrupted)" in (tmp_path / "r.html").read_text()
 
 
 def test_what_is_not_there_is_refused(pictured, tmp_path):

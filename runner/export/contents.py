@@ -1,0 +1,48 @@
+"""What a recording has to be shown or exported, and what is to be said of what it has not."""
+
+from __future__ import annotations
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.reader import Recording
+
+
+def status_of(recording: Recording) -> str:
+    """Return `finished`, or what the run is instead."""
+    return str(recording.result.get("status", "interrupted"))
+
+
+def shortcomings(recording: Recording) -> list[str]:
+    """Return what is missing from a recording, a sentence each; of a whole one nothing."""
+    said, status = [], status_of(recording)
+    if status != "finished":
+        done = "there is what its loop had done"
+        if recording.kind == "job":
+            episodes, planned = recording.count(schema.TRAIN_EPISODE), recording.config["episodes"]
+            done = f"there are {episodes:,} of {planned:,} training episodes"
+        said.append(f"Run {recording.run['run_id']} did not finish ({status}): {done}.")
+    said += [f"Of {topic} some messages were lost in a repair; they are missing." for topic in recording.lost]
+    return said
+
+
+def has_steps(recording: Recording) -> bool:
+    """Return whether any step was recorded."""
+    return bool(recording.count(schema.TRAIN_STEP) or recording.count(schema.EVAL_STEP))
+
+
+def require_steps(recording: Recording, purpose: str) -> None:
+    """Refuse a recording without steps; the purpose is what is to be done with them, such as `play`.
+
+    Raises:
+        RecordingError: it has none.
+    """
+    if not has_steps(recording):
+        raise RecordingError(f"{recording.path}: found no steps to {purpose}: {why_no_steps(recording)}.")
+
+
+def why_no_steps(recording: Recording) -> str:
+    """Return why a recording has no steps, and what gives it some."""
+    if recording.config["recording"]["steps"] == "none":
+        run_id = recording.run["run_id"]
+        return f"they were left out (recording.steps: none); `dualtaxi rerecord {run_id}` records them"
+    return "it ended before one was recorded"
