@@ -50,6 +50,11 @@ def action_names(mdp: Mdp) -> list[list[str]] | None:
     return [names for _ in mdp.agents]
 
 
+def numbered_actions(mdp: Mdp) -> list[list[str]]:
+    """Return the words of each agent's actions; `action 3` where the scene does not name them."""
+    return action_names(mdp) or [[f"action {i}" for i in range(count)] for count in mdp.action_counts]
+
+
 def agent_actions(mdp: Mdp, action: int) -> tuple[int, ...]:
     """Return the action of each agent in a joint action."""
     return tuple(int(own) for own in np.unravel_index(action, mdp.action_counts))
@@ -59,6 +64,11 @@ def event_in_words(name: str) -> str:
     """Return an event's name as people say it: `taxi_1.drop_off` is `taxi 1 drop-off`."""
     agent, _, event = name.rpartition(".")
     return f"{agent.replace('_', ' ')} {spoken(event)}".strip()
+
+
+def events_in_words(mdp: Mdp, mask: int) -> str:
+    """Return the events of a bit mask in words, parted by commas."""
+    return ", ".join(event_in_words(name) for bit, name in enumerate(mdp.event_names) if mask >> bit & 1)
 
 
 def spoken(name: str) -> str:

@@ -10,11 +10,9 @@ from runner.analysis.compare import Comparison, MetricResult
 from runner.analysis.compare.sections import EXPLANATION, in_short, metric_section
 from runner.analysis.groups import Group
 from runner.analysis.sections import Grid
-from runner.errors import RunnerError
-from runner.export.plots import panels_of
 from runner.export.plots_compare import intervals_svg, letter, profile_svg
-from runner.export.plots_figure import COLOURS, footnote, is_wide, panel_svg
-from runner.export.report import TEMPLATES, require_packages, templates
+from runner.export.plots_figure import COLOURS, footnote
+from runner.export.report import TEMPLATES, curves, require_packages, templates
 
 
 def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
@@ -41,7 +39,7 @@ def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
                 for i, group in enumerate(groups)
             ],
             metrics=[_metric(metric, labels) for metric in comparison.metrics],
-            panels=_panels(groups),
+            panels=curves(groups),
             footnote=footnote(groups),
             runs=_runs(groups),
             explanation=EXPLANATION,
@@ -70,23 +68,9 @@ def _metric(metric: MetricResult, labels: list[str]) -> dict[str, Any]:
     }
 
 
-def _panels(groups: Sequence[Group]) -> list[dict[str, Any]]:
-    try:
-        panels = panels_of(groups)
-    except RunnerError:
-        return []
-    return [{"svg": panel_svg(panel, len(groups)), "wide": is_wide(panel)} for panel in panels]
-
-
 def _runs(groups: Sequence[Group]) -> Grid:
     rows = [
-        (
-            run.run_id,
-            f"{letter(i)}: {group.label}",
-            run.name,
-            str(run.seed),
-            run.status,
-        )
+        (run.run_id, f"{letter(i)}: {group.label}", run.name, str(run.seed), run.status)
         for i, group in enumerate(groups)
         for run in group.runs
     ]

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
+from typing import Any
+
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -46,3 +50,14 @@ def why_no_steps(recording: Recording) -> str:
         run_id = recording.run["run_id"]
         return f"they were left out (recording.steps: none); `dualtaxi rerecord {run_id}` records them"
     return "it ended before one was recorded"
+
+
+def flat_text(config: Mapping[str, Any]) -> dict[str, str]:
+    """Return a resolved configuration as flat text: `evaluation.trials` is `100`; lists as JSON."""
+    flat: dict[str, str] = {}
+    for key, value in config.items():
+        if isinstance(value, Mapping) and value:
+            flat |= {f"{key}.{inner}": text for inner, text in flat_text(value).items()}
+        else:
+            flat[key] = value if isinstance(value, str) else json.dumps(value)
+    return flat

@@ -20,12 +20,10 @@ from runner.analysis.diff.tables import common_snapshots
 from runner.analysis.groups import Group
 from runner.analysis.readings import read_series
 from runner.analysis.sections import Grid, Section
-from runner.errors import RunnerError
 from runner.export import svg, svg_maps
-from runner.export.plots import Panel, panels_of
 from runner.export.plots_diff import tables_svg
-from runner.export.plots_figure import COLOURS, is_wide, panel_svg
-from runner.export.report import BROAD, TEMPLATES, require_packages, templates
+from runner.export.plots_figure import COLOURS
+from runner.export.report import BROAD, TEMPLATES, curves, require_packages, templates
 from runner.export.report_maps import situation, situation_in_words
 from runner.export.report_replay import deeds_in_words
 from runner.mdp import Mdp
@@ -54,7 +52,7 @@ def render_diff(difference: RunDiff, a: Recording, b: Recording) -> str:
         .get_template("diff.html")
         .render(
             told_of(difference, a, b),
-            panels=_panels(a, b),
+            panels=_curves(a, b),
             ramp=", ".join(svg_maps.RAMP),
             style=(TEMPLATES / "report.css").read_text("utf-8") + svg.STYLE + svg_maps.STYLE,
             dark=(TEMPLATES / "report_dark.css").read_text("utf-8"),
@@ -232,11 +230,6 @@ def _map(mdp: Mdp, apart: NDArray[np.float64], agent: str) -> list[dict[str, Any
     return [{"svg": picture, "caption": caption, "high": bounds[1]}]
 
 
-def _panels(a: Recording, b: Recording) -> list[dict[str, Any]]:
+def _curves(a: Recording, b: Recording) -> list[dict[str, Any]]:
     """Return both runs' metrics, a plot each."""
-    groups = [Group(name, (read_series(recording),)) for name, recording in (("A", a), ("B", b))]
-    try:
-        panels: list[Panel] = panels_of(groups)
-    except RunnerError:
-        return []
-    return [{"svg": panel_svg(panel, len(groups)), "wide": is_wide(panel)} for panel in panels]
+    return curves([Group(name, (read_series(recording),)) for name, recording in (("A", a), ("B", b))])

@@ -21,7 +21,7 @@ from runner.export.report_replay import Episode, deeds_in_words
 from runner.frames import agents_of
 from runner.mdp import Mdp
 from runner.recording.reader import Recording
-from runner.words import event_in_words, states_in_words
+from runner.words import events_in_words, spoken, states_in_words
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -127,14 +127,13 @@ def captions_of(mdp: Mdp, learners: list[str], episode: Episode, scene: bool = T
     totals = np.cumsum(episode.rewards, axis=0)
     captions = [[f"step 0 of {episode.length:,}", "the episode begins", ""]]
     for k in range(episode.steps):
-        names = [event_in_words(name) for i, name in enumerate(mdp.event_names) if episode.events[k] >> i & 1]
         explored = " (explored)" if episode.explored[k] else ""
         rewards = _rewards(learners, episode.rewards[k].tolist(), totals[k].tolist())
         captions.append(
             [
                 f"step {k + 1:,} of {episode.length:,}: {actions[episode.actions[k]]}{explored}",
                 rewards,
-                ", ".join(names),
+                events_in_words(mdp, int(episode.events[k])),
             ]
         )
     if episode.steps < episode.length:
@@ -148,7 +147,7 @@ def captions_of(mdp: Mdp, learners: list[str], episode: Episode, scene: bool = T
 def _rewards(learners: list[str], rewards: list[float], totals: list[float]) -> str:
     if len(rewards) == 1:
         return f"reward {rewards[0]:+g}, sum {totals[0]:+g}"
-    each = [f"{name.replace('_', ' ')} {own:+g}" for name, own in zip(learners, rewards, strict=True)]
+    each = [f"{spoken(name)} {own:+g}" for name, own in zip(learners, rewards, strict=True)]
     return f"reward {', '.join(each)}; sum {sum(totals):+g}"
 
 

@@ -9,14 +9,14 @@ import os
 import re
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count, islice
 from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import MissingExtra, RunnerError
-from runner.export.contents import status_of
+from runner.export.contents import flat_text, status_of
 from runner.export.scalars import created, measures, seconds_of
 from runner.recording.reader import Recording
 
@@ -87,17 +87,6 @@ def export(
             raise
 
 
-def params_of(config: Mapping[str, Any]) -> dict[str, str]:
-    """Return a resolved configuration as flat text: `evaluation.trials` is `100`; lists as JSON."""
-    flat: dict[str, str] = {}
-    for key, value in config.items():
-        if isinstance(value, Mapping) and value:
-            flat |= {f"{key}.{inner}": text for inner, text in params_of(value).items()}
-        else:
-            flat[key] = value if isinstance(value, str) else json.dumps(value)
-    return flat
-
-
 def _export(
     recording: Recording, tracking: str, experiment: str, with_recording: bool, force: bool
 ) -> Exported:
@@ -129,7 +118,7 @@ def _export(
 def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) -> Exported:
     from mlflow.entities import Metric, Param
 
-    params, names = params_of(recording.config), dict[str, str]()
+    params, names = flat_text(recording.config), dict[str, str]()
     fitting = [Param(_name(key, names), text) for key, text in params.items() if len(text) <= _LONGEST]
     notes = [
         f"{key} is longer than MLflow's {_LONGEST:,} characters; it is in run.json alone."

@@ -5,7 +5,6 @@ Groups have the colours and markers that they have in the learning curves.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
@@ -99,7 +98,7 @@ def _draw_group(axes: Axes, group: GroupResult, row: int, number: int) -> None:
 
 def _svg(metric: MetricResult, title: str, kind: str, height: float, draw: Callable[[Axes], None]) -> str:
     mpl = matplotlib_of("a page")
-    with mpl.rc_context(STYLE | {"savefig.transparent": True}):
+    with mpl.rc_context(STYLE):
         figure = mpl.figure.Figure(figsize=(_WIDTH, height))
         axes = figure.add_axes((0.68 / _WIDTH, 0.5 / height, 0.8, 1 - 0.72 / height))
         draw(axes)
@@ -108,9 +107,7 @@ def _svg(metric: MetricResult, title: str, kind: str, height: float, draw: Calla
         axes.margins(x=0.05)
         axes.xaxis.set_major_locator(mpl.ticker.MaxNLocator(5, steps=[1, 2, 5, 10]))
         axes.xaxis.set_major_formatter(number_on_axis)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return svg_for_page(buffer.getvalue(), f"{kind}-{metric.name}", title)
+        return svg_for_page(figure, f"{kind}-{metric.name}", title)
 
 
 def letter(number: int) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 
 from runner.analysis.diff import TableDiff
@@ -27,7 +26,7 @@ def tables_svg(tables: Sequence[TableDiff]) -> str:
         ("mean", "mean difference"),
         ("greedy_share", "other greedy action, %"),
     )
-    with mpl.rc_context(STYLE | {"savefig.transparent": True}):
+    with mpl.rc_context(STYLE):
         figure = mpl.figure.Figure(figsize=(4.0, 3.6))
         for row, (name, label) in enumerate(kinds):
             axes = figure.add_axes((0.17, 0.71 - 0.28 * row, 0.79, 0.23))
@@ -54,6 +53,4 @@ def tables_svg(tables: Sequence[TableDiff]) -> str:
                     ncols=len(agents), loc="lower right", bbox_to_anchor=(1.02, 0.96), borderaxespad=0.1
                 )
         axes.set_xlabel("training episodes")
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return svg_for_page(buffer.getvalue(), "tables", "Difference of the Q-tables over training episodes")
+        return svg_for_page(figure, "tables", "Difference of the Q-tables over training episodes")

@@ -21,6 +21,7 @@ from runner.analysis.groups import Group
 from runner.analysis.series import SHARES, is_loop
 from runner.errors import MissingExtra, RunnerError
 from runner.export.plots import Curve, Panel
+from runner.words import spoken
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -137,14 +138,17 @@ def panel_svg(panel: Panel, groups: int) -> str:
     """Return one panel as an SVG element for a page: its ink is the page's text colour."""
     mpl = matplotlib_of("a report")
     width = 8.0 if is_wide(panel) else 4.0
-    with mpl.rc_context(STYLE | {"savefig.transparent": True}):
+    with mpl.rc_context(STYLE):
         figure = mpl.figure.Figure(figsize=(width, 2.5))
         right = 0.8 if is_wide(panel) else 0.97
         axes = figure.add_axes((0.68 / width, 0.19, right - 0.68 / width, 0.63))
         draw_panel(axes, panel, groups)
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return svg_for_page(buffer.getvalue(), panel.metric, f"{panel.title} over training episodes")
+        return svg_for_page(figure, panel.metric, f"{panel.title} over training episodes")
+
+
+def panel_svgs(panels: Sequence[Panel], groups: int) -> list[dict[str, Any]]:
+    """Return panels as pages take them: each as SVG, and whether it is wide."""
+    return [{"svg": panel_svg(panel, groups), "wide": is_wide(panel)} for panel in panels]
 
 
 def draw_panel(axes: Axes, panel: Panel, groups: int) -> None:
@@ -277,7 +281,7 @@ def _legend(axes: Axes, panel: Panel, groups: int) -> None:
             linestyle=DASHES[number % len(DASHES)],
             marker=MARKERS[number % len(MARKERS)] if groups == 1 else "",
             markersize=3.2,
-            label=line.replace("_", " ") or "all",
+            label=spoken(line) or "all",
         )
         for number, line in enumerate(panel.lines)
     ]
@@ -313,15 +317,18 @@ def _heading(figure: Figure, groups: Sequence[Group], height: float) -> None:
     )
 
 
-def svg_for_page(svg: str, name: str, title: str) -> str:
-    """Return the `<svg>` element alone, its ink that of the page.
+def svg_for_page(figure: Figure, name: str, title: str) -> str:
+    """Return a figure as an `<svg>` element alone, its ink that of the page; call it where `STYLE` is set.
 
     Args:
-        svg: a document of Matplotlib's.
+        figure: what is shown.
         name: set before its ids, so that they are the page's only ones.
         title: what readers of the page hear.
     """
-    element = svg[svg.index("<svg") :]
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    element = buffer.getvalue()
+    element = element[element.index("<svg") :]
     element = re.sub(r"<metadata>.*?</metadata>", "", element, flags=re.DOTALL)
     element = element.replace(INK, "currentColor")
     for number, colour in enumerate(COLOURS):  # the page has lighter ones for the dark

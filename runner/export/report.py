@@ -13,14 +13,14 @@ from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.analysis.groups import groups_of
+from runner.analysis.groups import Group, groups_of
 from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries
-from runner.errors import MissingExtra, RecordingError
+from runner.errors import MissingExtra, RecordingError, RunnerError
 from runner.export import svg, svg_maps
-from runner.export.contents import has_steps, shortcomings, status_of, why_no_steps
+from runner.export.contents import flat_text, has_steps, shortcomings, status_of, why_no_steps
 from runner.export.plots import panels_of
-from runner.export.plots_figure import footnote, is_wide, matplotlib_of, panel_svg
+from runner.export.plots_figure import footnote, matplotlib_of, panel_svgs
 from runner.export.report_maps import MapRow, maps_of, stages_of
 from runner.export.report_replay import (
     Episode,
@@ -114,7 +114,7 @@ def _run(recording: Recording, series: RunSeries, number: int, chosen: Sequence[
         "name": recording.run["name"],
         "seed": recording.run["seed"],
         "state": status_of(recording),
-        "agents": [agent.replace("_", " ") for agent in environment["agents"]],
+        "agents": [spoken(agent) for agent in environment["agents"]],
         "learners": agents_of(recording),
         "environment": environment,
         "facts": _facts(recording),
@@ -123,7 +123,7 @@ def _run(recording: Recording, series: RunSeries, number: int, chosen: Sequence[
         "evaluations": evaluations,
         "event_names": [_heading(name) for name in environment["event_names"]],
         "broad": drawing is not None and drawing.width > BROAD,
-        "config": _flat(recording.config),
+        "config": flat_text(recording.config),
         "provenance": recording.provenance,
         "notes": _notes(recording),
         "maps": _maps(recording, episodes),
@@ -267,17 +267,25 @@ def _plots(series: Sequence[RunSeries]) -> dict[str, Any]:
     from runner.export.plots_figure import COLOURS
 
     groups = groups_of(series)
-    try:
-        panels = panels_of(groups)
-    except RecordingError:
+    panels = curves(groups)
+    if not panels:
         return {}
     return {
-        "panels": [{"svg": panel_svg(panel, len(groups)), "wide": is_wide(panel)} for panel in panels],
+        "panels": panels,
         "groups": [
             (i % len(COLOURS), COLOURS[i % len(COLOURS)], group.described) for i, group in enumerate(groups)
         ],
         "footnote": footnote(groups),
     }
+
+
+def curves(groups: Sequence[Group]) -> list[dict[str, Any]]:
+    """Return the learning curves of groups of runs for a page, a plot a metric; none where no run has any."""
+    try:
+        panels = panels_of(groups)
+    except RunnerError:
+        return []
+    return panel_svgs(panels, len(groups))
 
 
 def templates() -> Environment:
@@ -317,14 +325,3 @@ def _embedded(data: Any) -> str:
     """Return data as JSON that can stand inside a script element."""
     text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
-
-
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, str]:
-    """Return a configuration as dotted keys and JSON values."""
-    flat: dict[str, str] = {}
-    for key, value in values.items():
-        if isinstance(value, dict) and value:
-            flat |= _flat(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value if isinstance(value, str) else json.dumps(value)
-    return flat

@@ -20,7 +20,7 @@ from runner.export.svg_maps import pair_map, policy_map
 from runner.frames import agents_of
 from runner.mdp import Mdp
 from runner.recording.reader import Recording
-from runner.words import states_in_words
+from runner.words import spoken, states_in_words
 
 Tables = list[NDArray[np.float64]]
 
@@ -136,7 +136,7 @@ def _pair_row(
         grids.append(values)
     bounds = _bounds(grids)
     one, other = (mdp.scene["things"][mover]["label"] for mover in movers)
-    whose = "" if len(learners) == 1 else f" of {learners[learner].replace('_', ' ')}"
+    whose = "" if len(learners) == 1 else f" of {spoken(learners[learner])}"
     title = f"Highest Q-value{whose} for every pair of places"
     fixed = situation_in_words(mdp, state, movers)
     told = (

@@ -25,6 +25,8 @@ from runner.words import (
     actions_in_words,
     agent_actions,
     event_in_words,
+    numbered_actions,
+    spoken,
     states_in_words,
     trial_in_words,
 )
@@ -136,7 +138,7 @@ def deeds_in_words(mdp: Mdp) -> list[str]:
     words = [str(word) for word in actions_in_words(mdp)]
     if len(mdp.agents) < 2 or action_names(mdp) is None:
         return words
-    names = [agent.replace("_", " ") for agent in mdp.agents]
+    names = [spoken(agent) for agent in mdp.agents]
     return [
         ", ".join(f"{name} {own}" for name, own in zip(names, word.split(" + "), strict=True))
         for word in words
@@ -188,12 +190,12 @@ def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[
         places: from states to places as `svg.Drawing.places` gives them; None without a scene.
     """
     mdp, agents = recording.mdp, agents_of(recording)
-    own = action_names(mdp) or [[f"action {i}" for i in range(n)] for n in mdp.action_counts]
+    own = numbered_actions(mdp)
     joint = actions_in_words(mdp).tolist()
     return {
         "actions": deeds_in_words(mdp),
         "choices": [joint] if len(agents) == 1 else own,
-        "learners": [agent.replace("_", " ") for agent in agents],
+        "learners": [spoken(agent) for agent in agents],
         "events": [event_in_words(name) for name in mdp.event_names],
         "episodes": [_packed(mdp, episode, places) for episode in episodes],
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import re
 import textwrap
@@ -205,10 +204,8 @@ def _objective_axis(axes: Axes, picture: Picture) -> None:
 
 def _svg(draw: Callable[[Axes], None], name: str, told: str, width: float = 4.0, height: float = 2.6) -> str:
     mpl = matplotlib_of("a report")
-    with mpl.rc_context(STYLE | {"savefig.transparent": True}):
+    with mpl.rc_context(STYLE):
         figure = mpl.figure.Figure(figsize=(width, height), layout="constrained")
         draw(figure.add_subplot())
-        buffer = io.StringIO()
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    page = svg_for_page(buffer.getvalue(), f"sweep-{name}", told)
+        page = svg_for_page(figure, f"sweep-{name}", told)
     return page.replace("#ffffff", "var(--paper, #ffffff)")

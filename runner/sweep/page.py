@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from runner.analysis.groups import Group
-from runner.export.plots_figure import COLOURS, footnote, is_wide, panel_svg
+from runner.export.plots_figure import COLOURS, footnote, panel_svgs
 from runner.export.report import TEMPLATES, require_packages, templates
 from runner.sweep.figure import parallel_svg, parameter_svgs
 from runner.sweep.plots import learning, picture_of
@@ -44,7 +44,7 @@ def render_sweep(results: Results, recordings: Path) -> str:
             legend=[
                 (i % len(COLOURS), COLOURS[i % len(COLOURS)], *_told(group)) for i, group in enumerate(groups)
             ],
-            panels=[{"svg": panel_svg(panel, len(groups)), "wide": is_wide(panel)} for panel in panels],
+            panels=panel_svgs(panels, len(groups)),
             footnote=footnote(groups),
             moment=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
             style=(TEMPLATES / "report.css").read_text("utf-8"),

@@ -22,12 +22,10 @@ from runner.export.rerun.scene import (
     PASSENGER_COLOUR,
     Marks,
     Scene,
-    action_labels,
-    agent_label,
     rgb,
 )
 from runner.mdp import Mdp
-from runner.words import action_names
+from runner.words import action_names, numbered_actions, spoken
 
 MOST_REWARDS: Final = 2_000
 MOST_T: Final = 10_000
@@ -129,7 +127,7 @@ def vocabulary_of(
     told = []
     for i, learner in enumerate(learners):
         distinct = np.unique(rewards[..., i])
-        whose = f" of {agent_label(learner)}" if len(learners) > 1 else ""
+        whose = f" of {spoken(learner)}" if len(learners) > 1 else ""
         if len(distinct) <= MOST_REWARDS:
             colour = MOVER_COLOURS[i % len(MOVER_COLOURS)] if whose else INK
             told.append((classes.add([f"reward{whose} {_signed(r)}" for r in distinct], colour), distinct))
@@ -153,7 +151,7 @@ def vocabulary_of(
 
 
 def _stops(classes: Classes, scene: Scene, agent: int) -> NDArray[np.int64]:
-    names = action_labels(scene.mdp)[agent]
+    names = numbered_actions(scene.mdp)[agent]
     numbers = np.full(len(names), -1)
     if action_names(scene.mdp) is None:
         return numbers

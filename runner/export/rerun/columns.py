@@ -12,7 +12,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from runner.export.rerun.scene import INK
+from runner.export.rerun.scene import INK, rgb
 
 APPLICATION: Final = "dualtaxi"
 _POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
@@ -211,4 +211,4 @@ def ink(n: int) -> NDArray[np.uint32]:
 
 def rgba(colour: str, alpha: int = 255) -> tuple[int, int, int, int]:
     """Return the parts of a colour "#rrggbb"."""
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16), alpha
+    return *rgb(colour), alpha

@@ -9,9 +9,9 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.export.rerun.columns import Batch, Sender, instances, texts
-from runner.export.rerun.scene import event_words, events_of_steps
+from runner.export.rerun.scene import events_of_steps
 from runner.mdp import Mdp
-from runner.words import states_in_words
+from runner.words import events_in_words, states_in_words
 
 _OVER: Final = 1
 _TIME_OUT: Final = 2
@@ -67,7 +67,7 @@ class EventWriter(Sender):
     def _happening(self, mask: int, end: int, length: int) -> tuple[str, str]:
         """Return what is said of a step, and the level of that."""
         if mask not in self._words:
-            words = event_words(self._mdp, mask)
+            words = events_in_words(self._mdp, mask)
             bad = "collision" in words and not mask & self._mdp.success_mask
             self._words[mask] = words, "WARN" if bad else "INFO"
         words, level = self._words[mask]

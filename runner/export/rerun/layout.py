@@ -10,9 +10,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from runner.export.rerun.maps import draw_blocks
-from runner.export.rerun.scene import Scene, agent_label, rgb
+from runner.export.rerun.scene import Scene, rgb
 from runner.export.rerun.values import TOP, WIDTH, bar_rows, draw_table
 from runner.mdp import Mdp
+from runner.words import spoken
 
 FRAMES_A_SECOND: Final = 10.0
 _PLOTS: Final = (
@@ -146,7 +147,7 @@ def _maps(run: Shown) -> list[Any]:
                 origin=f"{run.root}/",
                 contents=contents,
                 visual_bounds=bounds,
-                name=f"{agent_label(learner)}: max Q, greedy moves",
+                name=f"{spoken(learner)}: max Q, greedy moves",
             )
         )
     return views

@@ -22,7 +22,7 @@ from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
 from runner.export.rerun.layout import Shown, draw_background
 from runner.export.rerun.metrics import EVAL_COLOUR, TRAIN_COLOUR
-from runner.export.rerun.scene import TRAIL_STEPS, marks_of, scene_of
+from runner.export.rerun.scene import TRAIL_STEPS, marks_of, rgb, scene_of
 from runner.export.rerun.selection import (
     SPREAD_STEPS,
     Request,
@@ -39,10 +39,7 @@ BATCH: Final = 8_192
 MOST_LINES: Final = 16
 """Numbers of an observation or action that are drawn as lines."""
 PHASES: Final = ("train", "eval")
-_COLOURS: Final = {
-    phase: [tuple(bytes.fromhex(colour[1:]))]
-    for phase, colour in (("train", TRAIN_COLOUR), ("eval", EVAL_COLOUR))
-}
+_COLOURS: Final = {"train": [rgb(TRAIN_COLOUR)], "eval": [rgb(EVAL_COLOUR)]}
 
 
 def select_loop(recording: Recording, request: Request) -> Selection:

@@ -10,9 +10,10 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.export.rerun.events import evaluation_texts, send_text
-from runner.export.rerun.scene import agent_label, rgb
+from runner.export.rerun.scene import rgb
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.words import spoken
 
 TRAIN_COLOUR: Final = "#E69F00"
 EVAL_COLOUR: Final = "#0072B2"
@@ -44,7 +45,7 @@ class MetricWriter:
     ) -> None:
         self._stream = stream
         self._root = root
-        self._learners = [agent_label(name) for name in learners]
+        self._learners = [spoken(name) for name in learners]
         self._events = list(event_names)
         self._tint = tint
         self._label = f"{label} " if label else ""
@@ -94,7 +95,7 @@ class MetricWriter:
         trials = np.array([[row["trials"]] for row in rows], float)
         if self._events:
             self._series(
-                "eval/metrics/events", rows, counts / trials, [agent_label(name) for name in self._events]
+                "eval/metrics/events", rows, counts / trials, [spoken(name) for name in self._events]
             )
         for name, column in self._collisions(counts):
             self._series(f"eval/metrics/{name}", rows, column / trials, ["evaluation"])

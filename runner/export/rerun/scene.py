@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.mdp import Mdp
-from runner.words import action_names, event_in_words, spoken
+from runner.words import action_names, spoken
 
 # Okabe and Ito (2008), told apart with any common colour blindness; mid-tones, for light and dark themes.
 MOVER_COLOURS: Final = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7")
@@ -179,16 +179,6 @@ def own_actions(mdp: Mdp) -> NDArray[np.int64]:
     return np.stack(np.unravel_index(joint, mdp.action_counts), axis=1).astype(np.int64)
 
 
-def action_labels(mdp: Mdp) -> list[list[str]]:
-    """Return the words of each agent's actions."""
-    return action_names(mdp) or [[f"action {k}" for k in range(count)] for count in mdp.action_counts]
-
-
-def agent_label(agent: str) -> str:
-    """Return the name of an agent or learner as people say it."""
-    return spoken(agent)
-
-
 def events_of_steps(mdp: Mdp, block: NDArray[np.void]) -> NDArray[np.uint32]:
     """Return the event bits of each recorded step, from its state, action and next state."""
     if not mdp.event_names:
@@ -250,11 +240,6 @@ def _happened(mdp: Mdp, mask: int, agent: str) -> list[str]:
             bad = owner == "" or (name not in mdp.success_events and event not in ("pickup",))
             words.append(f"{BAD_SIGN if bad else GOOD_SIGN} {spoken(event)}")
     return words
-
-
-def event_words(mdp: Mdp, mask: int) -> str:
-    """Return the events of a mask in words."""
-    return ", ".join(event_in_words(name) for bit, name in enumerate(mdp.event_names) if mask >> bit & 1)
 
 
 def _placements(scene: Scene) -> Placements:

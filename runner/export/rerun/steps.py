@@ -16,9 +16,10 @@ from runner.export.rerun.columns import Batch, Sender, scalars
 from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
 from runner.export.rerun.maps import MapWriter
-from runner.export.rerun.scene import Marks, Scene, agent_label
+from runner.export.rerun.scene import Marks, Scene
 from runner.export.rerun.values import ValueWriter
 from runner.mdp import Mdp
+from runner.words import spoken
 
 
 class StepWriter(Sender):
@@ -46,7 +47,7 @@ class StepWriter(Sender):
 
     def dress(self) -> None:
         """Log what never changes."""
-        names = [f"reward {agent_label(learner)}" for learner in self._learners]
+        names = [f"reward {spoken(learner)}" for learner in self._learners]
         self.static("reward", rr.SeriesLines(names=names))
         self._values.dress()
         if self._grid:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, instances, rgba, scalars, strips
-from runner.export.rerun.scene import INK, MOVER_COLOURS, action_labels, agent_label, own_actions
+from runner.export.rerun.scene import INK, MOVER_COLOURS, own_actions
 from runner.mdp import Mdp
+from runner.words import numbered_actions, spoken
 
 NAME_X: Final = 1.0
 BAR_LEFT: Final = 2.5
@@ -49,8 +50,8 @@ class ValueWriter(Sender):
         colours = [MOVER_COLOURS[i % len(MOVER_COLOURS)] for i in range(len(counts))]
         bars = [rgba(colour) for colour, count in zip(colours, counts, strict=True) for _ in range(count)]
         series = [
-            f"{agent_label(agent)} {name}"
-            for agent, names in zip(self._mdp.agents, action_labels(self._mdp), strict=True)
+            f"{spoken(agent)} {name}"
+            for agent, names in zip(self._mdp.agents, numbered_actions(self._mdp), strict=True)
             for name in names
         ]
         self.static(
@@ -96,15 +97,13 @@ class ValueWriter(Sender):
 
     def _bars(self, values: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return a bar a value, [n, values, 2 points, 2]: from the agent's lowest there to its highest."""
-        from runner.export.rerun.filling import (
-            bar_ends,  # Numba is slow to load, and a live view has no values
-        )
+        from runner.export.rerun import filling  # Numba is slow to load, and a live view has no values
 
         bars = np.empty((*values.shape, 2, 2), np.float32)
         bars[:, :, 0, 0] = BAR_LEFT
         bars[..., 1] = np.concatenate(self._rows)[:, None]
         bounds = np.cumsum((0, *self._mdp.action_counts))
-        bar_ends(values, bounds, BAR_LEFT, BAR_LENGTH, _FINENESS, bars[:, :, 1, 0])
+        filling.bar_ends(values, bounds, BAR_LEFT, BAR_LENGTH, _FINENESS, bars[:, :, 1, 0])
         return bars
 
 
@@ -123,8 +122,10 @@ def draw_table(stream: rr.RecordingStream, path: str, mdp: Mdp) -> None:
     places: list[tuple[float, float]] = []
     labels: list[str] = []
     colours: list[Any] = []
-    for i, (agent, rows, names) in enumerate(zip(mdp.agents, bar_rows(mdp), action_labels(mdp), strict=True)):
-        labels += [agent_label(agent).upper(), *names]
+    for i, (agent, rows, names) in enumerate(
+        zip(mdp.agents, bar_rows(mdp), numbered_actions(mdp), strict=True)
+    ):
+        labels += [spoken(agent).upper(), *names]
         places += [(NAME_X, float(y) - LABEL_RISE) for y in (rows[0] - 1.15, *rows)]
         colours += [rgba(MOVER_COLOURS[i % len(MOVER_COLOURS)])] + [rgba(INK)] * len(names)
     headings = {

@@ -18,6 +18,7 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 
 from runner.cli import cli
+from runner.export.report import render_report
 from runner.export.report_replay import ranked_trials
 from runner.export.svg import Drawing, trail_points, transform
 from runner.recording.reader import open_recording
@@ -108,6 +109,13 @@ def test_a_run_without_steps_is_shown_without_replay_and_says_so(pictured, tmp_p
     assert "dualtaxi rerecord" in path.read_text()
     asked = report(run.recording, "-o", path, "--force", "--episode", 0)
     assert "rerecord" in asked.stderr
+
+
+def test_a_run_without_any_metric_is_shown_without_curves(pictured):
+    run = pictured("lake", evaluation=None, log={"every_steps": 10**6})
+    page, _ = render_report([run.recording])
+    assert "No metrics were recorded" in page
+    assert 'id="replay-data-0"' in page
 
 
 @pytest.mark.parametrize("share", [0.6, 0.8, 0.95])
