@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli.output import say
-from runner.cli.parameters import EpisodeRanges, Numbers
+from runner.cli.parameters import EpisodeRanges, NumberList
 
 if TYPE_CHECKING:
     from runner.export.rerun.selection import Request, Selection
@@ -22,7 +22,7 @@ def choice_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--eval",
             "evaluations",
-            type=Numbers(),
+            type=NumberList(),
             metavar="N[,N]",
             help="The trials of the evaluation after N training episodes.",
         ),

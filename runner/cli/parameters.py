@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import click
 from click.shell_completion import CompletionItem
@@ -41,77 +41,88 @@ class RunName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # gener
         ]
 
 
-class TrialName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+class _Numbers(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+    """Numbers written in one text."""
+
+    expected: ClassVar[str]
+    """How they are written."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[Any, ...]:
+        """Return the numbers in a text."""
+        try:
+            return self.parsed(value)
+        except ValueError:
+            self.fail(f"found {value!r}, expected {self.expected}", param, ctx)
+
+    def parsed(self, text: str) -> tuple[Any, ...]:
+        """Return the numbers in a text.
+
+        Raises:
+            ValueError: it is not written as it should be.
+        """
+        raise NotImplementedError
+
+
+def _number(text: str) -> int:
+    """Return a number from 0; `int` would take signs, blanks and underscores."""
+    if not text.isdecimal():
+        raise ValueError(text)
+    return int(text)
+
+
+class TrialName(_Numbers):
     """`N:TRIAL`, a trial of the evaluation after N training episodes."""
 
     name = "N:TRIAL"
+    expected = "N:TRIAL, such as 3000:0"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int]:
-        """Return both numbers."""
-        if isinstance(value, tuple):
-            return value
-        after, colon, trial = value.partition(":")
-        if not after.isdecimal() or (colon and not trial.isdecimal()):
-            self.fail(f"found {value!r}, expected N:TRIAL, such as 3000:0", param, ctx)
-        return int(after), int(trial or 0)
+    def parsed(self, text: str) -> tuple[int, int]:
+        """Return both numbers; the first trial, if none is said."""
+        after, colon, trial = text.partition(":")
+        return _number(after), _number(trial) if colon else 0
 
 
-class EpisodeRanges(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+class EpisodeRanges(_Numbers):
     """`0:20,49980:50000`: ranges of episodes; a single number is that episode."""
 
     name = "ranges"
+    expected = "START:STOP or N, such as 0:20,49980:50000"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[tuple[int, int | None], ...]:
+    def parsed(self, text: str) -> tuple[tuple[int, int | None], ...]:
         """Return (start, stop) of each range; an open end is None."""
-        if isinstance(value, tuple):
-            return value
-        return tuple(self._range(part.strip(), param, ctx) for part in value.split(","))
+        return tuple(self._range(part.strip()) for part in text.split(","))
 
-    def _range(
-        self, text: str, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, int | None]:
+    def _range(self, text: str) -> tuple[int, int | None]:
         start, colon, stop = text.partition(":")
-        known = all(number == "" or number.isdecimal() for number in (start, stop))
-        if not known or not (start or colon):
-            self.fail(f"found {text!r}, expected START:STOP or N, such as 0:20,49980:50000", param, ctx)
-        first = int(start or 0)
-        return first, (int(stop) if stop else None) if colon else first + 1
+        first = 0 if colon and not start else _number(start)
+        if not colon:
+            return first, first + 1
+        return first, _number(stop) if stop else None
 
 
-class Numbers(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+class NumberList(_Numbers):
     """Numbers parted by commas."""
 
     name = "numbers"
+    expected = "numbers such as 1000,49000"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, ...]:
+    def parsed(self, text: str) -> tuple[int, ...]:
         """Return the numbers."""
-        if isinstance(value, tuple):
-            return value
-        parts = [part.strip() for part in value.split(",")]
-        if not all(part.isdecimal() for part in parts):
-            self.fail(f"found {value!r}, expected numbers such as 1000,49000", param, ctx)
-        return tuple(int(part) for part in parts)
+        return tuple(_number(part.strip()) for part in text.split(","))
 
 
-class SpotName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+class SpotName(_Numbers):
     """`EPISODE:T`, or `eval:N:TRIAL:T`."""
 
     name = "spot"
+    expected = "EPISODE:T such as 120:5, or eval:N:TRIAL:T"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[int, ...]:
-        """Return (episode, t) or (N, trial, t)."""
-        if isinstance(value, tuple):
-            return value
-        parts = value.removeprefix("eval:").split(":")
-        wanted = 3 if value.startswith("eval:") else 2
-        if not 1 <= len(parts) <= wanted or not all(part.isdecimal() for part in parts):
-            self.fail(f"found {value!r}, expected EPISODE:T such as 120:5, or eval:N:TRIAL:T", param, ctx)
-        return tuple(int(part) for part in parts) + (0,) * (wanted - len(parts))
+    def parsed(self, text: str) -> tuple[int, ...]:
+        """Return (episode, t) or (N, trial, t); what is not said is 0."""
+        parts = text.removeprefix("eval:").split(":")
+        wanted = 3 if text.startswith("eval:") else 2
+        if len(parts) > wanted:
+            raise ValueError(text)
+        return tuple(map(_number, parts)) + (0,) * (wanted - len(parts))

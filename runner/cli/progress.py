@@ -1,4 +1,4 @@
-"""The progress line of a run: on a terminal's stderr, gone when the run is over."""
+"""How far something is: a line on a terminal's stderr, gone when it is over."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Final
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
 
 from runner.cli.output import number, size
 
@@ -21,30 +22,22 @@ BAR_WIDTH: Final = 12
 @contextlib.contextmanager
 def progress_line(label: str, episodes: int) -> Iterator[Callable[[Progress], None]]:
     """Give what `run_job` reports to: it keeps the line up to date, where there is a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda _: None
-        return
-    from rich import progress as rich_progress
-    from rich.console import Console
-
-    columns = [
-        *([rich_progress.TextColumn(label, markup=False)] if label else []),
-        rich_progress.BarColumn(bar_width=BAR_WIDTH),
-        rich_progress.TextColumn("{task.completed:,}/{task.total:,}"),
-        rich_progress.TextColumn("{task.fields[facts]}", markup=False),
-        rich_progress.TimeRemainingColumn(compact=True),
-    ]
-    with rich_progress.Progress(
-        *columns,
-        console=Console(stderr=True, highlight=False),
-        transient=True,
-        refresh_per_second=REDRAWS_A_SECOND,
-    ) as bar:
-        task = bar.add_task("", total=episodes, facts="")
-        speed = _Speed()
+    speed = _Speed()
+    with _line(
+        lambda rich: [
+            *([rich.TextColumn(label, markup=False)] if label else []),
+            rich.BarColumn(bar_width=BAR_WIDTH),
+            rich.TextColumn("{task.completed:,}/{task.total:,}"),
+            rich.TextColumn("{task.fields[facts]}", markup=False),
+            rich.TimeRemainingColumn(compact=True),
+        ],
+        total=episodes,
+        facts="",
+    ) as update:
 
         def report(progress: Progress) -> None:
-            bar.update(task, completed=progress.episode, facts=facts_in_words(progress, speed.of(progress)))
+            if update is not None:
+                update(completed=progress.episode, facts=facts_in_words(progress, speed.of(progress)))
 
         yield report
 
@@ -52,23 +45,63 @@ def progress_line(label: str, episodes: int) -> Iterator[Callable[[Progress], No
 @contextlib.contextmanager
 def steps_line(label: str) -> Iterator[Callable[[int], None]]:
     """Give what is told the steps done so far: it keeps a line of them, where there is a terminal."""
+    with _line(
+        lambda rich: [
+            rich.SpinnerColumn(),
+            rich.TextColumn(label, markup=False),
+            rich.TextColumn("{task.completed:,} steps"),
+        ]
+    ) as update:
+        yield lambda steps: update(completed=steps) if update is not None else None
+
+
+@contextlib.contextmanager
+def bytes_line(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Give what is told the bytes done and their number: a line of them, where there is a terminal."""
+    with _line(
+        lambda rich: [
+            rich.TextColumn(label, markup=False),
+            rich.BarColumn(bar_width=BAR_WIDTH),
+            rich.DownloadColumn(),
+            rich.TransferSpeedColumn(),
+            rich.TimeRemainingColumn(compact=True),
+        ]
+    ) as update:
+        yield lambda done, total: update(completed=done, total=total) if update is not None else None
+
+
+@contextlib.contextmanager
+def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Give what is called with how many are done: it keeps a line up to date, where there is a terminal."""
+    with _line(
+        lambda rich: [
+            rich.BarColumn(bar_width=BAR_WIDTH),
+            rich.TextColumn(f"{{task.completed:,}} {what}", markup=False),
+            rich.TimeRemainingColumn(compact=True),
+        ],
+        total=total or None,
+    ) as update:
+        yield lambda done: update(completed=done) if update is not None else None
+
+
+@contextlib.contextmanager
+def _line(
+    columns: Callable[[Any], list[Any]], total: float | None = None, **fields: Any
+) -> Iterator[Callable[..., None] | None]:
+    """Give what updates a line of columns, made of what `rich.progress` has; None where there is no terminal."""
     if not sys.stderr.isatty():
-        yield lambda _: None
+        yield None
         return
-    from rich import progress as rich_progress
+    from rich import progress
     from rich.console import Console
 
-    columns = [
-        rich_progress.SpinnerColumn(),
-        rich_progress.TextColumn(label, markup=False),
-        rich_progress.TextColumn("{task.completed:,} steps"),
-    ]
-    drawn = Console(stderr=True, highlight=False)
-    with rich_progress.Progress(
-        *columns, console=drawn, transient=True, refresh_per_second=REDRAWS_A_SECOND
-    ) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda steps: bar.update(task, completed=steps)
+    with progress.Progress(
+        *columns(progress),
+        console=Console(stderr=True, highlight=False),
+        transient=True,
+        refresh_per_second=REDRAWS_A_SECOND,
+    ) as drawn:
+        yield partial(drawn.update, drawn.add_task("", total=total, **fields))
 
 
 class _Speed:
@@ -94,47 +127,3 @@ def facts_in_words(progress: Progress, speed: float | None) -> str:
     if progress.evaluations:
         facts.append(f"finish {number(progress.evaluations[-1]['finish_percent'], 0)} %")
     return "  ".join([*facts, size(progress.bytes_written)])
-
-
-@contextlib.contextmanager
-def bytes_line(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Give what is told the bytes done and their number: a line of them, where there is a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda _, __: None
-        return
-    from rich import progress as rich_progress
-    from rich.console import Console
-
-    columns = (
-        rich_progress.TextColumn(label, markup=False),
-        rich_progress.BarColumn(bar_width=BAR_WIDTH),
-        rich_progress.DownloadColumn(),
-        rich_progress.TransferSpeedColumn(),
-        rich_progress.TimeRemainingColumn(compact=True),
-    )
-    with rich_progress.Progress(
-        *columns, console=Console(stderr=True), transient=True, refresh_per_second=REDRAWS_A_SECOND
-    ) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-@contextlib.contextmanager
-def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Give what is called with how many are done: it keeps a line up to date, where there is a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda _: None
-        return
-    from rich import progress as rich_progress
-    from rich.console import Console
-
-    columns = (
-        rich_progress.BarColumn(bar_width=BAR_WIDTH),
-        rich_progress.TextColumn(f"{{task.completed:,}} {what}", markup=False),
-        rich_progress.TimeRemainingColumn(compact=True),
-    )
-    with rich_progress.Progress(
-        *columns, console=Console(stderr=True), transient=True, refresh_per_second=REDRAWS_A_SECOND
-    ) as bar:
-        task = bar.add_task("", total=total or None)
-        yield lambda done: bar.update(task, completed=done)

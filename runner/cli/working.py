@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import shlex
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runner.cli.options import find_recorded
-from runner.cli.output import UNKNOWN, duration, say, size
+from runner.cli.finding import find_recorded, suggested
+from runner.cli.output import UNKNOWN, draw, duration, facts, print_json, say, size
 from runner.errors import RecordingError, RunnerError, RunNotFound
 from runner.runs import RECORDING_FILE, RUN_FILE, recordings_folder
 
@@ -72,14 +70,6 @@ def at_work(label: str, episodes: int) -> Iterator[tuple[Report, Interrupt]]:
         yield report, interrupt
 
 
-def in_folder(run: Run) -> str:
-    """Return what a command that is suggested needs to find a run: nothing, if it is in the usual folder."""
-    root = run.folder.parent
-    if root.absolute() == recordings_folder().absolute():
-        return ""
-    return f" --recordings {shlex.quote(os.fspath(root))}"
-
-
 def run_as_json(run: Run) -> dict[str, Any]:
     """Return what programs want to know of a run that is over."""
     summary = _told(run)
@@ -118,3 +108,32 @@ def _told(run: Run) -> dict[str, Any]:
 
 def _steps_in_words(summary: dict[str, Any]) -> str:
     return f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation"
+
+
+def tell_received(run: Run, digest: str, already: str, as_json: bool, **more: object) -> None:
+    """Tell of a run that came from elsewhere.
+
+    Args:
+        run: as it is here.
+        digest: of its content.
+        already: what was there already, such as `this content`; empty if it was written now.
+        as_json: tell it as JSON.
+        more: what else programs want to know.
+    """
+    if already:
+        say(f"Run {run.run_id} is there already with {already}; nothing was written.")
+    if as_json:
+        told = {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status}
+        told |= {"path": str(run.recording.absolute()), "already": bool(already)}
+        print_json(told | {"content_digest": digest} | more)
+        return
+    draw(
+        facts(
+            {
+                "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
+                "digest": digest,
+                "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
+                "next": suggested(run, "show"),
+            }
+        )
+    )

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli.options import find, json_option, recordings_option, runs_argument
+from runner.cli.finding import find
+from runner.cli.options import json_option, recordings_option, runs_argument
 from runner.cli.output import draw, facts, print_json, say, size
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.options import find_all_recorded, json_option, recordings_option, runs_argument
+from runner.cli.finding import find_all_recorded
+from runner.cli.options import json_option, recordings_option, runs_argument
 from runner.cli.output import print_json, say
 from runner.cli.sections import print_sections, require_one_form, require_page
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.options import find_recorded, json_option, recordings_option
+from runner.cli.finding import find_recorded
+from runner.cli.options import json_option, recordings_option
 from runner.cli.output import print_json, say, size
 from runner.cli.parameters import RunName
 from runner.cli.sections import print_sections, require_one_form, require_page

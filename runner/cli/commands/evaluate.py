@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import INTERRUPTED
-from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
+from runner.cli.finding import find_recorded, suggested
+from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, print_json, say
-from runner.cli.working import at_work, in_folder, run_as_json, run_in_words
+from runner.cli.working import at_work, run_as_json, run_in_words
 
 if TYPE_CHECKING:
     from runner.runs import Run
@@ -85,7 +86,7 @@ def command(
     elif run.status == "finished":
         _summarise(run, origin)
     if interrupt.came and run.status == "interrupted":
-        say(f"Interrupted: what was played is kept; `dualtaxi resume {run.run_id}` plays the rest.")
+        say(f"Interrupted: what was played is kept; `{suggested(run, 'resume')}` plays the rest.")
         ctx.exit(INTERRUPTED)
 
 
@@ -100,4 +101,4 @@ def _summarise(run: Run, origin: dict[str, object]) -> None:
         )
     told = run_in_words(run)
     told |= {"table": f"of run {origin['run']} after {origin['step']:,} training steps"}
-    draw(table, "", facts(told | {"next": f"dualtaxi play {run.run_id} --eval 0:0{in_folder(run)}"}))
+    draw(table, "", facts(told | {"next": suggested(run, "play", "--eval 0:0")}))

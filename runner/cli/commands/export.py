@@ -11,14 +11,14 @@ from runner.errors import nearest
 
 FORMS: Final[dict[str, tuple[str, str]]] = {
     "rerun": ("runner.cli.commands.export_rerun", "For the Rerun viewer: every view of chosen episodes."),
-    "parquet": ("runner.cli.commands.export_parquet", "Steps, episodes and measures as Parquet."),
-    "csv": ("runner.cli.commands.export_csv", "Steps, episodes and measures as CSV."),
+    "parquet": ("runner.cli.commands.export_tables:parquet", "Steps, episodes and measures as Parquet."),
+    "csv": ("runner.cli.commands.export_tables:csv", "Steps, episodes and measures as CSV."),
     "minari": ("runner.cli.commands.export_minari", "A Minari dataset, for offline learning."),
     "tensorboard": ("runner.cli.commands.export_tensorboard", "An event file for TensorBoard."),
     "mlflow": ("runner.cli.commands.export_mlflow", "A run in an MLflow store."),
     "gif": ("runner.cli.commands.export_gif", "A short film of an episode, for slides and READMEs."),
 }
-"""Form -> its module, which has the command as `command`, and its short help."""
+"""Form -> its module, which has the command as `command` unless another name is said; and its short help."""
 
 
 class _Forms(click.Group):
@@ -34,7 +34,8 @@ class _Forms(click.Group):
             if not ctx.resilient_parsing:
                 ctx.fail(f"there is no export {cmd_name!r}.{nearest(cmd_name, FORMS)}")
             return None
-        command: click.Command = importlib.import_module(FORMS[cmd_name][0]).command
+        module, _, name = FORMS[cmd_name][0].partition(":")
+        command: click.Command = getattr(importlib.import_module(module), name or "command")
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002

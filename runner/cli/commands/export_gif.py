@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import episode_option, find_recorded, recordings_option, run_argument, trial_option
+from runner.cli.finding import find_recorded
+from runner.cli.options import episode_option, recordings_option, run_argument, trial_option
 from runner.cli.output import say, size
 
 

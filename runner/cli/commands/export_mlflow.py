@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find_recorded, recordings_option, run_argument
+from runner.cli.finding import find_recorded
+from runner.cli.options import recordings_option, run_argument
 from runner.cli.output import say
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import click
 
 from runner.cli.choosing import choice_options, request_of, tell
-from runner.cli.options import find_recorded, recordings_option, run_argument
+from runner.cli.finding import find_recorded
+from runner.cli.options import recordings_option, run_argument
 from runner.cli.output import duration, size
 
 

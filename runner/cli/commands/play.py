@@ -9,14 +9,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.options import (
-    episode_option,
-    find_recorded,
-    json_option,
-    recordings_option,
-    run_argument,
-    trial_option,
-)
+from runner.cli.finding import find_recorded
+from runner.cli.options import episode_option, json_option, recordings_option, run_argument, trial_option
 from runner.cli.output import print_json
 
 if TYPE_CHECKING:

@@ -9,11 +9,11 @@ import click
 from runner.cli.options import (
     json_option,
     recordings_option,
+    required,
     server_option,
     token_file_option,
     token_option,
 )
-from runner.cli.output import draw, facts, print_json, say, size
 
 
 @click.command("pull")
@@ -42,33 +42,15 @@ def command(
       dualtaxi pull k3v9m2xq --server https://runs.example.org --token-file ~/.dualtaxi-token
     """  # noqa: D301 - Click wants the backspace itself
     from runner.cli.progress import bytes_line
-    from runner.cli.working import in_folder
+    from runner.cli.working import tell_received
     from runner.runs import recordings_folder
     from runner.service.address import found_token
     from runner.service.client import Client
 
-    if not server:
-        raise click.UsageError("missing option '--server', such as --server http://localhost:8000.")
     with (
-        Client(server, found_token(token, token_file)) as client,
+        Client(required(server), found_token(token, token_file)) as client,
         bytes_line(f"pulling {run_name}") as report,
     ):
         pulled = client.pull(run_name, recordings_folder(recordings), report)
-    run = pulled.run
-    if pulled.already:
-        say(f"Run {run.run_id} is there already with this content; nothing was written.")
-    if as_json:
-        told = {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status}
-        told |= {"path": str(run.recording.absolute()), "already": pulled.already}
-        print_json(told | {"content_digest": pulled.content_digest})
-        return
-    draw(
-        facts(
-            {
-                "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
-                "digest": pulled.content_digest,
-                "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
-                "next": f"dualtaxi show {run.run_id}{in_folder(run)}",
-            }
-        )
-    )
+    already = "this content" if pulled.already else ""
+    tell_received(pulled.run, pulled.content_digest, already, as_json)

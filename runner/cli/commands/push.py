@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from runner.cli.finding import find_recorded
 from runner.cli.options import (
-    find_recorded,
     json_option,
     recordings_option,
+    required,
     server_option,
     token_file_option,
     token_option,
@@ -66,10 +67,8 @@ def command(
 
     if bool(names) == outbox:
         raise click.UsageError("expected either runs or --outbox.")
-    if names and not server:
-        raise click.UsageError("missing option '--server', such as --server http://localhost:8000.")
     secret = found_token(token, token_file)
-    pushes = _outbox(server, secret) if outbox else _runs(names, str(server), secret, recordings)
+    pushes = _outbox(server, secret) if outbox else _runs(names, required(server), secret, recordings)
     results = [_outcome(name, push) for name, push in pushes]
     stored = [result for result in results if result is not None]
     if as_json:

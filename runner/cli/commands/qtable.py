@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli.options import find_recorded, json_option, recordings_option, run_argument
+from runner.cli.finding import find_recorded
+from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import UNKNOWN, draw, facts, number, print_json, say, table, title
 
 if TYPE_CHECKING:

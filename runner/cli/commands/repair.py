@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from runner.cli.finding import suggested
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, size
 from runner.cli.working import recording_of
@@ -110,7 +111,7 @@ def _next(done: Repair, run: Run | None) -> dict[str, str]:
     """Return what brings back what was lost, if anything does: a loop cannot be done again here."""
     if run is None or done.lossless or "made_by" in run.facts.get("config", {}):
         return {}
-    return {"next": f"dualtaxi resume {run.run_id}"}
+    return {"next": suggested(run, "resume")}
 
 
 def _losses(done: Repair) -> list[str]:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find_all_recorded, recordings_option, runs_argument
+from runner.cli.finding import find_all_recorded
+from runner.cli.options import recordings_option, runs_argument
 from runner.cli.output import say, size
 from runner.cli.parameters import TrialName
 

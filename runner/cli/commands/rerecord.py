@@ -6,9 +6,10 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.finding import find, suggested
+from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, say
-from runner.cli.working import at_work, in_folder, refuse_running, run_as_json, run_in_words
+from runner.cli.working import at_work, refuse_running, run_as_json, run_in_words
 
 
 @click.command("rerecord")
@@ -38,6 +39,6 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
         print_json(run_as_json(run), indent=None)
     elif not nothing_to_do:
         proof = {"proof": "the content digest is the one that the run had"}
-        draw(facts(run_in_words(run) | proof | {"next": f"dualtaxi play {run.run_id}{in_folder(run)}"}))
+        draw(facts(run_in_words(run) | proof | {"next": suggested(run, "play")}))
     if nothing_to_do:
         say(f"Run {run.run_id} holds its steps already; there is nothing to do.")

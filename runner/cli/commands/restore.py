@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find, json_option, recordings_option
+from runner.cli.finding import find
+from runner.cli.options import json_option, recordings_option
 from runner.cli.output import draw, facts, print_json
 from runner.cli.parameters import RunName
 

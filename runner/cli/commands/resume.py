@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 
 from runner.cli import INTERRUPTED
-from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.finding import find, suggested
+from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, say
-from runner.cli.working import at_work, in_folder, run_as_json, run_in_words
+from runner.cli.working import at_work, run_as_json, run_in_words
 
 
 @click.command("resume")
@@ -49,9 +50,9 @@ def command(
     if as_json:
         print_json(run_as_json(run), indent=None)
     elif not nothing_to_do:
-        draw(facts(run_in_words(run) | {"next": f"dualtaxi show {run.run_id}{in_folder(run)}"}))
+        draw(facts(run_in_words(run) | {"next": suggested(run, "show")}))
     if nothing_to_do:
         say(f"Run {run.run_id} is finished; there is nothing to do.")
     if interrupt.came and run.status == "interrupted":
-        say(f"Interrupted again; `dualtaxi resume {run.run_id}` goes on from what is kept.")
+        say(f"Interrupted again; `{suggested(run, 'resume')}` goes on from what is kept.")
         ctx.exit(INTERRUPTED)

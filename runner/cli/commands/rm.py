@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find, json_option, recordings_option, runs_argument
+from runner.cli.finding import find
+from runner.cli.options import json_option, recordings_option, runs_argument
 from runner.cli.removing import carry_out, dry_run_option, force_option, yes_option
 from runner.errors import RunnerError
 from runner.runs import recordings_folder

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from runner.cli import INTERRUPTED
+from runner.cli.finding import suggested
 from runner.cli.options import config_argument, json_option, recordings_option, set_option
-from runner.cli.output import amount, duration, print_json, say, size
-from runner.cli.working import announcing, in_folder, run_as_json
+from runner.cli.output import amount, print_json, say, size
+from runner.cli.working import announcing, run_as_json, run_in_words
 
 if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
     from rich.console import RenderableType
@@ -142,9 +143,8 @@ def _run_abreast(
     if interrupt.came:
         for run in runs:
             if run.status == "interrupted":
-                say(f"Interrupted: {run.recording}; `dualtaxi resume {run.run_id}` goes on from there.")
-        if left := len(config.seeds) - len(runs):
-            say(f"Not begun: {left} of {len(config.seeds)} seeds, from {config.seeds[len(runs)]} on.")
+                say(f"Interrupted: {run.recording}; `{suggested(run, 'resume')}` goes on from there.")
+        _tell_left(config, len(runs))
         ctx.exit(INTERRUPTED)
 
 
@@ -192,11 +192,16 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch
 
 def _tell_interrupted(run: Run, config: ExperimentConfig, begun: int) -> None:
     """Say what is kept, and what was not begun."""
-    done, left = run.summary["episodes"], len(config.seeds) - begun
+    done = run.summary["episodes"]
     say(f"Interrupted: {done:,} of {config.episodes:,} episodes are kept in {run.recording}.")
     if run.status == "interrupted":
-        say(f"`dualtaxi resume {run.run_id}` goes on from there.")
-    if left:
+        say(f"`{suggested(run, 'resume')}` goes on from there.")
+    _tell_left(config, begun)
+
+
+def _tell_left(config: ExperimentConfig, begun: int) -> None:
+    """Say which seeds were not begun, if any."""
+    if left := len(config.seeds) - begun:
         say(f"Not begun: {left} of {len(config.seeds)} seeds, from {config.seeds[begun]} on.")
 
 
@@ -244,7 +249,7 @@ def _summarise(run: Run, blank: bool) -> None:
         shown = some(records)
         parts.append(evaluation_table(shown, successes, console()))
         if len(shown) < len(records):
-            parts.append(f"{len(shown)} of {len(records)} evaluations; `dualtaxi show {run.run_id}` has all.")
+            parts.append(f"{len(shown)} of {len(records)} evaluations; `{suggested(run, 'show')}` has all.")
         parts.append("")
     draw(*parts, facts(_result(run, records[-1]["episode"] if records else None)))
 
@@ -252,21 +257,15 @@ def _summarise(run: Run, blank: bool) -> None:
 def _result(run: Run, evaluated: int | None) -> dict[str, str]:
     """Return what there is to say of a run at its end; `evaluated` is when it was last evaluated."""
     summary = run.summary
-    steps = (summary["train_steps"] + summary["eval_steps"]) * summary["steps_recorded"]
-    each = f", {summary['bytes'] / steps:.0f} bytes a step" if steps else ""
-    more = [f"show {run.run_id}"]
+    more = [suggested(run, "show")]
     if not summary["steps_recorded"]:
-        more += [f"rerecord {run.run_id}"] * (run.status == "finished")
+        more += [suggested(run, "rerecord")] * (run.status == "finished")
     elif evaluated is not None:
-        more.append(f"play {run.run_id} --eval {evaluated}:0")
+        more.append(suggested(run, "play", f"--eval {evaluated}:0"))
     elif summary["train_steps"]:
-        more.append(f"play {run.run_id} --episode 0")
-    folder = in_folder(run)
-    return {
-        "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
-        "steps": f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation, "
-        f"in {duration(summary['seconds'])}",
-        "digest": summary["content_digest"],
-        "file": f"{run.recording}  {size(summary['bytes'])}{each}",
-        "next": "\n".join(f"dualtaxi {one}{folder}" for one in more),
-    }
+        more.append(suggested(run, "play", "--episode 0"))
+    told = run_in_words(run)
+    steps = (summary["train_steps"] + summary["eval_steps"]) * summary["steps_recorded"]
+    if steps:
+        told["file"] += f", {summary['bytes'] / steps:.0f} bytes a step"
+    return told | {"next": "\n".join(more)}

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.cli.options import find, json_option, recordings_option, restored, run_argument
+from runner.cli.finding import find, restored
+from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import UNKNOWN, age, console, draw, duration, facts, print_json, say, size, title
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.options import json_option, server_option, token_file_option, token_option
+from runner.cli.options import json_option, required, server_option, token_file_option, token_option
 from runner.cli.output import draw, facts, print_json, say
 
 if TYPE_CHECKING:
@@ -47,9 +47,7 @@ def command(
     from runner.service.address import found_token
     from runner.service.client import Client
 
-    if not server:
-        raise click.UsageError("missing option '--server', such as --server http://localhost:8000.")
-    with Client(server, found_token(token, token_file)) as client:
+    with Client(required(server), found_token(token, token_file)) as client:
         job = client.submit(text_of(file), file.name)
         say(f"Job {job.number}: {job.name}, {job.runs:,} runs; {client.url}/queue/{job.number}")
         if watching:

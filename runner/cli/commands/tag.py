@@ -7,7 +7,8 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import find, json_option, recordings_option, run_argument
+from runner.cli.finding import find
+from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import print_json, say
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from runner.cli.options import json_option, recordings_option
-from runner.cli.output import draw, facts, print_json, say, size
 
 
 @click.command("unpack")
@@ -28,28 +27,13 @@ def command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) ->
       dualtaxi unpack quick-k3v9m2xq.dualtaxi
       dualtaxi unpack quick-k3v9m2xq.dualtaxi --as-new --recordings from_anna
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.cli.working import in_folder
+    from runner.cli.working import tell_received
     from runner.packing.unpacking import unpack
     from runner.runs import recordings_folder
 
     unpacked = unpack(file, recordings_folder(recordings), as_new)
     run, manifest = unpacked.run, unpacked.manifest
     digest = run.summary.get("content_digest") or manifest.content_digest
-    if unpacked.already:
-        more = "" if digest == manifest.content_digest else " and more"
-        say(f"Run {run.run_id} is there already with this content{more}; nothing was written.")
-    if as_json:
-        told = {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status}
-        told |= {"path": str(run.recording.absolute()), "already": unpacked.already}
-        print_json(told | {"content_digest": digest, "anonymous": manifest.anonymous})
-        return
-    draw(
-        facts(
-            {
-                "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
-                "digest": digest,
-                "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
-                "next": f"dualtaxi show {run.run_id}{in_folder(run)}",
-            }
-        )
-    )
+    content = "this content" if digest == manifest.content_digest else "this content and more"
+    already = content if unpacked.already else ""
+    tell_received(run, digest, already, as_json, anonymous=manifest.anonymous)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.choosing import choice_options, request_of, tell
-from runner.cli.options import find_recorded, recordings_option
+from runner.cli.finding import find_recorded
+from runner.cli.options import recordings_option
 from runner.cli.output import say
 from runner.cli.parameters import RunName, SpotName
 
