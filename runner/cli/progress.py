@@ -88,7 +88,7 @@ def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
 def _line(
     columns: Callable[[Any], list[Any]], total: float | None = None, **fields: Any
 ) -> Iterator[Callable[..., None] | None]:
-    """Give what updates a line of columns, made of what `rich.progress` has; None where there is no terminal."""
+    """Give what updates a line of columns, made of what `rich.progress` has; None without a terminal."""
     if not sys.stderr.isatty():
         yield None
         return

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from runner.analysis.diff import can_compare_steps
 from runner.analysis.diff.sections import where_in_words
 from runner.analysis.diff.trajectory import evaluation_partings, training_parting
-from runner.analysis.evaluations import evaluation_after
+from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.errors import RecordingError
 from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select
 from runner.recording import schema
@@ -84,11 +84,12 @@ def _train_step(recording: Recording, episode: int, t: int) -> tuple[str, int, R
 
 def _eval_step(recording: Recording, after: int, trial: int, t: int) -> tuple[str, int, Request]:
     train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
-    where = str(recording.path)
-    evaluation = evaluation_after(evaluations_with_steps(recording, train, evals), after, where)
+    job, where = recording.kind == "job", str(recording.path)
+    known = evaluations_with_steps(recording, train, evals) if job else evaluations_of(recording)
+    evaluation = evaluation_after(known, after, where)
     number = evaluation.trial(trial, where)
     step = _within(recording, evals.first_step[number], evals.first_step[number + 1], t)
-    return "eval", step, Request(evaluations=(after,))
+    return "eval", step, Request(evaluations=(after,)) if job else Request()  # a loop's are there anyway
 
 
 def _within(recording: Recording, first: int, stop: int, t: int) -> int:
