@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import secrets
 import shutil
@@ -10,12 +11,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.labels import LABELS_FILE, read_labels
 from runner.packing.container import Manifest, Pack, PackError, opened
 from runner.packing.packing import facts_bytes, run_facts
-from runner.packing.present import Occupied, known, met
+from runner.packing.present import Occupied, known, met, settled
 from runner.recording.facts import json_object
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of, rewrite
@@ -55,8 +57,7 @@ def unpack(path: Path, recordings: Path, as_new: bool = False) -> Unpacked:
         except Occupied as error:
             run, occupied = None, error
         if run is not None:
-            _take_all(pack, None)
-            return Unpacked(run, manifest, already=True)
+            return Unpacked(settled(run, _confirmed(path, pack, run)), manifest, already=True)
         with workplace(recordings) as folder:
             _check_room(path, folder)
             _take_all(pack, folder)
@@ -85,12 +86,22 @@ def _met(occupied: Occupied, folder: Path, manifest: Manifest) -> tuple[Run, Man
     return run, manifest, already
 
 
-def _take_all(pack: Pack, folder: Path | None) -> None:
-    """Read a pack to its end, into a folder if there is one."""
+def _confirmed(path: Path, pack: Pack, run: Run) -> dict[str, Any]:
+    """Read a pack to its end; return what it says of a run that is there, as its recording confirms it."""
+    said = io.BytesIO()
     for member in pack.manifest.members:
-        if folder is None:
-            pack.take(member, None)
-            continue
+        pack.take(member, said if member.name == RUN_FILE else None)
+    pack.check_end()
+    try:
+        with open_recording(run.recording) as recording:
+            return run_facts(recording, json_object(said.getvalue(), RUN_FILE))
+    except RecordingError as error:
+        raise PackError(f"{path}: {error}") from error
+
+
+def _take_all(pack: Pack, folder: Path) -> None:
+    """Read a pack to its end, into a folder."""
+    for member in pack.manifest.members:
         with (folder / member.name).open("xb") as target:
             pack.take(member, target)
             target.flush()

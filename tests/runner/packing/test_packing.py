@@ -139,6 +139,15 @@ def test_an_interrupted_run_is_gone_on_with_by_a_pack_of_its_end_and_not_set_bac
     assert [path.name for path in theirs.iterdir()] == [taxis.run_id]
 
 
+def test_a_run_whose_end_came_without_its_word_says_it_when_that_comes_again(taxis, tmp_path):
+    whole = pack(taxis, tmp_path / "whole.dualtaxi").path
+    theirs = tmp_path / "theirs"
+    unpack(whole, theirs).run.update(status="interrupted", summary={})
+    again = unpack(whole, theirs)
+    assert (again.already, again.run.status) == (True, "finished")
+    assert list_runs(theirs)[0].summary["content_digest"] == taxis.summary["content_digest"]
+
+
 @pytest.mark.parametrize("anonymous", [False, True])
 @pytest.mark.parametrize("missing", [400, 20_000])
 def test_a_killed_run_stays_interrupted(taxis, tmp_path, missing, anonymous):
