@@ -29,8 +29,8 @@ from runner.recording.arrays import pack_array
 from runner.recording.chunks import Packing
 from runner.recording.messages import QTable, encode, encode_log, encode_q_table
 from runner.recording.past import Past
-from runner.recording.recorder import Recorder, storage_error
-from runner.recording.writer import RecordingFile
+from runner.recording.recorder import Recorder
+from runner.recording.writer import RecordingFile, storage_error
 from runner.runs import Run
 
 REPORT_SECONDS: Final = 0.1

@@ -41,8 +41,7 @@ from runner.recording.contents import Contents
 from runner.recording.integrity import checked_survey, may_be_cut
 from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
-from runner.recording.recorder import storage_error
-from runner.recording.writer import RecordingFile
+from runner.recording.writer import RecordingFile, storage_error
 from runner.runs import RECORDING_FILE, Run, run_at
 from runner.verify import differing_environment, differing_provenance, initial_tables
 

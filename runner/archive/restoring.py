@@ -30,7 +30,7 @@ from runner.recording.messages import QTable, encode_q_table
 from runner.recording.piles import Piles
 from runner.recording.pipeline import Pipeline
 from runner.recording.reader import open_recording
-from runner.recording.recorder import BLOCK_BYTES, capacity_of, storage_error
+from runner.recording.recorder import BLOCK_BYTES, capacity_of
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 
@@ -112,7 +112,7 @@ class _Restoring:
                 self._piles.flush()
         finally:
             self._pipeline.close()
-        self._raise_failure()
+        self._pipeline.raise_failure()
         self._compare()
         if self._file is not None:
             result = self._archive.metadata.get("result")
@@ -194,17 +194,10 @@ class _Restoring:
         self._count_steps(topic, 1)
 
     def _send(self, topic: Topic, records: memoryview, times: Any, offsets: Any) -> None:
-        self._raise_failure()
+        self._pipeline.raise_failure()
         self._counts[topic.name] += len(times)
         self._room.acquire()
         self._pipeline.send(topic, records, times, offsets, used=self._room.release)
-
-    def _raise_failure(self) -> None:
-        failure = self._pipeline.failure
-        if isinstance(failure, OSError) and self._file is not None:
-            raise storage_error(self._file, failure) from failure
-        if failure is not None:
-            raise failure
 
     def _rows(self, table: Table) -> Iterator[dict[str, Any]]:
         """Yield the rows of a table."""

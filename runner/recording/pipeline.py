@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from runner.recording.chunks import Chunk, Packing, encode_chunk
 from runner.recording.digest import ContentHash
 from runner.recording.schema import Topic, message_record
-from runner.recording.writer import RecordingFile
+from runner.recording.writer import RecordingFile, storage_error
 
 ENCODERS: Final = 2
 WORK_UNDER_WAY: Final = 32
@@ -117,6 +117,17 @@ class Pipeline:
     def open(self) -> bool:
         """Whether it takes more: it was not closed."""
         return not self._closed and (self._writer is None or self._writer.is_alive())
+
+    def raise_failure(self) -> None:
+        """Raise what went wrong while writing, if something did.
+
+        Raises:
+            StorageError: the disk is full or failing.
+        """
+        if isinstance(self.failure, OSError) and self._file is not None:
+            raise storage_error(self._file, self.failure) from self.failure
+        if self.failure is not None:
+            raise self.failure
 
     def close(self) -> None:
         """Wait until everything sent is written, or was given up after a failure; stop the threads."""

@@ -6,7 +6,6 @@ When all buffers are under way the learner waits, so memory is bounded. What a r
 
 from __future__ import annotations
 
-import os
 import queue
 import time
 from collections.abc import Callable, Mapping
@@ -17,7 +16,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import StorageError
 from runner.recording import schema
 from runner.recording.chunks import Packing
 from runner.recording.past import Past
@@ -131,7 +129,7 @@ class Recorder:
             StorageError: the disk is full or failing; everything before is kept.
             Diverged: a record differs from the one that the recording holds already.
         """
-        self._raise_failure()
+        self._pipeline.raise_failure()
         step_topic, episode_topic = schema.PHASES[phase]
         other = self.steps["eval" if phase == "train" else "train"]
         if steps:
@@ -150,7 +148,7 @@ class Recorder:
 
         Returns whether it is new: not in the recording already.
         """
-        self._raise_failure()
+        self._pipeline.raise_failure()
         log_time = sum(self.steps.values()) * STEP_NANOSECONDS
         self.counts[topic.name] += 1
         known = self._past.compare_message(topic, log_time, payload)
@@ -170,7 +168,7 @@ class Recorder:
         Raises:
             StorageError: the disk is full or failing; everything before is kept.
         """
-        self._raise_failure()
+        self._pipeline.raise_failure()
         self._piles.add(topic, position * STEP_NANOSECONDS, payload)
         self.counts[topic.name] += 1
 
@@ -182,7 +180,7 @@ class Recorder:
         Raises:
             StorageError: the disk is full or failing; everything before is kept.
         """
-        self._raise_failure()
+        self._pipeline.raise_failure()
         self.counts[topic.name] += 1
         self._pipeline.submit(topic, make, position * STEP_NANOSECONDS)
 
@@ -202,7 +200,7 @@ class Recorder:
         """
         self.flush()
         self._pipeline.close()
-        self._raise_failure()
+        self._pipeline.raise_failure()
         return self._pipeline.hash.topics()
 
     def abandon(self) -> None:
@@ -269,24 +267,8 @@ class Recorder:
             used=partial(lane.free.put, block),
         )
 
-    def _raise_failure(self) -> None:
-        failure = self._pipeline.failure
-        if isinstance(failure, OSError) and self._file is not None:
-            raise storage_error(self._file, failure) from failure
-        if failure is not None:
-            raise failure
-
 
 def capacity_of(topic: Topic, sizes: schema.Sizes, chunk_steps: int) -> int:
     """Return how many records a block of a topic has."""
     most = EPISODES_A_BLOCK if topic.message in (schema.EPISODE, schema.RESET) else chunk_steps
     return max(1, min(most, BLOCK_BYTES // schema.record_dtype(topic.message, sizes).itemsize))
-
-
-def storage_error(file: RecordingFile, error: OSError) -> StorageError:
-    """Return the error that tells a user that writing failed, and what was kept."""
-    reason = error.strerror or os.strerror(error.errno or 0)
-    return StorageError(
-        f"{file.path}: writing failed ({reason}) after {file.size:,} bytes. What was written is kept and "
-        "can be read; free some disk, or choose another --recordings."
-    )

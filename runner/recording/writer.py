@@ -34,6 +34,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from runner import __version__
+from runner.errors import StorageError
 from runner.recording.chunks import Chunk
 from runner.recording.contents import Contents
 from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPICS, Topic, file_descriptor_set
@@ -279,6 +280,15 @@ def schemas_and_channels(topics: Sequence[Topic]) -> tuple[list[Schema], list[Ch
         for topic in sorted(topics, key=lambda topic: topic.channel)
     ]
     return schemas, channels
+
+
+def storage_error(file: RecordingFile, error: OSError) -> StorageError:
+    """Return the error that tells a user that writing failed, and what was kept."""
+    reason = error.strerror or os.strerror(error.errno or 0)
+    return StorageError(
+        f"{file.path}: writing failed ({reason}) after {file.size:,} bytes. What was written is kept and "
+        "can be read; free some disk, or choose another --recordings."
+    )
 
 
 def schema_and_channel_bytes(topics: Sequence[Topic]) -> bytes:

@@ -24,9 +24,9 @@ from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
 from runner.recording.digest import combine
 from runner.recording.facts import sizes_of
 from runner.recording.messages import encode, encode_image, encode_log
-from runner.recording.recorder import FLUSH_SECONDS, Recorder, storage_error
+from runner.recording.recorder import FLUSH_SECONDS, Recorder
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.recording.writer import RecordingFile
+from runner.recording.writer import RecordingFile, storage_error
 from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder
 from runner.scene import is_whole
 from runner.service.outbox import Follower, connected, is_server, outbox_folder
