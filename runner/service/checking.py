@@ -143,7 +143,15 @@ class Checker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._end()
+        self.close()
+
+    def close(self) -> None:
+        """End the process, if there is one."""
+        if self._process is not None:
+            self._pipe.close()
+            self._process.kill()
+            self._process.join()
+            self._process = None
 
     def check(self, text: str, source: str) -> Checked:
         """Return what a text means; arguments and errors as for the function `check`.
@@ -168,28 +176,21 @@ class Checker:
             if self._pipe.poll(CHECK_SECONDS):
                 answer: Checked | RunnerError = self._pipe.recv()
                 return answer
-            self._end()
+            self.close()
             return ConfigError(
                 f"{source}: took longer than {CHECK_SECONDS:g} s to check; is env.kwargs sound?"
             )
-        self._end()
+        self.close()
         return ConfigError(f"{source}: its environment ended the process that was checking it.")
 
     def _start(self) -> None:
-        self._end()
+        self.close()
         self._pipe, theirs = self._context.Pipe()
         self._process = self._context.Process(
             target=_serve, args=(theirs, self._recordings), name="checker", daemon=True
         )
         self._process.start()
         theirs.close()
-
-    def _end(self) -> None:
-        if self._process is not None:
-            self._pipe.close()
-            self._process.kill()
-            self._process.join()
-            self._process = None
 
 
 def _serve(pipe: Any, recordings: Path) -> None:

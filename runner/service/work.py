@@ -23,7 +23,7 @@ from runner.estimate import free_bytes
 from runner.service.checking import Checked, Checker
 from runner.service.doing.order import Order, Outcome
 from runner.service.doing.process import work
-from runner.service.queue import Event, Job, NotPossibleNow, Queue, now
+from runner.service.queue import Job, NotPossibleNow, Queue, now
 
 GOODBYE_SECONDS: Final = 15.0
 """How long a worker may take to close its recording before it is ended."""
@@ -124,7 +124,7 @@ class Jobs:
         self._stopping.set()
         if self._thread.is_alive():
             self._thread.join()
-        self._checker.__exit__()
+        self._checker.close()
         self.queue.close()
 
     @property
@@ -199,18 +199,9 @@ class Jobs:
             return self._change(number, state="queued", error="", ended="", deaths=0, **asked)
 
     def progress(self, number: int) -> dict[str, Any] | None:
-        """Return how far a job is that is running, as its worker last said; None if it has said nothing."""
-        with self._lock:
-            return self._progress.get(number) if number in self._busy else None
-
-    def last_progress(self, number: int) -> dict[str, Any] | None:
-        """Return how far a job was when its worker last said it, also after the end of either."""
+        """Return how far a job was when its worker last said it, also after its end; None if none ever did."""
         with self._lock:
             return self._progress.get(number)
-
-    def events(self, number: int, place: int = 0) -> tuple[list[Event], int]:
-        """Return a job's events from a place on; see `Queue.events`."""
-        return self.queue.events(number, place)
 
     def standing(self) -> Standing:
         """Return how the queue stands."""

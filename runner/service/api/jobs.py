@@ -230,7 +230,7 @@ async def watch(
     `state`, `run` and `log` have ids; `progress` has none, as only the latest counts.
     """
     place = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 16 else 0
-    if jobs.queue.job(number).is_over and place and not jobs.events(number, place)[0]:
+    if jobs.queue.job(number).is_over and place and not jobs.queue.events(number, place)[0]:
         return Response(status_code=HTTPStatus.NO_CONTENT)  # which ends a browser's coming again
     if jobs.watchers >= MOST_WATCHERS:
         raise Refused(
@@ -250,8 +250,8 @@ async def _events(jobs: Jobs, number: int, place: int, stopping: asyncio.Event) 
         progress, spoken = None, time.monotonic()
         while not stopping.is_set():
             job = jobs.queue.job(number)  # before its events, so that none of them is missed
-            before, progress = progress, jobs.last_progress(number)
-            found, place = await run_sync(jobs.events, number, place)
+            before, progress = progress, jobs.progress(number)
+            found, place = await run_sync(jobs.queue.events, number, place)
             has_moved = progress is not None and progress is not before
             if progress is not None and has_moved:
                 yield _event("progress", progress)
@@ -291,7 +291,7 @@ def told(job: Job, jobs: Jobs) -> JobTold:
         started=job.started,
         ended=job.ended,
         error=job.error,
-        progress=jobs.progress(job.number),
+        progress=jobs.progress(job.number) if job.state == "running" else None,
         begun=[RunOfJob(seed=seed, run_id=run_id) for seed, run_id in begun.items()],
     )
 

@@ -209,7 +209,7 @@ def _log(jobs: Jobs, number: int) -> tuple[list[dict[str, Any]], int]:
     lines: list[dict[str, Any]] = []
     place = 0
     while True:
-        found, place = jobs.events(number, place)
+        found, place = jobs.queue.events(number, place)
         if not found:
             return lines[-MOST_LINES:], place
         lines += [{"kind": event.kind, **event.data} for event in found]

@@ -30,7 +30,7 @@ def cluster():
 def until(jobs, number, is_so):
     deadline = time.monotonic() + 60
     while not is_so(jobs.queue.job(number)):
-        assert time.monotonic() < deadline, (jobs.queue.job(number), jobs.events(number))
+        assert time.monotonic() < deadline, (jobs.queue.job(number), jobs.queue.events(number))
         time.sleep(0.05)
 
 
@@ -44,7 +44,7 @@ def test_a_job_is_done_by_ray_as_beside_the_server_and_can_be_cancelled(cluster,
         digests = [[run.summary["content_digest"] for run in runs] for runs in (far, here)]
         assert digests[0] == digests[1]
         assert jobs.queue.runs_of(number) == {run.seed: run.run_id for run in far}
-        told = {event.kind for event in jobs.events(number)[0]}
+        told = {event.kind for event in jobs.queue.events(number)[0]}
         assert told == {"state", "run", "log"}
         with open_recording(far[0].recording) as recording:
             assert "ray" in recording.provenance["command"]
