@@ -61,7 +61,7 @@ class FrozenMapping(Mapping[str, Any]):
         return hash(frozenset(self._items.items()))
 
     def __repr__(self) -> str:
-        return f"FrozenMapping({self._items!r})"
+        return repr(self._items)
 
 
 def frozen(value: object, path: Path = ()) -> Any:

@@ -13,6 +13,7 @@ from gymnasium.envs.toy_text.taxi import TaxiEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from runner.config.values import frozen
 from runner.errors import EnvironmentNotUsable
 from runner.mdp import Mdp, from_parts, load_mdp
 
@@ -128,6 +129,11 @@ REFUSED = {
     "no table, but discrete": ("Blackjack-v1", {}, r"'Blackjack-v1' offers no transition table"),
     "unknown argument": ("Taxi-v4", {"colour": "red"}, r"cannot be made with colour='red'.*colour"),
     "bad value": (DUALTAXI, {"slip": 2}, r"cannot be made with slip=2: slip is 2, expected"),
+    "bad reward": (
+        DUALTAXI,
+        frozen({"rewards": {"pickupp": 1}}),
+        r"cannot be made with rewards={'pickupp': 1}.*did you mean 'pickup'",
+    ),
     "bad map": (DUALTAXI, {"map": ["+-+"]}, r"cannot be made with map="),
     "bad map of another": ("FrozenLake-v1", {"map_name": "9x9"}, r"cannot be made with map_name='9x9'"),
 }
