@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from blake3 import blake3
+from gymnasium.vector import SyncVectorEnv
 
 import runner
 from runner import execution
@@ -23,13 +24,15 @@ from runner.job import Job
 from runner.recording import open as open_recording
 from runner.runs import Run
 from runner.wrappers import loop
+from tests.runner.wrappers.loops import Leaving, drive, parallel, play
 from tests.runner.wrappers.loops import make as make_env
-from tests.runner.wrappers.loops import play
 
 HERE = Path(__file__).parent
 NAMES = ("cooperative", "competitive")
 LOOPS = {"taxi": "Taxi-v4", "pole": "CartPole-v1", "rooms": "RoomsText"}
 """A loop of each kind: steps, transitions of fixed width, and of variable width."""
+TOGETHER = ("vector", "game")
+"""Loops over several environments at once, and over agents of which one after the other leaves."""
 
 
 def expectations(path: Path) -> dict[str, Any]:
@@ -99,6 +102,20 @@ def make_loop(name: str) -> None:
         rec.run.recording.replace(HERE / f"{name}.mcap")
 
 
+def make_together(name: str) -> None:
+    """Make the recording of a loop over environments side by side, or of a game of several agents."""
+    loop.provenance = made_by
+    with tempfile.TemporaryDirectory() as folder:
+        if name == "vector":
+            envs = SyncVectorEnv([lambda: make_env("CartPole-v1")] * 3)
+            with runner.record_vector(envs, folder, name=name, seed=5) as rec:
+                drive(rec, 80)
+        else:
+            with runner.record_parallel(Leaving(), folder, name=name, seed=5, info=["left"]) as rec:
+                parallel(rec, 20)
+        rec.run.recording.replace(HERE / f"{name}.mcap")
+
+
 def made_by() -> dict[str, str]:
     """Return a provenance that tells nothing of the machine but its kind."""
     packages = {f"package.{package}": version(package) for package in ("numpy", "numba", "llvmlite")}
@@ -111,6 +128,8 @@ if __name__ == "__main__":
         make(name)
     for name in LOOPS:
         make_loop(name)
+    for name in TOGETHER:
+        make_together(name)
     found = {name: expectations(HERE / f"{name}.mcap") for name in NAMES}
-    found |= {name: loop_expectations(HERE / f"{name}.mcap") for name in LOOPS}
+    found |= {name: loop_expectations(HERE / f"{name}.mcap") for name in (*LOOPS, *TOGETHER)}
     (HERE / "digests.json").write_text(json.dumps(found, indent=1) + "\n")

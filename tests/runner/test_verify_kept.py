@@ -12,7 +12,7 @@ from runner.analysis.tables import history_of
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.verify import verify
-from tests.data.make import LOOPS, NAMES, expectations, loop_expectations
+from tests.data.make import LOOPS, NAMES, TOGETHER, expectations, loop_expectations
 
 DATA = Path(__file__).parents[1] / "data"
 EXPECTED = json.loads((DATA / "digests.json").read_text())
@@ -49,7 +49,7 @@ def test_each_state_has_its_history(name):
         assert history.changed_step.max() < len(steps)
 
 
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("name", [*LOOPS, *TOGETHER])
 def test_what_kept_loops_hold(name):
     path = DATA / f"{name}.mcap"
     assert loop_expectations(path) == EXPECTED[name]
@@ -59,7 +59,19 @@ def test_what_kept_loops_hold(name):
     assert path.stat().st_size < 50_000
 
 
+def test_what_happened_side_by_side_is_told_apart():
+    with open_recording(DATA / "vector.mcap") as recording:
+        assert recording.environments == 3
+        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        assert len(steps) == 80 * 3
+        assert (steps["t"] == schema.NEVER).any()
+    with open_recording(DATA / "game.mcap") as recording:
+        played = list(recording.transitions("train"))
+        assert [int(one["acted"]) for one in played[:3]] == [0b111, 0b110, 0b100]
+        assert [int(one["agents_terminated"]) for one in played[:3]] == [0b001, 0b010, 0b100]
+
+
 def test_kept_loops_have_every_kind_of_message_but_frames():
-    kept = {topic for name in LOOPS for topic in EXPECTED[name]["messages"]}
+    kept = {topic for name in (*LOOPS, *TOGETHER) for topic in EXPECTED[name]["messages"]}
     every = {topic.name for name in schema.LOOP_TOPICS for topic in schema.KINDS[name]}
     assert kept == every - {"/train/frame", "/eval/frame"}

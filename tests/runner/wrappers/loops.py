@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
 
 import runner
 from runner.recording.reader import Recording, open_recording
@@ -97,3 +98,59 @@ def recorded(folder: Path, name: str, steps: int, **options: Any) -> tuple[Path,
 
 def opened(path: Path) -> Recording:
     return open_recording(path)
+
+
+class Leaving:
+    """Three agents of which one leaves at each step; made as PettingZoo asks for."""
+
+    metadata = {"name": "leaving_v0"}  # noqa: RUF012 - as PettingZoo has it
+    possible_agents = ("a", "b", "c")
+
+    def __init__(self) -> None:
+        self.agents: list[str] = []
+
+    def observation_space(self, agent: str) -> Any:
+        return spaces.Box(0, 9, (2,), np.float32)
+
+    def action_space(self, agent: str) -> Any:
+        return spaces.Discrete(5)
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.agents = list(self.possible_agents)
+        return {agent: np.zeros(2, np.float32) for agent in self.agents}, {a: {} for a in self.agents}
+
+    def step(self, actions: Any) -> Any:
+        there = list(self.agents)
+        gone = self.agents.pop(0)
+        values = {agent: np.full(2, len(there), np.float32) for agent in there}
+        ends = {agent: agent == gone for agent in there}
+        never = dict.fromkeys(there, False)
+        return values, dict.fromkeys(there, 1.0), ends, never, {agent: {"left": gone} for agent in there}
+
+    def close(self) -> None:
+        pass
+
+
+def drive(envs: Any, steps: int) -> list[Any]:
+    """Play at random, with resets by mask where the environments do not reset themselves."""
+    envs.action_space.seed(2)
+    seen = [envs.reset(seed=7)[0]]
+    disabled = envs.metadata["autoreset_mode"] == AutoresetMode.DISABLED
+    for _ in range(steps):
+        result = envs.step(envs.action_space.sample())
+        seen.append(result[:4])
+        over = result[2] | result[3]
+        if disabled and over.any():
+            seen.append(envs.reset(options={"reset_mask": over})[0])
+    return seen
+
+
+def parallel(env: Any, episodes: int) -> list[Any]:
+    """Play at random; agents may leave before the others."""
+    generator, seen = np.random.default_rng(3), []
+    for k in range(episodes):
+        seen.append(("reset", env.reset(seed=k)[0]))
+        while env.agents:
+            actions = {agent: int(generator.integers(env.action_space(agent).n)) for agent in env.agents}
+            seen.append((actions, *env.step(actions)[:4]))
+    return seen

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -15,7 +14,7 @@ from runner.errors import EnvironmentNotUsable
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import Recording, open_recording
-from tests.runner.wrappers.loops import make, play
+from tests.runner.wrappers.loops import Leaving, drive, make, parallel, play
 
 N = 3
 NAMES = ("CartPole-v1", "FrozenLake-v1", "Rooms")
@@ -23,20 +22,6 @@ NAMES = ("CartPole-v1", "FrozenLake-v1", "Rooms")
 
 def vector(name: str, mode: AutoresetMode) -> SyncVectorEnv:
     return SyncVectorEnv([lambda: make(name)] * N, autoreset_mode=mode)
-
-
-def drive(envs: Any, steps: int) -> list[Any]:
-    """Play at random, with resets by mask where the environments do not reset themselves."""
-    envs.action_space.seed(2)
-    seen = [envs.reset(seed=7)[0]]
-    disabled = envs.metadata["autoreset_mode"] == AutoresetMode.DISABLED
-    for _ in range(steps):
-        result = envs.step(envs.action_space.sample())
-        seen.append(result[:4])
-        over = result[2] | result[3]
-        if disabled and over.any():
-            seen.append(envs.reset(options={"reset_mask": over})[0])
-    return seen
 
 
 def alike(left: Any, right: Any) -> bool:
@@ -118,17 +103,6 @@ def test_what_a_vector_cannot_record_is_refused(tmp_path):
         runner.record_vector(envs, tmp_path)
 
 
-def parallel(env: Any, episodes: int) -> list[Any]:
-    """Play at random; agents may leave before the others."""
-    generator, seen = np.random.default_rng(3), []
-    for k in range(episodes):
-        seen.append(("reset", env.reset(seed=k)[0]))
-        while env.agents:
-            actions = {agent: int(generator.integers(env.action_space(agent).n)) for agent in env.agents}
-            seen.append((actions, *env.step(actions)[:4]))
-    return seen
-
-
 def test_a_parallel_game_is_recorded_and_undisturbed(tmp_path):
     with runner.record_parallel(DualTaxiParallelEnv(max_steps=40), tmp_path) as game:
         seen = parallel(game, 4)
@@ -151,37 +125,6 @@ def test_a_parallel_game_is_recorded_and_undisturbed(tmp_path):
     assert ended["length"].tolist() == [40] * 4
     assert ended["truncated"].all()
     assert [int(one["seed"]) for one in first] == [0, 1, 2, 3]
-
-
-class Leaving:
-    """Three agents of which one leaves at each step; made as PettingZoo asks for."""
-
-    metadata = {"name": "leaving_v0"}  # noqa: RUF012 - as PettingZoo has it
-    possible_agents = ("a", "b", "c")
-
-    def __init__(self) -> None:
-        self.agents: list[str] = []
-
-    def observation_space(self, agent: str) -> Any:
-        return gymnasium.spaces.Box(0, 9, (2,), np.float32)
-
-    def action_space(self, agent: str) -> Any:
-        return gymnasium.spaces.Discrete(5)
-
-    def reset(self, seed: int | None = None, options: Any = None) -> Any:
-        self.agents = list(self.possible_agents)
-        return {agent: np.zeros(2, np.float32) for agent in self.agents}, {a: {} for a in self.agents}
-
-    def step(self, actions: Any) -> Any:
-        there = list(self.agents)
-        gone = self.agents.pop(0)
-        values = {agent: np.full(2, len(there), np.float32) for agent in there}
-        ends = {agent: agent == gone for agent in there}
-        never = dict.fromkeys(there, False)
-        return values, dict.fromkeys(there, 1.0), ends, never, {agent: {"left": gone} for agent in there}
-
-    def close(self) -> None:
-        pass
 
 
 def test_agents_that_leave_are_told(tmp_path):
