@@ -143,8 +143,9 @@ def _heading(results: Results, shown: int) -> list[str]:
     states = [entry.state for entry in ranking for _ in range(1 + len(entry.again))]
     told = ", ".join(f"{states.count(s)} {s}" for s in get_args(State) if s in states) or "none begun"
     again = sum(len(entry.again) for entry in ranking)
+    seeds = "1 seed" if len(sweep.seeds) == 1 else f"{len(sweep.seeds)} seeds"
     return [
-        f"{sweep.file.strategy}, {results.trials:,} trials ({told}), {len(sweep.seeds)} seeds each. "
+        f"{sweep.file.strategy}, {results.trials:,} trials ({told}), {seeds} each. "
         f"Objective: {sweep.objective.described}.",
         *([f"{again} trials tried values again, and are shown once."] if again else []),
         *([f"The best {shown} of {len(ranking):,}; --all shows all."] if shown < len(ranking) else []),

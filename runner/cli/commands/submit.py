@@ -49,7 +49,8 @@ def command(
 
     with Client(required(server), found_token(token, token_file)) as client:
         job = client.submit(text_of(file), file.name)
-        say(f"Job {job.number}: {job.name}, {job.runs:,} runs; {client.url}/queue/{job.number}")
+        runs = "1 run" if job.runs == 1 else f"{job.runs:,} runs"
+        say(f"Job {job.number}: {job.name}, {runs}; {client.url}/queue/{job.number}")
         if watching:
             _tell(client.watch(job.number))
             job = client.job(job.number)

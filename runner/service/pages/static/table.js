@@ -18,7 +18,7 @@ function step(by) {
 
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input:not([type=checkbox]), textarea, select")) return;
-  if (event.key === "/") { event.preventDefault(); search.focus(); }
+  if (event.key === "/") { event.preventDefault(); search.focus(); search.select(); }
   if (!form) return;
   if (event.key === "j") step(1);
   if (event.key === "k") step(-1);
