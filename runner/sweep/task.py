@@ -119,8 +119,8 @@ def move_whole(run: Path, recordings: Path) -> None:
                 old.rename(place)
             raise
     finally:
-        for folder in (fresh, old):
-            shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(fresh, ignore_errors=True)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def result_of(run: Run, objective: Objective) -> Result:
@@ -147,18 +147,18 @@ def _run(task: Task, stop: Callable[[], bool]) -> Run:
         run = find_run(task.run_id, Path(task.recordings))
         if is_over(run):
             return run
-        watch = _Watch(task, _mdp_of(task), stop)
+        watch = _Pruning(task, _mdp_of(task), stop)
         return watch.labelled(resume(run, task.accept_changes, watch.report, watch.stop))
     job = Job(from_mapping(task.config), task.seed)
     mdp = _mdp_of(task)
-    watch = _Watch(task, mdp, stop)
+    watch = _Pruning(task, mdp, stop)
     run = create_run(Path(task.recordings), job.config, task.seed, task.name)
     with unless_empty(run):
         change_labels(run.folder, lambda _: Labels(tags=tuple(sorted(task.tags))))
         return watch.labelled(run_job(job, run, watch.report, watch.stop, mdp=mdp, threads=task.threads))
 
 
-class _Watch:
+class _Pruning:
     """Gives a run up when it is hopeless."""
 
     def __init__(self, task: Task, mdp: Mdp, stop: Callable[[], bool]) -> None:

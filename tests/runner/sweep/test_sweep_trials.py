@@ -158,20 +158,23 @@ def test_a_process_that_is_gone_before_its_task_comes_is_replaced(done, monkeypa
     assert (result.status, result.digest) == ("finished", said.digest)
 
 
-def test_a_run_that_cannot_be_moved_leaves_the_one_that_was_there(done, monkeypatch, tmp_path):
+@pytest.mark.parametrize("failing", [(".fresh",), (".fresh", ".old")])
+def test_a_run_that_cannot_be_moved_leaves_the_one_that_was_there(done, monkeypatch, tmp_path, failing):
     run = list_runs(done[0])[0].folder
     shutil.copytree(run, tmp_path / run.name)
     real = Path.rename
 
     def rename(path, to):
-        if path.name.endswith(".fresh"):
+        if path.name.endswith(failing):
             raise OSError(5, "Input/output error")
         return real(path, to)
 
     monkeypatch.setattr(Path, "rename", rename)
     with pytest.raises(OSError, match="Input/output"):
         move_whole(run, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == [run.name]
+    (left,) = tmp_path.iterdir()
+    assert (left.name == run.name) == (".old" not in failing)
+    assert (left / "recording.mcap").read_bytes() == (run / "recording.mcap").read_bytes()
 
 
 def test_hopeless_runs_are_given_up_and_stay_so(tmp_path):
