@@ -1,15 +1,17 @@
-"""One process at a time works on a run that is there already."""
+"""One process at a time works in a folder: on a run that is there already, a sweep, a queue."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import Final
-
-from filelock import FileLock, Timeout
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunnerError, StorageError
 from runner.runs import RECORDING_FILE, Run, run_at
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 RUN_LOCK: Final = "owner.lock"
 
@@ -26,13 +28,8 @@ def locked(run: Run, archived: bool = False) -> Iterator[Run]:
         RunnerError: it is running or archived, or another process has it in this way.
         StorageError: the folder cannot be written.
     """
-    lock = FileLock(run.folder / RUN_LOCK)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout as error:
-        raise RunnerError(f"run {run.run_id} is being worked on by another process; let it.") from error
-    except OSError as error:
-        raise StorageError(f"{run.folder}: cannot be written ({error.strerror}).") from error
+    busy = RunnerError(f"run {run.run_id} is being worked on by another process; let it.")
+    lock = acquired(run.folder / RUN_LOCK, busy)
     try:
         if run.facts.get("recording", RECORDING_FILE) == RECORDING_FILE:
             run = run_at(run.folder)
@@ -48,3 +45,26 @@ def locked(run: Run, archived: bool = False) -> Iterator[Run]:
         yield run
     finally:
         lock.release()
+
+
+def acquired(path: Path, busy: RunnerError) -> FileLock:
+    """Return the lock of a file, acquired without waiting; who asked for it releases it.
+
+    Args:
+        path: the file; its folder is made if it is missing.
+        busy: what is raised if another process has it.
+
+    Raises:
+        RunnerError: `busy`.
+        StorageError: the folder cannot be written.
+    """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(path, thread_local=False)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise busy from error
+    except OSError as error:
+        raise StorageError(f"{path.parent}: cannot be written ({error.strerror}).") from error
+    return lock

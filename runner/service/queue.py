@@ -20,11 +20,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, Literal, Self, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, get_args
 
 from runner.config.document import write_yaml
 from runner.documents import read_object
 from runner.errors import RunnerError, StorageError
+from runner.locking import acquired
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 Kind = Literal["config", "sweep"]
 State = Literal["queued", "running", "interrupted", "finished", "failed", "cancelled"]
@@ -298,22 +302,13 @@ def now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-def _hold(folder: Path) -> Any:
+def _hold(folder: Path) -> FileLock:
     """Keep every other process from the queue, as long as this one lives."""
-    from filelock import FileLock, Timeout
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder / LOCK_FILE, thread_local=False)
-        lock.acquire(blocking=False)
-    except Timeout as error:
-        raise RunnerError(
-            f"{folder.parent} is served by another process already; stop that one, or choose another "
-            "--recordings."
-        ) from error
-    except OSError as error:
-        raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
-    return lock
+    busy = RunnerError(
+        f"{folder.parent} is served by another process already; stop that one, or choose another "
+        "--recordings."
+    )
+    return acquired(folder / LOCK_FILE, busy)
 
 
 def _read_jobs(folder: Path) -> Iterator[Job]:

@@ -20,10 +20,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
 
-from filelock import FileLock, Timeout
+from filelock import FileLock
 
 from runner.documents import write_whole
 from runner.errors import RunnerError, RunNotFound, StorageError
+from runner.locking import acquired
 from runner.packing.present import sync
 from runner.runs import run_of_id
 from runner.service.appending import Appending, on_disk
@@ -377,21 +378,9 @@ def _repeated(upload: Upload, completion: Completion) -> Upload:
 
 
 def _only_server(folder: Path) -> FileLock:
-    """Return the lock of a folder of uploads, held.
-
-    Raises:
-        StorageError: the folder cannot be made.
-        RunnerError: another process holds it.
-    """
-    lock = FileLock(folder / LOCK_FILE, thread_local=False)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock.acquire(blocking=False)
-    except Timeout as error:
-        raise RunnerError(f"{folder.parent}: another server has this folder; stop it first.") from error
-    except OSError as error:
-        raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
-    return lock
+    """Return the lock of a folder of uploads, acquired; errors as for `runner.locking.acquired`."""
+    busy = RunnerError(f"{folder.parent}: another server has this folder; stop it first.")
+    return acquired(folder / LOCK_FILE, busy)
 
 
 def _read_all(folder: Path) -> Iterator[Upload]:

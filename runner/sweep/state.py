@@ -17,6 +17,7 @@ from runner.config.loading import read_text
 from runner.documents import read_object, write_whole
 from runner.errors import ConfigError, RunnerError, StorageError, nearest
 from runner.job import identity_of
+from runner.locking import acquired
 from runner.runs import Run, list_runs
 from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep
@@ -135,17 +136,8 @@ def held(name: str, recordings: Path) -> Iterator[None]:
         SweepBusy: one does.
         StorageError: the folder cannot be written.
     """
-    from filelock import FileLock, Timeout
-
-    folder = folder_of(name, recordings)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = FileLock(folder / LOCK)
-        lock.acquire(blocking=False)
-    except Timeout as error:
-        raise SweepBusy(f"the sweep {name!r} is being done by another process; let it.") from error
-    except OSError as error:
-        raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
+    busy = SweepBusy(f"the sweep {name!r} is being done by another process; let it.")
+    lock = acquired(folder_of(name, recordings) / LOCK, busy)
     try:
         yield
     finally:
