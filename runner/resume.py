@@ -60,7 +60,7 @@ def is_finished(run: Run) -> bool:
     """Return whether a run came to its end and its recording is whole, as far as it says itself."""
     try:
         with open_recording(run.recording) as recording:
-            return recording.finished and recording.result.get("status") == "finished"
+            return recording.finished and recording.status == "finished"
     except RecordingError:
         return False
 

@@ -148,7 +148,7 @@ def _compare(recording: Recording, rerun: bool, report: Report) -> Verification:
     if recording.run["job"] != job.identity:
         return _other_job(recording, job.identity)
     mdp = load_mdp(config.env.id, config.env.kwargs, config.rewards) if rerun else recording.mdp
-    complete = recording.result.get("status") == "finished"
+    complete = recording.status == "finished"
     past = Past(recording, complete, without_steps=config.recording.steps == "none")
     session = rerun_session(job, mdp, recording, past, report)
     found = Verification(

@@ -33,7 +33,7 @@ def read_series(recording: Recording) -> RunSeries:
         run_id=recording.run["run_id"],
         name=recording.run["name"],
         seed=int(recording.run["seed"]),
-        status=recording.result.get("status", "interrupted"),
+        status=recording.status,
         config=recording.config,
         evaluation=[
             (record["episode"], evaluation_readings(record) | exact.get(record["evaluation"], {}))
@@ -60,7 +60,7 @@ def loop_series(recording: Recording) -> RunSeries:
         run_id=recording.run["run_id"],
         name=recording.run["name"],
         seed=int(recording.run["seed"]),
-        status=recording.result.get("status", "interrupted"),
+        status=recording.status,
         config=_without_seed(recording.config, int(recording.run["seed"])),
         evaluation=_loop_evaluations(recording),
         training=sorted(training.items()),

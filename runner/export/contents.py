@@ -11,14 +11,9 @@ from runner.recording import schema
 from runner.recording.reader import Recording
 
 
-def status_of(recording: Recording) -> str:
-    """Return `finished`, or what the run is instead."""
-    return str(recording.result.get("status", "interrupted"))
-
-
 def shortcomings(recording: Recording) -> list[str]:
     """Return what is missing from a recording, a sentence each; of a whole one nothing."""
-    said, status = [], status_of(recording)
+    said, status = [], recording.status
     if status != "finished":
         done = "there is what its loop had done"
         if recording.kind == "job":

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import MissingExtra, RunnerError
-from runner.export.contents import flat_text, status_of
+from runner.export.contents import flat_text
 from runner.export.scalars import created, measures, seconds_of
 from runner.recording.reader import Recording
 
@@ -145,7 +145,7 @@ def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) 
         client.log_artifact(run_id, str(path))
     if with_recording:
         client.log_artifact(run_id, str(recording.path))
-    status = _STATUS.get(status_of(recording), "KILLED")
+    status = _STATUS.get(recording.status, "KILLED")
     client.set_terminated(run_id, status, round(max(last, began) * 1000))
     notes += [
         f"{_short(name)} is called {_short(key)}: MLflow takes no such name."
@@ -183,7 +183,7 @@ def _tags(recording: Recording) -> dict[str, str]:
         DIGEST_TAG: _digest(recording),
         "dualtaxi.job": run["job"],
         "dualtaxi.seed": run["seed"],
-        "dualtaxi.status": status_of(recording),
+        "dualtaxi.status": recording.status,
     }
 
 

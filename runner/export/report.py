@@ -18,7 +18,7 @@ from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries
 from runner.errors import MissingExtra, RecordingError, RunnerError
 from runner.export import svg, svg_maps
-from runner.export.contents import flat_text, has_steps, shortcomings, status_of, why_no_steps
+from runner.export.contents import flat_text, has_steps, shortcomings, why_no_steps
 from runner.export.plots import panels_of
 from runner.export.plots_figure import footnote, matplotlib_of, panel_svgs
 from runner.export.report_maps import MapRow, maps_of, stages_of
@@ -113,7 +113,7 @@ def _run(recording: Recording, series: RunSeries, number: int, chosen: Sequence[
         "id": recording.run["run_id"],
         "name": recording.run["name"],
         "seed": recording.run["seed"],
-        "state": status_of(recording),
+        "state": recording.status,
         "agents": [spoken(agent) for agent in environment["agents"]],
         "learners": agents_of(recording),
         "environment": environment,

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from runner.analysis.tables import step_of_episode, tables_at
 from runner.errors import RecordingError
-from runner.export.contents import status_of
 from runner.export.svg_maps import pair_map, policy_map
 from runner.frames import agents_of
 from runner.mdp import Mdp
@@ -67,7 +66,7 @@ def stages_of(recording: Recording) -> list[Stage]:
     middle = between[0] if between else _replayed(recording, half)
     stages = [first, *([middle] if middle else []), last]
     titles = ["before learning", "in the middle", "after learning"]
-    if status_of(recording) != "finished":
+    if recording.status != "finished":
         titles[-1] = "at the last snapshot"
     named = zip([titles[0], *([titles[1]] if middle else []), titles[-1]], stages, strict=True)
     unique = {stage.step: Stage(f"{title}: {_after(stage)}", *_rest(stage)) for title, stage in named}

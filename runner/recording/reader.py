@@ -136,6 +136,11 @@ class Recording:
             return {}
         return self._json("result")
 
+    @property
+    def status(self) -> str:
+        """How the run ended: `finished`, `failed`, or `interrupted`, also if it could not say so."""
+        return str(self.result.get("status", "interrupted"))
+
     def run_facts(self) -> dict[str, Any]:
         """Return what `run.json` says, from the recording alone."""
         result = self.result

@@ -139,12 +139,11 @@ def _diff_of_loops(a: Recording, b: Recording) -> RunDiff:
     digests = [recording.result.get("content_digest") for recording in (a, b)]
     same = digests[0] is not None and digests[0] == digests[1]
     notes = ["recorded from a loop: what it learned is not known, so no cause and no tables are told"]
-    if not comparable(a, b):
+    alike = comparable(a, b)
+    if not alike:
         notes.append("the environments have other spaces: no steps are compared")
-    partings = [
-        loop_parting(a, b, phase) if comparable(a, b) and not same else None for phase in ("train", "eval")
-    ]
-    if comparable(a, b) and not any(partings) and (topics := parted_topics(a, b)):
+    partings = [loop_parting(a, b, phase) if alike and not same else None for phase in ("train", "eval")]
+    if alike and not any(partings) and (topics := parted_topics(a, b)):
         notes.append(f"all steps are the same; what differs is in {', '.join(topics)}")
     return RunDiff(
         a=_who(a),
@@ -172,8 +171,8 @@ def can_compare_steps(a: Recording, b: Recording) -> bool:
 
 def _who(recording: Recording) -> dict[str, Any]:
     run = recording.run
-    status = recording.result.get("status", "interrupted")
-    return {"run_id": run["run_id"], "name": run["name"], "seed": int(run["seed"]), "status": status}
+    named = {"run_id": run["run_id"], "name": run["name"], "seed": int(run["seed"])}
+    return named | {"status": recording.status}
 
 
 def _settings(recording: Recording) -> dict[str, Any]:
@@ -196,7 +195,7 @@ def _costs(recording: Recording) -> dict[str, Any]:
 def _notes(a: Recording, b: Recording) -> list[str]:
     notes = []
     for name, recording in (("A", a), ("B", b)):
-        if recording.result.get("status") != "finished":
+        if recording.status != "finished":
             notes.append(f"{name} is not finished: compared as far as it got")
         if recording.kind == "job" and recording.config["recording"]["steps"] == "none":
             again = f"`dualtaxi rerecord {recording.run['run_id']}` records them"
