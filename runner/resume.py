@@ -92,6 +92,17 @@ def resume(
         return _go_on(current, accept_changes, report, stop)
 
 
+def require_same_makers(run: Run) -> None:
+    """Refuse a run that would be gone on with by other code or libraries than began it.
+
+    Raises:
+        RunnerError: what differs.
+    """
+    changes = _changes(run)
+    if changes:
+        raise RunnerError(_refusal(run, changes))
+
+
 def _settled(run: Run) -> Run:
     """Return a run whose recording is finished; if its owner died before saying so, say it."""
     if run.status == "finished":

@@ -84,10 +84,11 @@ def begin(sweep: Sweep, recordings: Path, resume: bool, accept_changes: bool) ->
         sweep: what is to be done.
         recordings: the folder of its runs.
         resume: whether it may be there already.
-        accept_changes: whether it may have been another then.
+        accept_changes: whether it may have been another then, or begun by other code.
 
     Raises:
-        RunnerError: there is one of this name already, or it was another.
+        RunnerError: there is one of this name already, it was another, or other code began a run of it
+            that is not over.
         StorageError: the folder cannot be written.
     """
     require_startable(sweep, recordings, resume, accept_changes)
@@ -98,7 +99,8 @@ def require_startable(sweep: Sweep, recordings: Path, resume: bool, accept_chang
     """Refuse what `begin` would refuse, and write nothing.
 
     Raises:
-        RunnerError: there is one of this name already, or it was another.
+        RunnerError: there is one of this name already, it was another, or other code began a run of it
+            that is not over.
     """
     there = sweep.name in sweeps_in(recordings)
     if there and not resume:
@@ -115,6 +117,17 @@ def require_startable(sweep: Sweep, recordings: Path, resume: bool, accept_chang
                 + "\n--accept-changes goes on all the same, and runs that still belong to it count; "
                 "--name begins another."
             )
+        _require_same_makers(sweep.name, recordings)
+
+
+def _require_same_makers(name: str, recordings: Path) -> None:
+    """Refuse runs that cannot be gone on with as they are: without them a search would go elsewhere."""
+    from runner.resume import require_same_makers
+
+    failed = failures_of(name, recordings)
+    for identity, run in runs_of(name, recordings).items():
+        if not is_over(run) and identity not in failed:
+            require_same_makers(run)
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, str, str]]:

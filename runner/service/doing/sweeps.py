@@ -38,7 +38,7 @@ def do_sweep(order: Order, line: Line) -> Outcome:
     sweep = from_values(described(order))
     with _held(order, line.stop):
         there = order.name in state.sweeps_in(order.recordings)
-        state.begin(sweep, order.recordings, resume=there, accept_changes=False)
+        state.begin(sweep, order.recordings, resume=there, accept_changes=order.accept_changes)
         if order.retry:
             state.forget_failures(order.name, order.recordings)
         wait_for_others(state.runs_of(order.name, order.recordings).values(), line.stop)

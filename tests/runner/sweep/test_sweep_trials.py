@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from sweeping import Here, described, digests, swept
 
+from runner import verify
 from runner.again import rerecord
 from runner.config import from_mapping
 from runner.errors import RunnerError
@@ -28,6 +29,7 @@ from runner.sweep.model import Objective
 from runner.sweep.plan import plan_of
 from runner.sweep.results import ranking, results_of, sections
 from runner.sweep.task import Task, move_whole
+from runner.sweep.trials import run_sweep
 
 
 def test_each_run_is_an_ordinary_one_tagged_with_the_sweep(done):
@@ -67,6 +69,23 @@ def test_a_sweep_that_was_cut_off_twice_goes_on_as_if_it_never_had_been(done, sw
     trials, standing = swept(tmp_path, sweep, third)
     assert digests(trials) == digests(done[1])
     assert third.done == 12 - 3 - 4
+    assert len(list_runs(tmp_path)) == 12
+
+
+def test_a_sweep_whose_unfinished_run_was_begun_by_other_code_is_refused_before_it_takes_another_course(
+    done, sweep, tmp_path, monkeypatch
+):
+    first = Here(most=3)
+    swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
+    before = len(list_runs(tmp_path))
+    here = verify.provenance()
+    monkeypatch.setattr(verify, "provenance", lambda: here | {"git": "another"})
+    with pytest.raises(RunnerError, match=r"git: \S* then, another now"):
+        swept(tmp_path, sweep)
+    assert len(list_runs(tmp_path)) == before
+    state.begin(sweep, tmp_path, resume=True, accept_changes=True)
+    trials, _ = run_sweep(sweep, tmp_path, Here(), accept_changes=True)
+    assert digests(trials) == digests(done[1])
     assert len(list_runs(tmp_path)) == 12
 
 
