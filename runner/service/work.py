@@ -199,7 +199,7 @@ class Jobs:
             return self._change(number, state="queued", error="", ended="", deaths=0, **asked)
 
     def progress(self, number: int) -> dict[str, Any] | None:
-        """Return how far a job was when its worker last said it, also after its end; None if none ever did."""
+        """Return how far a job was when its worker last said so, also after its end; None if none did."""
         with self._lock:
             return self._progress.get(number)
 
