@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.learners import NO_LIMIT, blocks, tutorial_learner
 from runner.recording import schema
+from runner.recording.blocks import HEADER_BYTES
 from runner.recording.chunks import Packing
+from runner.recording.protobuf import file_descriptor_set
 from runner.recording.recorder import Recorder
 from runner.recording.writer import RecordingFile
 
@@ -75,7 +77,7 @@ def training_steps(n: int) -> NDArray[Any]:
 def wire_messages(records: NDArray[Any]) -> list[tuple[int, bytes]]:
     """Return (log time, payload) of each message record."""
     size, data = records.itemsize, records.tobytes()
-    payloads = (data[at + schema.HEADER_BYTES : at + size] for at in range(0, len(data), size))
+    payloads = (data[at + HEADER_BYTES : at + size] for at in range(0, len(data), size))
     return list(zip(records["log_time"].tolist(), payloads, strict=True))
 
 
@@ -99,9 +101,7 @@ def write(path: Path, messages: list[tuple[int, bytes]]) -> None:
     """Write the same messages by the official library."""
     writer = Writer(str(path), compression=CompressionType.ZSTD)
     writer.start(profile=schema.PROFILE)
-    schema_id = writer.register_schema(
-        schema.STEP.full_name, "protobuf", schema.file_descriptor_set(schema.STEP)
-    )
+    schema_id = writer.register_schema(schema.STEP.full_name, "protobuf", file_descriptor_set(schema.STEP))
     channel_id = writer.register_channel(schema.TRAIN_STEP.name, "protobuf", schema_id)
     for log_time, payload in messages:
         writer.add_message(channel_id, log_time, payload, log_time)

@@ -29,6 +29,7 @@ from runner.learning.learner import Held, Learner
 from runner.mdp import Mdp, load_mdp
 from runner.provenance import provenance
 from runner.recording import schema
+from runner.recording.blocks import message_record
 from runner.recording.digest import ContentHash
 from runner.recording.integrity import check_integrity
 from runner.recording.past import Past
@@ -216,7 +217,7 @@ def _check_topic(recording: Recording, topic: schema.Topic, digest: ContentHash)
     """
     if topic not in recording.dtypes:
         for time, payload in recording.messages(topic):
-            digest.update(topic, schema.message_record(topic, time, payload))
+            digest.update(topic, message_record(topic, time, payload))
         return "", 0
     number, expected, odd = schema.NUMBERED_BY[topic.message], 0, 0
     for block in recording.blocks(topic):

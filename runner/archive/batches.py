@@ -14,7 +14,7 @@ from runner.archive.layout import Shape, Table
 from runner.archive.manifest import Entry
 from runner.archive.rows import message_payload, message_row
 from runner.errors import RecordingError
-from runner.recording import schema
+from runner.recording.blocks import message_record
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 
@@ -88,7 +88,7 @@ class Batches:
             position, rest = divmod(time, STEP_NANOSECONDS)
             if rest:
                 raise self.foreign(topic, f"at {time} ns")
-            self._note(topic, schema.message_record(topic, time, payload), 1)
+            self._note(topic, message_record(topic, time, payload), 1)
             yield position, payload
 
     def same(self, topic: Topic, position: int, made: bytes, payload: bytes) -> None:

@@ -16,6 +16,7 @@ from runner.archive.values import SpaceColumns
 from runner.errors import RecordingError
 from runner.mdp import Mdp
 from runner.recording import schema
+from runner.recording.blocks import Sizes, blank_records, record_dtype
 from runner.recording.facts import kind_of, sizes_of, spaces_of
 from runner.recording.reader import Recording
 from runner.recording.recorder import BLOCK_BYTES
@@ -166,17 +167,17 @@ def of_phase(batch: pa.RecordBatch, phase: str, where: str) -> pa.RecordBatch:
     return batch if chosen.all() else batch.filter(pa.array(chosen))
 
 
-def _blanks(topic: Topic, sizes: schema.Sizes, n: int) -> Records:
+def _blanks(topic: Topic, sizes: Sizes, n: int) -> Records:
     """Return n blank records: if they are small, copied from others, which is quicker than to make them."""
     most = -(-n // _BLANKS) * _BLANKS
-    if most * schema.record_dtype(topic.message, sizes).itemsize > BLOCK_BYTES:
-        return schema.blank_records(topic, sizes, n)
+    if most * record_dtype(topic.message, sizes).itemsize > BLOCK_BYTES:
+        return blank_records(topic, sizes, n)
     return _blank(topic, sizes, most)[:n].copy()
 
 
 @lru_cache(8)
-def _blank(topic: Topic, sizes: schema.Sizes, n: int) -> Records:
-    return schema.blank_records(topic, sizes, n)
+def _blank(topic: Topic, sizes: Sizes, n: int) -> Records:
+    return blank_records(topic, sizes, n)
 
 
 def _step_columns(records: Records, shape: Shape) -> dict[str, Any]:

@@ -37,6 +37,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto
 
 from runner.archive.values import SpaceColumns
 from runner.recording import schema
+from runner.recording.blocks import Sizes
 from runner.recording.schema import MessageType, Topic
 
 FORMAT: Final = "dualtaxi archive"
@@ -139,8 +140,8 @@ class Shape:
     agents: tuple[str, ...]
     action_counts: tuple[int, ...]
     events: tuple[str, ...]
-    sizes: Mapping[Topic, schema.Sizes]
-    """Of each fixed-width topic, as `schema.record_dtype` wants them."""
+    sizes: Mapping[Topic, Sizes]
+    """Of each fixed-width topic, as `record_dtype` wants them."""
     spaces: Mapping[str, SpaceColumns] = field(default_factory=dict)
     """Of a loop, by the field whose values they hold: `action`, `next_observation`, `observation`."""
 

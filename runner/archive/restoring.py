@@ -24,6 +24,7 @@ from runner.config import from_mapping
 from runner.config.sections import Recording as Plan
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
+from runner.recording.blocks import HEADER_BYTES, message_record
 from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
 from runner.recording.facts import json_object
 from runner.recording.messages import QTable, encode_q_table
@@ -182,12 +183,12 @@ class _Restoring:
 
     def _send_message(self, topic: Topic, position: int, payload: bytes) -> None:
         time = position * STEP_NANOSECONDS
-        if not 0 <= position < _MOST_STEPS or len(payload) > MAX_CHUNK_BYTES - schema.HEADER_BYTES:
+        if not 0 <= position < _MOST_STEPS or len(payload) > MAX_CHUNK_BYTES - HEADER_BYTES:
             raise RecordingError(
                 f"{self._where}: {topic.name}: found {len(payload):,} bytes after {position} steps."
             )
         if not topic.digested:
-            self._undigested[topic].update(schema.message_record(topic, time, payload))
+            self._undigested[topic].update(message_record(topic, time, payload))
         self._piles.add(topic, time, payload)
         if topic.message is schema.IMAGE or self._archive.kind == "job":
             self._piles.flush()

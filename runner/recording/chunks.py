@@ -19,7 +19,8 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.schema import MESSAGE_HEAD, Topic
+from runner.recording.blocks import MESSAGE_HEAD
+from runner.recording.schema import Topic
 
 MAX_CHUNK_BYTES: Final = 64 << 20
 """The largest chunk that is read, packed or unpacked; the recorder's are below 16 MiB."""

@@ -22,6 +22,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.blocks import HEADER_BYTES
 from runner.recording.chunks import MAX_CHUNK_BYTES, unpack_chunk
 from runner.recording.index import MAX_NAME_BYTES, MAX_NAMED
 
@@ -194,18 +195,18 @@ def read_chunk(body: bytes, offset: int) -> tuple[Part, bytes]:
 
 def _messages(records: bytes, where: str) -> tuple[int, int]:
     """Return the channel of a chunk's messages and how many there are."""
-    if len(records) < schema.HEADER_BYTES:
+    if len(records) < HEADER_BYTES:
         raise RecordingError(f"{where}: holds no whole message")
     opcode, length, channel = struct.unpack_from("<BQH", records)
     if opcode != Opcode.MESSAGE or channel not in {topic.channel for topic in schema.ALL_TOPICS}:
         raise RecordingError(f"{where}: holds no messages of ours")
     if channel in {topic.channel for topic in schema.ALL_BLOCK_TOPICS}:
-        if len(records) % (9 + length) or 9 + length < schema.HEADER_BYTES:
+        if len(records) % (9 + length) or 9 + length < HEADER_BYTES:
             raise RecordingError(f"{where}: its messages differ in size")
         return channel, len(records) // (9 + length)
     at = messages = 0
-    while at + schema.HEADER_BYTES <= len(records):
-        at += 9 + max(struct.unpack_from("<Q", records, at + 1)[0], schema.HEADER_BYTES - 9)
+    while at + HEADER_BYTES <= len(records):
+        at += 9 + max(struct.unpack_from("<Q", records, at + 1)[0], HEADER_BYTES - 9)
         messages += 1
     if at != len(records):
         raise RecordingError(f"{where}: its messages do not fill it")

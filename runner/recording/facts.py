@@ -12,6 +12,7 @@ from runner.errors import RecordingError
 from runner.mdp import MAX_AGENTS, MAX_ARRAYS_BYTES, MAX_EVENTS, Mdp, from_parts
 from runner.recording import schema
 from runner.recording.arrays import unpack_array
+from runner.recording.blocks import Sizes, block_counts
 from runner.recording.contents import MAX_METADATA_BYTES
 from runner.recording.index import Index
 from runner.recording.schema import Topic
@@ -85,8 +86,8 @@ def spaces_of(run: Mapping[str, str], path: str) -> dict[str, Any]:
     return spaces
 
 
-def sizes_of(run: Mapping[str, str], path: str) -> dict[Topic, schema.Sizes]:
-    """Return what `schema.record_dtype` must know of each fixed-width topic of a recording.
+def sizes_of(run: Mapping[str, str], path: str) -> dict[Topic, Sizes]:
+    """Return what `record_dtype` must know of each fixed-width topic of a recording.
 
     Raises:
         RecordingError: its spaces are not described.
@@ -101,7 +102,7 @@ def sizes_of(run: Mapping[str, str], path: str) -> dict[Topic, schema.Sizes]:
         if action is None or observation is None:
             raise RecordingError(f"{path}: has a space of variable width, expected fixed ones in its kind.")
     return {
-        topic: schema.block_counts(topic, learners, events, action, observation)
+        topic: block_counts(topic, learners, events, action, observation)
         for topic in schema.KINDS[kind]
         if topic in schema.ALL_BLOCK_TOPICS
     }

@@ -29,8 +29,9 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
+from runner.recording.blocks import MESSAGE_HEAD
 from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES
-from runner.recording.schema import ALL_TOPICS, MESSAGE_HEAD, PROFILE
+from runner.recording.schema import ALL_TOPICS, PROFILE
 
 K = TypeVar("K")
 T = TypeVar("T")

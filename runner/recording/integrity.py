@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.blocks import HEADER, HEADER_BYTES
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head, message_index
 from runner.recording.contents import Contents, read_chunk, survey
 from runner.recording.writer import RecordingFile, schema_and_channel_bytes
@@ -209,11 +210,11 @@ def places(records: bytes, where: str) -> tuple[int, Times, Times]:
     """Return channel, times and offsets of a chunk's messages; checks what every message must have."""
     times, offsets, channels = [], [], set()
     at = 0
-    if len(records) >= schema.HEADER_BYTES:
+    if len(records) >= HEADER_BYTES:
         _, length, channel = struct.unpack_from("<BQH", records)
         if channel in _BLOCK_CHANNELS and length and len(records) % (9 + length) == 0:
             return _block_places(records, 9 + length, channel, where)
-    while at + schema.HEADER_BYTES <= len(records):
+    while at + HEADER_BYTES <= len(records):
         opcode, length, channel, sequence, log_time, publish_time = struct.unpack_from("<BQHIQQ", records, at)
         if opcode != Opcode.MESSAGE or sequence or publish_time != log_time:
             raise RecordingError(f"{where}: found a message at {at} that no recorder writes.")
@@ -227,7 +228,7 @@ def places(records: bytes, where: str) -> tuple[int, Times, Times]:
 
 
 def _block_places(records: bytes, size: int, channel: int, where: str) -> tuple[int, Times, Times]:
-    layout = np.dtype([*schema.HEADER, ("data", "u1", (size - schema.HEADER_BYTES,))])
+    layout = np.dtype([*HEADER, ("data", "u1", (size - HEADER_BYTES,))])
     block = np.frombuffer(records, layout)
     times = block["log_time"]
     constant = (

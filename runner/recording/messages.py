@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.protobuf import message_class
 from runner.recording.schema import STEP_NANOSECONDS, MessageType
 from runner.recording.spaces import NUMBERS
 
@@ -31,7 +32,7 @@ class QTable:
 
 def encode(message: MessageType, values: Mapping[str, Any]) -> bytes:
     """Return the message with these field values; a field that is missing is protobuf's zero."""
-    return bytes(schema.message_class(message)(**values).SerializeToString(deterministic=True))
+    return bytes(message_class(message)(**values).SerializeToString(deterministic=True))
 
 
 def decode(message: MessageType, payload: bytes) -> dict[str, Any]:
@@ -41,7 +42,7 @@ def decode(message: MessageType, payload: bytes) -> dict[str, Any]:
         RecordingError: the payload is no such message.
     """
     try:
-        parsed = schema.message_class(message).FromString(payload)
+        parsed = message_class(message).FromString(payload)
     except DecodeError as error:
         raise RecordingError(f"found a payload that is no {message.full_name} ({error})") from error
     return {

@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.recording.schema import Topic, message_record
+from runner.recording.blocks import message_record
+from runner.recording.schema import Topic
 
 MOST_BYTES: Final = 1 << 18
 MOST_MESSAGES: Final = 4096

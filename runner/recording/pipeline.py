@@ -20,9 +20,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.recording.blocks import message_record
 from runner.recording.chunks import Chunk, Packing, encode_chunk
 from runner.recording.digest import ContentHash
-from runner.recording.schema import Topic, message_record
+from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile, storage_error
 
 ENCODERS: Final = 2

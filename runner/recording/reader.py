@@ -4,7 +4,7 @@
         for block in recording.blocks(TRAIN_STEP):      # NumPy records, some thousands at a time
             print(block["rewards"].mean())
 
-A block is the file's own bytes seen through the dtype of `schema.record_dtype`: no message is parsed one
+A block is the file's own bytes seen through the dtype of `record_dtype`: no message is parsed one
 by one. It is the only way in which the rest of the project reads recordings.
 """
 
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError, RunnerError
 from runner.mdp import Mdp
 from runner.recording import schema
+from runner.recording.blocks import MESSAGE_HEAD, record_dtype
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.contents import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
 from runner.recording.facts import (
@@ -39,7 +40,7 @@ from runner.recording.facts import (
 )
 from runner.recording.index import ChunkEntry, read_index
 from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
-from runner.recording.schema import MESSAGE_HEAD, Topic
+from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
 from runner.recording.store import RecordStore
 
@@ -235,7 +236,7 @@ class Recording:
     def dtypes(self) -> dict[Topic, np.dtype[np.void]]:
         """The dtype of each fixed-width topic's message records in this recording."""
         return {
-            topic: schema.record_dtype(topic.message, sizes)
+            topic: record_dtype(topic.message, sizes)
             for topic, sizes in sizes_of(self.run, str(self.path)).items()
         }
 

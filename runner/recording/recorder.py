@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
+from runner.recording.blocks import Sizes, blank_records, block_counts, message_record, record_dtype
 from runner.recording.chunks import Packing
 from runner.recording.past import Past
 from runner.recording.piles import Piles
@@ -45,7 +46,7 @@ class _Lane:
     """The buffers of one fixed-width topic."""
 
     topic: Topic
-    sizes: schema.Sizes
+    sizes: Sizes
     capacity: int
     write: bool
     open: _Block | None = None
@@ -79,14 +80,12 @@ class Recorder:
         record_steps: bool = True,
         past: Past | None = None,
         beat: Callable[[], None] = lambda: None,
-        sizes: Mapping[Topic, schema.Sizes] | None = None,
+        sizes: Mapping[Topic, Sizes] | None = None,
         threads: bool = True,
     ) -> None:
         self._file = file
         self._past = past or Past()
-        sizes = sizes or {
-            topic: schema.block_counts(topic, learners, events) for topic in schema.BLOCK_TOPICS
-        }
+        sizes = sizes or {topic: block_counts(topic, learners, events) for topic in schema.BLOCK_TOPICS}
         self._lanes = {
             topic: _Lane(
                 topic,
@@ -111,7 +110,7 @@ class Recorder:
 
     def blank(self, topic: Topic, n: int) -> NDArray[np.void]:
         """Return n records of a fixed-width topic of their own, with every constant byte set."""
-        return schema.blank_records(topic, self._lanes[topic].sizes, n)
+        return blank_records(topic, self._lanes[topic].sizes, n)
 
     def block(self, topic: Topic) -> NDArray[np.void]:
         """Return the free records of the topic's open block, to be filled from the first on."""
@@ -152,7 +151,7 @@ class Recorder:
         log_time = sum(self.steps.values()) * STEP_NANOSECONDS
         self.counts[topic.name] += 1
         known = self._past.compare_message(topic, log_time, payload)
-        records = memoryview(schema.message_record(topic, log_time, payload))
+        records = memoryview(message_record(topic, log_time, payload))
         times = np.array([log_time], dtype=np.uint64)
         self._pipeline.send(topic, records, times, np.zeros(1, np.uint64), write=not known)
         return not known
@@ -246,7 +245,7 @@ class Recorder:
         """Return a block to fill: a used one that came back, or a new one while there may be more."""
         if lane.made < BLOCKS_UNDER_WAY and lane.free.empty():
             lane.made += 1
-            return _Block(schema.blank_records(lane.topic, lane.sizes, lane.capacity))
+            return _Block(blank_records(lane.topic, lane.sizes, lane.capacity))
         block = lane.free.get()
         block.filled = 0
         return block
@@ -268,7 +267,7 @@ class Recorder:
         )
 
 
-def capacity_of(topic: Topic, sizes: schema.Sizes, chunk_steps: int) -> int:
+def capacity_of(topic: Topic, sizes: Sizes, chunk_steps: int) -> int:
     """Return how many records a block of a topic has."""
     most = EPISODES_A_BLOCK if topic.message in (schema.EPISODE, schema.RESET) else chunk_steps
-    return max(1, min(most, BLOCK_BYTES // schema.record_dtype(topic.message, sizes).itemsize))
+    return max(1, min(most, BLOCK_BYTES // record_dtype(topic.message, sizes).itemsize))

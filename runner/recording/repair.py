@@ -20,6 +20,7 @@ from mcap.opcode import Opcode
 
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
+from runner.recording.blocks import record_dtype
 from runner.recording.contents import asks_for_indexes, attachment_of, metadata_of, read_chunk
 from runner.recording.facts import check_run, json_object, kind_of, sizes_of
 from runner.recording.integrity import check_integrity, places
@@ -202,7 +203,7 @@ class _Salvage:
         if name == "run":
             check_run(entries, str(self._path))
             self._dtypes = {
-                topic: schema.record_dtype(topic.message, sizes)
+                topic: record_dtype(topic.message, sizes)
                 for topic, sizes in sizes_of(entries, str(self._path)).items()
             }
         file.add_metadata(name, entries)

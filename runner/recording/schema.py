@@ -1,22 +1,14 @@
 """The recording format, stated once: topics, messages, fields, times and the version.
 
-Every message is protobuf. Those that come by the million (`Step`, `Episode`) use fixed-width fields only
-and write each of them, zeros too, so that a message has one size in a channel: a run of whole MCAP
-message records is then a NumPy array of one dtype, the same in the kernel's output, in the file's chunks
-and in the reader's hands, and a standard protobuf parser still reads each message.
+Every message is protobuf; `blocks` says how those that come by the million stand in the file.
 """
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from typing import Any, Final
+from typing import Final
 
-import numpy as np
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
-from numpy.typing import NDArray
 
 FORMAT_VERSION: Final = 1
 PROFILE: Final = "dualtaxi"
@@ -323,161 +315,3 @@ NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", TRANSITION: "step", RESE
 """The field that numbers the messages of a fixed-width topic, from 0."""
 NEVER: Final = 2**32 - 1
 """The `t` of a step in which a vector environment only reset one of its environments."""
-
-_WIDTH: dict[int, str] = {_DOUBLE: "<f8", _FIXED32: "<u4", _SFIXED64: "<i8", _FIXED64: "<u8", _BOOL: "?"}
-_WIRE: dict[int, int] = {_DOUBLE: 1, _SFIXED64: 1, _FIXED64: 1, _FIXED32: 5, _BOOL: 0, _STRING: 2, _BYTES: 2}
-
-Sizes = tuple[int | np.dtype[Any], ...]
-"""What is not fixed by the format: the elements of each repeated field, the dtype of each bytes field."""
-
-HEADER: Final = [
-    ("opcode", "u1"),
-    ("record_length", "<u8"),
-    ("channel_id", "<u2"),
-    ("sequence", "<u4"),
-    ("log_time", "<u8"),
-    ("publish_time", "<u8"),
-]
-"""An MCAP message record up to its data: 31 bytes. `sequence` is not used and is 0."""
-
-HEADER_BYTES: Final = np.dtype(HEADER).itemsize
-MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
-"""The same, for one message: opcode, length, channel, sequence, log time, publish time."""
-
-
-@lru_cache(64)
-def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
-    """Return the dtype of a whole MCAP message record of a fixed-width message.
-
-    Args:
-        message: its fields must all be of fixed width.
-        sizes: of each repeated field the number of elements, of each bytes field its dtype, in order.
-
-    Fields named `tag…` hold protobuf's constant bytes (see `blank_records`).
-    """
-    layout: list[Any] = list(HEADER)
-    for field, value in zip(message.fields, _values(message, sizes), strict=True):
-        layout.append((f"tag_{field.name}", "u1", (len(_tag(field, value)),)))
-        layout.append((field.name, value))
-    return np.dtype(layout)
-
-
-def _values(message: MessageType, sizes: Sizes) -> list[np.dtype[Any]]:
-    """Return the dtype of each field's value."""
-    remaining = iter(sizes)
-    values = []
-    for field in message.fields:
-        if field.kind == _BYTES:
-            values.append(np.dtype(next(remaining)))  # type: ignore[arg-type]
-        elif field.repeated:
-            values.append(np.dtype((_WIDTH[field.kind], (next(remaining),))))
-        else:
-            values.append(np.dtype(_WIDTH[field.kind]))
-    return values
-
-
-def _tag(field: Field, value: np.dtype[Any]) -> bytes:
-    """Return the constant bytes before a field's value: tag, and its length if it is bytes or packed."""
-    if not field.repeated and field.kind != _BYTES:
-        return bytes([field.number << 3 | _WIRE[field.kind]])
-    return bytes([field.number << 3 | 2]) + varint(value.itemsize)
-
-
-def varint(number: int) -> bytes:
-    """Return a number as protobuf writes lengths: seven bits a byte, the lowest first."""
-    low = []
-    while number >= 128:
-        low.append(number & 0x7F | 0x80)
-        number >>= 7
-    return bytes([*low, number])
-
-
-def blank_records(topic: Topic, sizes: Sizes, n: int) -> NDArray[np.void]:
-    """Return n message records of the topic with every constant byte set and every value 0."""
-    dtype = record_dtype(topic.message, sizes)
-    one = np.zeros((), dtype=dtype)
-    one["opcode"] = 5
-    one["record_length"] = dtype.itemsize - 9
-    one["channel_id"] = topic.channel
-    for field, value in zip(topic.message.fields, _values(topic.message, sizes), strict=True):
-        one[f"tag_{field.name}"] = list(_tag(field, value))
-    return np.full(n, one)
-
-
-def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:
-    """Return the whole message record of one message, logged at a time in nanoseconds."""
-    length = HEADER_BYTES - 9 + len(payload)
-    return MESSAGE_HEAD.pack(5, length, topic.channel, 0, log_time, log_time) + payload
-
-
-def block_counts(
-    topic: Topic,
-    learners: int,
-    events: int,
-    action: np.dtype[Any] | None = None,
-    observation: np.dtype[Any] | None = None,
-) -> Sizes:
-    """Return what `record_dtype` must know of a topic in a run.
-
-    Args:
-        topic: one of `ALL_BLOCK_TOPICS`.
-        learners: number of reward columns.
-        events: number of event counters.
-        action: dtype of an action, for `Transition`.
-        observation: dtype of an observation, for `Transition` and `Reset`.
-    """
-    known: dict[MessageType, tuple[int | np.dtype[Any] | None, ...]] = {
-        STEP: (learners,),
-        EPISODE: (learners, events),
-        TRANSITION: (action, observation, learners),
-        RESET: (observation,),
-    }
-    sizes = known[topic.message]
-    assert None not in sizes, f"{topic.message.name} needs the dtypes of its spaces"
-    return sizes  # type: ignore[return-value]
-
-
-def file_descriptor_set(message: MessageType) -> bytes:
-    """Return the schema of a message as MCAP wants it: a serialized FileDescriptorSet with its imports."""
-    return descriptor_pb2.FileDescriptorSet(file=_files(message)).SerializeToString(deterministic=True)
-
-
-@cache
-def message_class(message: MessageType) -> Any:
-    """Return the protobuf class of a message."""
-    pool = descriptor_pool.DescriptorPool()
-    for file in _files(message):
-        pool.AddSerializedFile(file.SerializeToString())
-    return message_factory.GetMessageClass(pool.FindMessageTypeByName(message.full_name))
-
-
-def _files(message: MessageType) -> list[descriptor_pb2.FileDescriptorProto]:
-    """Return the file that describes the message, after the files it imports."""
-    file = descriptor_pb2.FileDescriptorProto(
-        name=f"{message.package}/{message.name}.proto", package=message.package, syntax="proto3"
-    )
-    described = file.message_type.add(name=message.name)
-    imports = []
-    for field in message.fields:
-        added = described.field.add(
-            name=field.name,
-            number=field.number,
-            type=field.kind,
-            label=Pb.LABEL_REPEATED if field.repeated else Pb.LABEL_OPTIONAL,
-        )
-        if field.kind == Pb.TYPE_MESSAGE:
-            added.type_name = ".google.protobuf.Timestamp"
-            imports.append(_timestamp_file())
-            file.dependency.append(imports[-1].name)
-        elif field.kind == Pb.TYPE_ENUM:
-            added.type_name = f".{message.full_name}.Level"
-            levels = described.enum_type.add(name="Level")
-            for number, name in enumerate(LOG_LEVELS):
-                levels.value.add(name=name, number=number)
-    return [*imports, file]
-
-
-def _timestamp_file() -> descriptor_pb2.FileDescriptorProto:
-    file = descriptor_pb2.FileDescriptorProto()
-    timestamp_pb2.DESCRIPTOR.CopyToProto(file)
-    return file

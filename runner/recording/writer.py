@@ -37,7 +37,8 @@ from runner import __version__
 from runner.errors import StorageError
 from runner.recording.chunks import Chunk
 from runner.recording.contents import Contents
-from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPICS, Topic, file_descriptor_set
+from runner.recording.protobuf import file_descriptor_set
+from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPICS, Topic
 
 LIBRARY = f"dualtaxi {__version__}"
 

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from runner.errors import RecordingError, RunnerError
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.blocks import blank_records
 from runner.recording.repair import repair
 from tests.reliability.hostile import (
     ATTACHMENT,
@@ -99,7 +100,7 @@ def with_chunks(data: bytes, bodies: list[bytes], finished: bool) -> bytes:
 
 def steps_of_zeros(size: int) -> bytes:
     """Return messages of training steps, all alike, of about so many bytes."""
-    one = schema.blank_records(schema.TRAIN_STEP, (2,), 1).tobytes()
+    one = blank_records(schema.TRAIN_STEP, (2,), 1).tobytes()
     return one * (size // len(one))
 
 

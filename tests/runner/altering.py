@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from runner.recording import open as open_recording
-from runner.recording import schema
+from runner.recording.blocks import HEADER, HEADER_BYTES
 from runner.recording.chunks import Packing, encode_chunk
 from runner.recording.contents import survey
 from runner.recording.schema import Topic
@@ -58,9 +58,9 @@ def _records(recording: Any, topic: Topic, change: Change) -> tuple[list[bytes],
 
 
 def _record(topic: Topic, log_time: int, payload: bytes) -> bytes:
-    header = np.zeros((), schema.HEADER)
+    header = np.zeros((), HEADER)
     header["opcode"], header["channel_id"] = 5, topic.channel
-    header["record_length"] = schema.HEADER_BYTES - 9 + len(payload)
+    header["record_length"] = HEADER_BYTES - 9 + len(payload)
     header["log_time"] = header["publish_time"] = log_time
     return header.tobytes() + payload
 

@@ -13,6 +13,7 @@ from runner.learning.learner import Learner
 from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.blocks import blank_records, block_counts
 from runner.resume import resume
 from runner.runs import list_runs
 from runner.verify import verify
@@ -54,7 +55,7 @@ def live(run, step):
     learner = Learner(config, mdp, 3)
     counts = len(learner.agents), len(mdp.event_names)
     steps, episodes = (
-        schema.blank_records(topic, schema.block_counts(topic, *counts), step + 1).view(np.recarray)
+        blank_records(topic, block_counts(topic, *counts), step + 1).view(np.recarray)
         for topic in (schema.TRAIN_STEP, schema.TRAIN_EPISODE)
     )
     if step:

@@ -21,6 +21,7 @@ from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
+from runner.recording.protobuf import message_class
 from runner.runs import create_run, list_runs
 from tests.runner.learning.oracle import Twin
 from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
@@ -232,8 +233,7 @@ def test_a_run_that_is_told_to_stop_is_interrupted_and_closed_properly(asked, tm
             complete.count(topic) for topic in schema.BLOCK_TOPICS
         )
         lines = [
-            schema.message_class(schema.LOG).FromString(line)
-            for _, line in recording.messages(schema.LOG_TOPIC)
+            message_class(schema.LOG).FromString(line) for _, line in recording.messages(schema.LOG_TOPIC)
         ]
         assert (lines[-1].message, lines[-1].level) == ("interrupted", schema.LOG_LEVELS.index("WARNING"))
 

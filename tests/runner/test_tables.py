@@ -14,6 +14,7 @@ from runner.learning.learner import Learner
 from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.blocks import blank_records, block_counts
 from runner.recording.repair import repair
 from tests.runner.altering import altered
 from tests.runner.recording.making import TAXIS, experiment, make_run
@@ -56,12 +57,8 @@ def live(config):
     def at(step: int) -> list[np.ndarray]:
         learner = Learner(config, mdp, 0)
         counts = len(learner.agents), len(mdp.event_names)
-        block = schema.blank_records(
-            schema.TRAIN_STEP, schema.block_counts(schema.TRAIN_STEP, *counts), max(step, 1)
-        )
-        ended = schema.blank_records(
-            schema.TRAIN_EPISODE, schema.block_counts(schema.TRAIN_EPISODE, *counts), 100
-        )
+        block = blank_records(schema.TRAIN_STEP, block_counts(schema.TRAIN_STEP, *counts), max(step, 1))
+        ended = blank_records(schema.TRAIN_EPISODE, block_counts(schema.TRAIN_EPISODE, *counts), 100)
         taken = learner.train(block.view(np.recarray), ended.view(np.recarray), 10**6, step)[0] if step else 0
         assert taken == step
         return [learner.table(i).copy() for i in range(len(learner.agents))]

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from runner.analysis.diff.settings import EnvironmentDiff, changes_in
 from runner.analysis.diff.trajectory import Parting
 from runner.recording import schema
+from runner.recording.blocks import HEADER
 from runner.recording.messages import decode
 from runner.recording.reader import Recording
 
 MOST_NUMBERS: Final = 16
 """A value of more numbers is not told whole where it differs."""
-_HEADER: Final = {name for name, _ in schema.HEADER}
+_HEADER: Final = {name for name, _ in HEADER}
 
 
 def loop_environment_diff(a: Recording, b: Recording) -> EnvironmentDiff:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.blocks import HEADER_BYTES
 from runner.recording.reader import Recording
 
 Block = NDArray[np.void]
@@ -102,7 +103,7 @@ def rows_that_differ(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> ND
         left, right = (
             np.ascontiguousarray(block).view(np.uint8).reshape(-1, block.itemsize) for block in (a, b)
         )
-        if left[:, schema.HEADER_BYTES :].tobytes() == right[:, schema.HEADER_BYTES :].tobytes():
+        if left[:, HEADER_BYTES:].tobytes() == right[:, HEADER_BYTES:].tobytes():
             return np.zeros(len(a), np.bool_)
     differs = np.zeros(len(a), np.bool_)
     for name in fields:

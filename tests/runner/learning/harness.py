@@ -12,6 +12,7 @@ from runner.config import ExperimentConfig, from_mapping
 from runner.learning.learner import Learner
 from runner.mdp import Mdp, load_mdp
 from runner.recording import schema
+from runner.recording.blocks import blank_records, block_counts
 from tests.runner.learning.oracle import Twin
 
 SMALL_MAP = ["+---+", "|A: |", "| |B|", "+---+"]
@@ -158,7 +159,7 @@ def blank_blocks(learner: Learner, n: int) -> tuple[Any, ...]:
     """Return n step records and n episode records to fill, such as the recorder hands out."""
     learners, events = len(learner.agents), len(learner.mdp.event_names)
     return tuple(
-        schema.blank_records(topic, schema.block_counts(topic, learners, events), n).view(np.recarray)
+        blank_records(topic, block_counts(topic, learners, events), n).view(np.recarray)
         for topic in (schema.TRAIN_STEP, schema.TRAIN_EPISODE)
     )
 

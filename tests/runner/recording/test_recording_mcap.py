@@ -20,6 +20,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.protobuf import message_class
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
 PACKINGS = [
@@ -87,8 +88,8 @@ def test_messages_of_the_million_kind_have_one_size_each(run):
     for topic in schema.BLOCK_TOPICS:
         sizes = {len(message.data) for message, _ in official_messages(run.recording)[topic.name]}
         assert len(sizes) == 1
-    values = schema.message_class(schema.STEP)(step=2**62, state=2**31, rewards=[1e300, -0.0], explored=3)
-    zeros = schema.message_class(schema.STEP)()
+    values = message_class(schema.STEP)(step=2**62, state=2**31, rewards=[1e300, -0.0], explored=3)
+    zeros = message_class(schema.STEP)()
     assert values.ByteSize() != zeros.ByteSize(), "what protobuf would have left out is what we write"
 
 

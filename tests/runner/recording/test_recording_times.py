@@ -10,6 +10,7 @@ from mcap.reader import make_reader
 
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.protobuf import message_class
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
 TENTH = 100_000_000
@@ -70,7 +71,7 @@ def test_measures_and_tables_have_the_time_of_the_last_step_before_them(recordin
         assert metrics["evaluation"] == number
         assert metrics["log_time"] == evaluated["log_time"][trials == number][-1]
     for log_time, payload in recording.messages(schema.Q_TABLE_TOPIC):
-        step = schema.message_class(schema.Q_TABLE).FromString(payload).step
+        step = message_class(schema.Q_TABLE).FromString(payload).step
         assert log_time == 0 or log_time in times
         assert (training["log_time"] <= log_time).sum() == step
 
@@ -87,7 +88,7 @@ def test_times_do_not_decrease_within_a_topic_and_equal_publish_times(recording)
 
 def test_text_says_the_same_time_as_its_message(recording):
     lines = [
-        (time, schema.message_class(schema.LOG).FromString(payload))
+        (time, message_class(schema.LOG).FromString(payload))
         for time, payload in recording.messages(schema.LOG_TOPIC)
     ]
     assert len(lines) >= 2

@@ -1,0 +1,139 @@
+"""Message records as NumPy arrays.
+
+The messages that come by the million (`Step`, `Episode`) use fixed-width fields only and write each of
+them, zeros too, so that a message has one size in a channel: a run of whole MCAP message records is then
+a NumPy array of one dtype, the same in the kernel's output, in the file's chunks and in the reader's
+hands, and a standard protobuf parser still reads each message.
+"""
+
+from __future__ import annotations
+
+import struct
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
+from numpy.typing import NDArray
+
+from runner.recording.schema import EPISODE, RESET, STEP, TRANSITION, Field, MessageType, Topic
+
+_FIXED: Final[dict[int, tuple[str, int]]] = {
+    Pb.TYPE_DOUBLE: ("<f8", 1),
+    Pb.TYPE_SFIXED64: ("<i8", 1),
+    Pb.TYPE_FIXED64: ("<u8", 1),
+    Pb.TYPE_FIXED32: ("<u4", 5),
+    Pb.TYPE_BOOL: ("?", 0),
+}
+"""Kind of a field of fixed width -> its dtype, and protobuf's wire type."""
+_DELIMITED: Final = 2
+"""The wire type of what has its length before it: bytes, and packed fields."""
+
+Sizes = tuple[int | np.dtype[Any], ...]
+"""What is not fixed by the format: the elements of each repeated field, the dtype of each bytes field."""
+
+HEADER: Final = [
+    ("opcode", "u1"),
+    ("record_length", "<u8"),
+    ("channel_id", "<u2"),
+    ("sequence", "<u4"),
+    ("log_time", "<u8"),
+    ("publish_time", "<u8"),
+]
+"""An MCAP message record up to its data: 31 bytes. `sequence` is not used and is 0."""
+
+HEADER_BYTES: Final = np.dtype(HEADER).itemsize
+MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
+"""The same, for one message: opcode, length, channel, sequence, log time, publish time."""
+
+
+@lru_cache(64)
+def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
+    """Return the dtype of a whole MCAP message record of a fixed-width message.
+
+    Args:
+        message: its fields must all be of fixed width.
+        sizes: of each repeated field the number of elements, of each bytes field its dtype, in order.
+
+    Fields named `tag…` hold protobuf's constant bytes (see `blank_records`).
+    """
+    layout: list[Any] = list(HEADER)
+    for field, value in zip(message.fields, _values(message, sizes), strict=True):
+        layout.append((f"tag_{field.name}", "u1", (len(_tag(field, value)),)))
+        layout.append((field.name, value))
+    return np.dtype(layout)
+
+
+def _values(message: MessageType, sizes: Sizes) -> list[np.dtype[Any]]:
+    """Return the dtype of each field's value."""
+    remaining = iter(sizes)
+    values = []
+    for field in message.fields:
+        if field.kind == Pb.TYPE_BYTES:
+            values.append(np.dtype(next(remaining)))  # type: ignore[arg-type]
+        elif field.repeated:
+            values.append(np.dtype((_FIXED[field.kind][0], (next(remaining),))))
+        else:
+            values.append(np.dtype(_FIXED[field.kind][0]))
+    return values
+
+
+def _tag(field: Field, value: np.dtype[Any]) -> bytes:
+    """Return the constant bytes before a field's value: tag, and its length if it is bytes or packed."""
+    if not field.repeated and field.kind != Pb.TYPE_BYTES:
+        return bytes([field.number << 3 | _FIXED[field.kind][1]])
+    return bytes([field.number << 3 | _DELIMITED]) + _varint(value.itemsize)
+
+
+def _varint(number: int) -> bytes:
+    """Return a number as protobuf writes lengths: seven bits a byte, the lowest first."""
+    low = []
+    while number >= 128:
+        low.append(number & 0x7F | 0x80)
+        number >>= 7
+    return bytes([*low, number])
+
+
+def blank_records(topic: Topic, sizes: Sizes, n: int) -> NDArray[np.void]:
+    """Return n message records of the topic with every constant byte set and every value 0."""
+    dtype = record_dtype(topic.message, sizes)
+    one = np.zeros((), dtype=dtype)
+    one["opcode"] = 5
+    one["record_length"] = dtype.itemsize - 9
+    one["channel_id"] = topic.channel
+    for field, value in zip(topic.message.fields, _values(topic.message, sizes), strict=True):
+        one[f"tag_{field.name}"] = list(_tag(field, value))
+    return np.full(n, one)
+
+
+def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:
+    """Return the whole message record of one message, logged at a time in nanoseconds."""
+    length = HEADER_BYTES - 9 + len(payload)
+    return MESSAGE_HEAD.pack(5, length, topic.channel, 0, log_time, log_time) + payload
+
+
+def block_counts(
+    topic: Topic,
+    learners: int,
+    events: int,
+    action: np.dtype[Any] | None = None,
+    observation: np.dtype[Any] | None = None,
+) -> Sizes:
+    """Return what `record_dtype` must know of a topic in a run.
+
+    Args:
+        topic: one of `ALL_BLOCK_TOPICS`.
+        learners: number of reward columns.
+        events: number of event counters.
+        action: dtype of an action, for `Transition`.
+        observation: dtype of an observation, for `Transition` and `Reset`.
+    """
+    known: dict[MessageType, tuple[int | np.dtype[Any] | None, ...]] = {
+        STEP: (learners,),
+        EPISODE: (learners, events),
+        TRANSITION: (action, observation, learners),
+        RESET: (observation,),
+    }
+    sizes = known[topic.message]
+    assert None not in sizes, f"{topic.message.name} needs the dtypes of its spaces"
+    return sizes  # type: ignore[return-value]
