@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import os
 import stat
-from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Mapping
-from functools import cached_property
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError, RunnerError
 from runner.mdp import Mdp
 from runner.recording import schema
-from runner.recording.blocks import MESSAGE_HEAD, record_dtype
+from runner.recording.blocks import record_dtype
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.contents import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
 from runner.recording.facts import (
@@ -38,17 +38,20 @@ from runner.recording.facts import (
     sizes_of,
     spaces_of,
 )
-from runner.recording.index import ChunkEntry, read_index
+from runner.recording.index import read_index
 from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
 from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
 from runner.recording.store import RecordStore
+from runner.recording.topic_chunks import TopicChunks, chunks_by_topic
 
 MAX_EPISODE_BYTES: Final = 128 << 20
 """The most that `episode_steps` gives as one array: some 1.5 million steps."""
 MAX_METRICS: Final = 1 << 17
 """The most that `metrics` gives as one list."""
 _METRICS_BYTES: Final = 1 << 20
+
+M = TypeVar("M")
 
 
 def open_recording(path: str | os.PathLike[str]) -> Recording:
@@ -82,7 +85,7 @@ class Recording:
         except BaseException:
             self.close()
             raise
-        self._known_numbers: dict[Topic, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
+        self._known_chunks: dict[Topic, TopicChunks] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -281,21 +284,16 @@ class Recording:
         Raises:
             RecordingError: a recording of its kind has none.
         """
-        for topic in self.topics:
-            if topic.name == name:
-                return topic
-        raise RecordingError(f"{self.path}: has no topic {name!r}: it is of the kind {self.kind!r}.")
+        if name not in self._own:
+            raise RecordingError(f"{self.path}: has no topic {name!r}: it is of the kind {self.kind!r}.")
+        return self._own[name]
 
     def count(self, topic: Topic) -> int:
         """Return the number behind a topic's last message: how many there are, if none was lost.
 
         For a topic of variable size it reads them.
         """
-        topic = self._own(topic)
-        if topic in self.dtypes:
-            ends = self._numbers(topic)[1]
-            return int(ends[-1]) if len(ends) else 0
-        return sum(1 for _ in self.messages(topic))
+        return self._chunks(topic).count()
 
     def blocks(self, topic: Topic, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
         """Yield the messages number `start` up to `stop` of a fixed-width topic, a chunk at a time.
@@ -303,63 +301,21 @@ class Recording:
         Each block is a read-only structured array with the fields of the message, and those of the MCAP
         record (`log_time` in nanoseconds, ...).
         """
-        topic = self._own(topic)
-        if topic not in self.dtypes:
-            raise RecordingError(
-                f"{self.path}: the messages of {topic.name} vary in size; read them one by one."
-            )
-        firsts, ends = self._numbers(topic)
-        stop = int(ends[-1]) if stop is None and len(ends) else (stop or 0)
-        chunks = range(
-            int(np.searchsorted(ends, start, side="right")), int(np.searchsorted(firsts, stop, side="left"))
-        )
-        entries = (self._entry(topic, k) for k in chunks)
-        for k, data in zip(chunks, self._store.chunks(entries), strict=True):
-            first = int(firsts[k])
-            yield self._block(topic, k, data)[max(start - first, 0) : stop - first]
+        return self._chunks(topic).blocks(start, stop)
 
     def blocks_between(self, topic: Topic, start_time: int, stop_time: int) -> Iterator[NDArray[np.void]]:
         """Yield the messages of a fixed-width topic logged from `start_time` up to `stop_time`, in ns."""
-        firsts, ends = self._numbers(topic)
-        if not len(firsts):
-            return
-        start, stop = np.uint64(max(start_time, 0)), np.uint64(max(stop_time, 0))
-        times = self._index.chunks.columns[self._chunks_of[topic.channel]]
-        first, behind = np.searchsorted(times["end_time"], start), np.searchsorted(times["start_time"], stop)
-        for block in self.blocks(topic, int(firsts[first]), int(ends[behind - 1])) if first < behind else ():
-            low, high = (int(np.searchsorted(block["log_time"], time)) for time in (start, stop))
-            if low < high:
-                yield block[low:high]
+        return self._chunks(topic).blocks_between(start_time, stop_time)
 
     def blocks_of_episodes(self, phase: str, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
         """Yield the steps of the episodes number `start` up to `stop`; None for the very end."""
-        behind = None if stop is None else self._first_step(phase, stop)
-        return self.blocks(self.topic(f"/{phase}/step"), self._first_step(phase, start), behind)
-
-    def _first_step(self, phase: str, episode: int) -> int:
-        """Return the first step of an episode or a later one, found in the steps themselves."""
-        topic = self.topic(f"/{phase}/step")
-        firsts, ends = (numbers.tolist() for numbers in self._numbers(topic))
-        k = bisect_left(ends, episode, key=lambda end: next(self.blocks(topic, end - 1, end))["episode"][0])
-        if k == len(ends):
-            return self.count(topic)
-        block = next(self.blocks(topic, firsts[k], ends[k]))
-        return int(firsts[k]) + int(np.searchsorted(block["episode"], episode))
+        steps = self._chunks(self.topic(f"/{phase}/step"))
+        behind = None if stop is None else steps.first_from("episode", stop)
+        return steps.blocks(steps.first_from("episode", start), behind)
 
     def messages(self, topic: Topic, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
         """Yield (log time in nanoseconds, payload) of a topic's messages, in order."""
-        for k in range(first_chunk, len(self._chunks_of[topic.channel])):
-            entry = self._entry(topic, k)
-            data = self._store.chunk(entry)
-            at = 0
-            while at < len(data):
-                if at + MESSAGE_HEAD.size > len(data):
-                    raise self._damaged(entry, f"stray bytes at {at}")
-                opcode, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
-                if opcode != 5 or length < 22 or at + 9 + length > len(data) or channel != topic.channel:
-                    raise self._damaged(entry, f"no message of {topic.name} at {at}")
-                yield log_time, data[at + MESSAGE_HEAD.size : at + 9 + length]
-                at += 9 + length
+        return self._chunks(topic).messages(first_chunk)
 
     def episodes(self, phase: str, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
         """Return the episode records of a phase (`train` or `eval`) as one array."""
@@ -394,12 +350,12 @@ class Recording:
             )
         if (stop - start) * self.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
             raise RecordingError(
-                f"{self.path}: {phase} episode {episode} has {stop - start:,} steps, too many to be given "
+                f"{self.path}: {phased} episode {episode} has {stop - start:,} steps, too many to be given "
                 f"at once; read them in blocks, from {start}."
             )
         blocks = list(self.blocks(topic, start, stop))
         if not blocks:
-            raise RecordingError(f"{self.path}: the steps of {phase} episode {episode} were lost.")
+            raise RecordingError(f"{self.path}: the steps of {phased} episode {episode} were lost.")
         return np.concatenate(blocks)[::stride]
 
     # --- of somebody's own loop ---------------------------------------------------------------------
@@ -417,21 +373,19 @@ class Recording:
         """Yield the resets of a phase one by one, as `transitions` yields steps."""
         yield from self._values(self.topic(f"/{phase}/reset"), observation="observation")
 
-    def decoded(self, topic: Topic) -> Iterator[dict[str, Any]]:
-        """Yield the messages of a topic of variable size: `log_time` and the fields, by name."""
-        for time, payload in self.messages(topic):
-            try:
-                yield {"log_time": time} | decode(topic.message, payload)
-            except RecordingError as error:
-                raise RecordingError(f"{self.path}: {topic.name} at {time} ns: {error}") from error
+    def decoded(self, topic: Topic, most: int = MAX_CHUNK_BYTES) -> Iterator[dict[str, Any]]:
+        """Yield the messages of a topic of variable size: `log_time` and the fields, by name.
+
+        Raises:
+            RecordingError: one cannot be read, or has more bytes than `most`.
+        """
+        for time, fields in self._parsed(topic, partial(decode, topic.message), most=most):
+            yield {"log_time": time} | fields
 
     def arrays(self) -> Iterator[Snapshot]:
         """Yield the arrays that a loop recorded by `snapshot`, in order."""
-        for time, payload in self.messages(schema.ARRAY_TOPIC):
-            try:
-                yield decode_array(payload)
-            except RecordingError as error:
-                raise RecordingError(f"{self.path}: the array at {time} ns: {error}") from error
+        for _, array in self._parsed(schema.ARRAY_TOPIC, decode_array):
+            yield array
 
     def _values(self, topic: Topic, **spaces: str) -> Iterator[Any]:
         """Yield a topic's messages one by one; `spaces` names the space of each field that is a value."""
@@ -470,23 +424,12 @@ class Recording:
         """
         if phase not in schema.PHASES:
             raise ValueError(f"found phase {phase!r}, expected one of: {', '.join(schema.PHASES)}.")
-        yield from self._decoded(
-            schema.TRAIN_METRICS_TOPIC if phase == "train" else schema.EVAL_METRICS_TOPIC
-        )
+        topic = schema.TRAIN_METRICS_TOPIC if phase == "train" else schema.EVAL_METRICS_TOPIC
+        yield from self.decoded(topic, _METRICS_BYTES)
 
     def optimality(self) -> Iterator[dict[str, Any]]:
         """Yield the exact measures of the evaluations, in order; none unless `evaluation.exact` was set."""
-        yield from self._decoded(schema.OPTIMALITY_TOPIC)
-
-    def _decoded(self, topic: schema.Topic) -> Iterator[dict[str, Any]]:
-        for time, payload in self.messages(topic):
-            where = f"{self.path}: {topic.name} at {time} ns"
-            if len(payload) > _METRICS_BYTES:
-                raise RecordingError(f"{where}: found {len(payload):,} bytes; too many to be ours.")
-            try:
-                yield {"log_time": time} | decode(topic.message, payload)
-            except RecordingError as error:
-                raise RecordingError(f"{where}: {error}") from error
+        yield from self.decoded(schema.OPTIMALITY_TOPIC, _METRICS_BYTES)
 
     def snapshots(self, step: int = 0, tables: int = 0) -> Iterator[QTable]:
         """Yield the snapshots in order; those are left out that are older than needed for `step`.
@@ -504,74 +447,64 @@ class Recording:
                 yield snapshot
 
     def _since(self, step: int, tables: int) -> Iterator[QTable]:
-        topic = schema.Q_TABLE_TOPIC
-        chunks = range(len(self._chunks_of[topic.channel]))
+        chunks = range(len(self._chunks(schema.Q_TABLE_TOPIC)))
         behind = bisect_right(chunks, step, key=lambda k: next(self._snapshots(k)).step) if step else 0
         yield from self._snapshots(max(0, behind - 2 * tables))
 
     def _snapshots(self, first_chunk: int) -> Iterator[QTable]:
-        for time, payload in self.messages(schema.Q_TABLE_TOPIC, first_chunk):
-            try:
-                yield decode_q_table(payload)
-            except RecordingError as error:
-                raise RecordingError(f"{self.path}: the Q-table at {time} ns: {error}") from error
+        for _, table in self._parsed(schema.Q_TABLE_TOPIC, decode_q_table, first_chunk):
+            yield table
 
     # --- inside ------------------------------------------------------------------------------------
 
-    def _json(self, name: str) -> dict[str, Any]:
-        return json_object(self.metadata(name).get("json"), f"{self.path}: the metadata {name!r}")
+    def _parsed(
+        self,
+        topic: Topic,
+        parse: Callable[[bytes], M],
+        first_chunk: int = 0,
+        most: int = MAX_CHUNK_BYTES,
+    ) -> Iterator[tuple[int, M]]:
+        """Yield (log time in nanoseconds, what `parse` makes of it) of a topic's messages, in order.
+
+        Raises:
+            RecordingError: it makes nothing of one, which is named, or one has more bytes than `most`.
+        """
+        for time, payload in self.messages(topic, first_chunk):
+            try:
+                if len(payload) > most:
+                    raise RecordingError(f"found {len(payload):,} bytes; too many to be ours.")
+                message = parse(payload)
+            except RecordingError as error:
+                raise RecordingError(f"{self.path}: {topic.name} at {time} ns: {error}") from error
+            yield time, message
+
+    def _chunks(self, topic: Topic) -> TopicChunks:
+        """Return the chunks of a topic, or of this recording's own of that name: the kinds differ."""
+        own = self._own.get(topic.name, topic)
+        if own not in self._known_chunks:
+            self._known_chunks[own] = TopicChunks(
+                own,
+                self._places[own],
+                self._index.chunks,
+                self._store,
+                self.dtypes.get(own),
+                self.lost.get(own.name, []),
+                str(self.path),
+            )
+        return self._known_chunks[own]
 
     @cached_property
-    def _chunks_of(self) -> Mapping[int, NDArray[np.intp]]:
-        """Which chunks each channel has, in order."""
-        table = self._index.chunks
-        channels = table.columns["channel"].copy() if table else np.empty(0, np.uint16)
-        for k in np.flatnonzero(channels == 0).tolist():
-            channel = self._store.first_channel(table[k])
-            channels[k] = channel
-        for k in np.flatnonzero(~np.isin(channels, list(self._index.channels))).tolist():
-            raise self._damaged(table[k], f"messages of channel {channels[k]}, expected one of ours")
-        return {topic.channel: np.flatnonzero(channels == topic.channel) for topic in schema.ALL_TOPICS}
+    def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
+        """Which chunks of the file are each topic's."""
+        return chunks_by_topic(self._index, self._store, str(self.path))
 
-    def _entry(self, topic: Topic, k: int) -> ChunkEntry:
-        """Return the entry of a topic's chunk number k."""
-        return self._index.chunks[int(self._chunks_of[topic.channel][k])]
+    @cached_property
+    def _own(self) -> Mapping[str, Topic]:
+        """The topics that a recording of its kind has, by name."""
+        return {topic.name: topic for topic in self.topics}
 
-    def _own(self, topic: Topic) -> Topic:
-        """Return this recording's topic of that name, if it has one: `/train/step` differs by its kind."""
-        return next((own for own in self.topics if own.name == topic.name), topic)
-
-    def _numbers(self, topic: Topic) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return, for each chunk of a fixed-width topic, the number of its first message and behind its last.
-
-        Messages are numbered as recorded; where a repair lost some, the numbers go on behind the gap.
-        """
-        if topic not in self._known_numbers:
-            size, chunks = self.dtypes[topic].itemsize, self._chunks_of[topic.channel]
-            sizes = np.empty(0, np.int64)
-            if len(chunks):
-                sizes = self._index.chunks.columns["uncompressed_size"][chunks].astype(np.int64)
-            if (odd := np.flatnonzero(sizes % size)).size:
-                entry = self._entry(topic, int(odd[0]))
-                raise self._damaged(entry, f"{entry.uncompressed_size} bytes, not a multiple of {size}")
-            ends = np.cumsum(sizes // size)
-            firsts = ends - sizes // size
-            for start, stop in self.lost.get(topic.name, []):
-                behind = firsts >= start
-                firsts[behind] += stop - start
-                ends[behind] += stop - start
-            self._known_numbers[topic] = firsts, ends
-        return self._known_numbers[topic]
-
-    def _block(self, topic: Topic, k: int, data: bytes) -> NDArray[np.void]:
-        """Return a chunk of a fixed-width topic as an array, after looking at its constant bytes."""
-        dtype = self.dtypes[topic]
-        block = np.frombuffer(data, dtype=dtype)
-        if (block["channel_id"] != topic.channel).any() or (
-            block["record_length"] != dtype.itemsize - 9
-        ).any():
-            raise self._damaged(self._entry(topic, k), f"other messages than of {topic.name}")
-        return block
+    def _json(self, name: str) -> dict[str, Any]:
+        return json_object(self.metadata(name).get("json"), f"{self.path}: the metadata {name!r}")
 
     def _record(self, opcode: int, offset: int, length: int, most: int = MAX_CHUNK_BYTES) -> bytes:
         """Return the body of a record of this kind."""
@@ -579,6 +512,3 @@ class Recording:
         if record[0] != opcode or int.from_bytes(record[1:9], "little") != length - 9:
             raise RecordingError(f"{self.path}: found another record at {offset} than the index says.")
         return record[9:]
-
-    def _damaged(self, entry: ChunkEntry, found: str) -> RecordingError:
-        return RecordingError(f"{self.path}: chunk at {entry.offset}: found {found}.")
