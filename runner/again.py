@@ -12,7 +12,7 @@ from runner import runs
 from runner.analysis.tables import last_step, tables_at
 from runner.config import ExperimentConfig, from_mapping
 from runner.errors import Diverged, RunnerError, StorageError
-from runner.execution import Report, Session, Stop, describe, recorder_for, run_job, write_result
+from runner.execution import Report, Session, Stop, describe, recorder_for, run_job
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.locking import locked
@@ -21,6 +21,7 @@ from runner.origin import address
 from runner.provenance import provenance
 from runner.recording.contents import survey
 from runner.recording.reader import open_recording
+from runner.recording.telling import write_result
 from runner.recording.writer import RecordingFile
 from runner.runs import Run, unless_empty
 from runner.verify import initial_tables
@@ -157,7 +158,7 @@ def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict
         summary = session.summary(topics)
         if summary["content_digest"] != expected:
             raise Diverged("the recording", "content digest", summary["content_digest"], expected)
-        write_result(file, {"status": "finished", **summary})
+        write_result(file, "finished", summary)
     return summary
 
 

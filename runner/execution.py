@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -19,18 +18,24 @@ from runner import runs
 from runner.errors import Diverged, RunnerError, StorageError
 from runner.job import Job
 from runner.learning.learner import Learner
-from runner.mdp import Mdp, description_bytes, load_mdp
+from runner.mdp import Mdp, load_mdp
 from runner.observer import Observer
 from runner.origin import configured_tables, settle
 from runner.planning import Yardstick
 from runner.provenance import provenance
 from runner.recording import schema
-from runner.recording.arrays import pack_array
 from runner.recording.chunks import Packing
 from runner.recording.messages import QTable, encode, encode_log, encode_q_table
 from runner.recording.past import Past
 from runner.recording.recorder import Recorder
-from runner.recording.writer import RecordingFile, storage_error
+from runner.recording.telling import (
+    Attachments,
+    environment_attachments,
+    run_facts,
+    write_description,
+    write_result,
+)
+from runner.recording.writer import RecordingFile
 from runner.runs import Run
 
 REPORT_SECONDS: Final = 0.1
@@ -100,12 +105,12 @@ def execute(session: Session, file: RecordingFile, run: Run, started: float) -> 
     try:
         status = "finished" if session.run() else "interrupted"
         summary = session.summary(session.recorder.drain())
-        write_result(file, {"status": status, **summary})
+        write_result(file, status, summary)
     except BaseException as error:
         session.recorder.abandon()
         status = "interrupted" if isinstance(error, KeyboardInterrupt | Diverged) else "failed"
         with contextlib.suppress(StorageError):  # a full disk may still have room for the index
-            write_result(file, {"status": status, "error": str(error)})
+            write_result(file, status, {"error": str(error)})
         with contextlib.suppress(StorageError):  # nor need there be room for this
             run.update(status=status, summary={"error": str(error), "bytes": file.size})
         _tell_what_next(run, error)
@@ -139,14 +144,6 @@ def _create(path: Path) -> RecordingFile:
         raise StorageError(
             f"{path}: cannot be created ({error.strerror}); choose another --recordings."
         ) from error
-
-
-def write_result(file: RecordingFile, result: dict[str, Any]) -> None:
-    """Write the result, the index and the summary; all of it, or nothing."""
-    try:
-        file.finish("result", {"json": json.dumps(result, sort_keys=True)})
-    except OSError as error:
-        raise storage_error(file, error) from error
 
 
 class Session:
@@ -191,16 +188,9 @@ class Session:
 
     def summary(self, topics: dict[str, str]) -> dict[str, Any]:
         """Return what is worth knowing of the run without opening its recording."""
-        from runner.recording.digest import combine
-
         last = self._progress.evaluations[-1] if self._progress.evaluations else None
-        return {
-            "content_digest": combine(topics),
-            "topic_digests": topics,
+        return self.recorder.totals(topics) | {
             "episodes": self._learner.episode,
-            "train_steps": self.recorder.steps["train"],
-            "eval_steps": self.recorder.steps["eval"],
-            "messages": {name: count for name, count in self.recorder.counts.items() if count},
             "steps_recorded": self._config.recording.steps == "all",
             "last_evaluation": last and evaluation_brief(last),
         }
@@ -378,41 +368,15 @@ def describe(
     Raises:
         StorageError: the disk is full or failing.
     """
-    try:
-        _describe(file, job, run, learner, made_by or provenance())
-    except OSError as error:
-        file.cut_back()
-        raise storage_error(file, error) from error
-
-
-def _describe(file: RecordingFile, job: Job, run: Run, learner: Learner, made_by: Mapping[str, str]) -> None:
-    mdp = learner.mdp
-    file.add_metadata(
-        "run",
-        {
-            "format_version": str(schema.FORMAT_VERSION),
-            "run_id": run.run_id,
-            "name": run.name,
-            "seed": str(job.seed),
-            "job": job.identity,
-            "created": run.facts["created"],
-            "agents": json.dumps(learner.agents),
-            "learners": str(len(learner.agents)),
-            "events": str(len(mdp.event_names)),
-        },
+    events = len(learner.mdp.event_names)
+    facts = run_facts(
+        run.run_id, run.name, job.seed, job.identity, run.facts["created"], learner.agents, events
     )
-    file.add_metadata("config", {"json": json.dumps(job.config.to_mapping(), sort_keys=True)})
-    file.add_metadata("provenance", made_by)
-    for name, (media_type, data) in _environment(mdp).items():
-        file.add_attachment(name, media_type, data)
+    config, environment = job.config.to_mapping(), _environment(learner.mdp)
+    write_description(file, facts, config, made_by or provenance(), environment)
 
 
 @lru_cache(maxsize=4)
-def _environment(mdp: Mdp) -> dict[str, tuple[str, bytes]]:
-    """Return the attachments that tell of an environment, by name: media type and content."""
-    description = json.loads(description_bytes(mdp)) | {"arrays": sorted(mdp.arrays())}
-    told = {"environment.json": ("application/json", json.dumps(description, indent=1).encode())}
-    return told | {
-        f"environment/{name}.npy.zst": ("application/zstd", pack_array(array))
-        for name, array in sorted(mdp.arrays().items())
-    }
+def _environment(mdp: Mdp) -> Attachments:
+    """Return the attachments that tell of an environment."""
+    return environment_attachments(mdp.description(), mdp.arrays())

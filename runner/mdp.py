@@ -13,7 +13,6 @@ import contextlib
 import dataclasses
 import difflib
 import importlib
-import json
 import math
 import traceback
 from collections.abc import Iterator, Mapping
@@ -401,8 +400,3 @@ def _sums_to_one(probability: NDArray[np.float64]) -> bool:
         return False
     total = np.asarray(probability.sum(axis=-1))
     return bool(total.min() >= 1 - 1e-5 and total.max() <= 1 + 1e-5)
-
-
-def description_bytes(mdp: Mdp) -> bytes:
-    """Return `description()` as canonical JSON."""
-    return json.dumps(mdp.description(), sort_keys=True, indent=1, ensure_ascii=False).encode()

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from runner.recording import schema
 from runner.recording.blocks import Sizes, blank_records, block_counts, message_record, record_dtype
 from runner.recording.chunks import Packing
+from runner.recording.digest import combine
 from runner.recording.past import Past
 from runner.recording.piles import Piles
 from runner.recording.pipeline import Pipeline
@@ -201,6 +202,16 @@ class Recorder:
         self._pipeline.close()
         self._pipeline.raise_failure()
         return self._pipeline.hash.topics()
+
+    def totals(self, topics: Mapping[str, str]) -> dict[str, Any]:
+        """Return what a result says of all that was recorded; `topics` are the hashes that `drain` gave."""
+        return {
+            "content_digest": combine(topics),
+            "topic_digests": topics,
+            "train_steps": self.steps["train"],
+            "eval_steps": self.steps["eval"],
+            "messages": {name: count for name, count in self.counts.items() if count},
+        }
 
     def abandon(self) -> None:
         """Write what was committed, unless writing failed, and stop the threads: the run ends badly."""

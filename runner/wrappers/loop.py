@@ -8,7 +8,6 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -16,95 +15,29 @@ from blake3 import blake3
 
 from runner import runs
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError
-from runner.mdp import Mdp
 from runner.provenance import provenance
 from runner.recording import schema
-from runner.recording.arrays import pack_array
 from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
-from runner.recording.digest import combine
 from runner.recording.facts import sizes_of
 from runner.recording.messages import encode, encode_image, encode_log
 from runner.recording.recorder import FLUSH_SECONDS, Recorder
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.recording.writer import RecordingFile, storage_error
+from runner.recording.telling import (
+    Attachments,
+    environment_attachments,
+    run_facts,
+    write_description,
+    write_result,
+)
+from runner.recording.writer import RecordingFile
 from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder
-from runner.scene import is_whole
 from runner.service.outbox import Follower, connected, is_server, outbox_folder
 from runner.wrappers.described import Described, as_json
+from runner.wrappers.plan import Plan
 from runner.wrappers.values import lone_number
 
-MADE_BY: Final = "runner.record"
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
 PHASES: Final = ("train", "eval")
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How a loop is recorded, as its user asked."""
-
-    recordings: str | os.PathLike[str] | None = None
-    name: str | None = None
-    seed: int = 0
-    config: Mapping[str, Any] = field(default_factory=dict)
-    info: tuple[str, ...] = ()
-    frames_every: int = 0
-    frame_format: str = "png"
-    compression: str = "zstd"
-    level: int = 3
-    index: str = "message"
-    chunk_steps: int = 16_384
-
-    def mapping(self, described: Described) -> dict[str, Any]:
-        """Return the configuration that the recording carries.
-
-        Raises:
-            ConfigError: it cannot be used.
-        """
-        self._check()
-        return {
-            "name": self.name or described.env_id.rpartition("/")[2].rpartition(":")[2],
-            "made_by": MADE_BY,
-            "env": {"id": described.env_id, "kwargs": described.kwargs},
-            "seeds": [self.seed],
-            "config": self._settings(),
-            "info": list(self.info),
-            "frames": {"every": self.frames_every, "format": self.frame_format},
-            "recording": {
-                "compression": self.compression,
-                "level": self.level,
-                "index": self.index,
-                "chunk_steps": self.chunk_steps,
-                "steps": "all",
-            },
-        }
-
-    def _settings(self) -> Any:
-        """Return the user's own settings as JSON holds them."""
-        try:
-            told = as_json(dict(self.config))
-            json.dumps(told, ensure_ascii=False).encode()
-        except (RecursionError, ValueError) as error:
-            raise ConfigError(
-                f"config: found what JSON cannot hold ({error}), expected text, numbers, lists and mappings."
-            ) from error
-        return told
-
-    def _check(self) -> None:
-        expectations = (
-            ("name", "text", self.name is None or isinstance(self.name, str)),
-            ("seed", "a whole number from 0", is_whole(self.seed, 0, 2**64 - 1)),
-            ("config", "a mapping", isinstance(self.config, Mapping)),
-            ("info", "names of fields", all(isinstance(name, str) for name in self.info)),
-            ("frames_every", "a whole number from 0", is_whole(self.frames_every, 0, 2**31)),
-            ("frame_format", "png or jpeg", self.frame_format in ("png", "jpeg")),
-            ("compression", "zstd, lz4 or none", self.compression in ("zstd", "lz4", "none")),
-            ("level", "1 to 19", is_whole(self.level, 1, 19)),
-            ("index", "message or chunk", self.index in ("message", "chunk")),
-            ("chunk_steps", "256 to 65,536", is_whole(self.chunk_steps, 256, 65_536)),
-        )
-        for key, expected, holds in expectations:
-            if not holds:
-                raise ConfigError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
 
 
 class Putting(Protocol):
@@ -182,33 +115,26 @@ class Loop(Generic[R]):
 
     def _describe(self, config: Mapping[str, Any]) -> dict[str, str]:
         """Write what makes the recording self-contained; return what is said of the run."""
-        described, mdp = self.described, self.described.mdp
+        described, mdp, run = self.described, self.described.mdp, self.run
         identity = {key: value for key, value in config.items() if key not in ("name", "seeds", "recording")}
         job = json.dumps(identity | {"seed": self.plan.seed}, sort_keys=True)
-        facts = {
-            "format_version": str(schema.FORMAT_VERSION),
-            "run_id": self.run.run_id,
-            "name": self.run.name,
-            "seed": str(self.plan.seed),
-            "job": blake3(job.encode()).hexdigest()[:32],
-            "created": self.run.facts["created"],
-            "agents": json.dumps(described.agents),
-            "learners": str(len(described.agents)),
-            "events": str(len(mdp.event_names) if mdp else 0),
+        facts = run_facts(
+            run.run_id,
+            run.name,
+            self.plan.seed,
+            job=blake3(job.encode()).hexdigest()[:32],
+            created=run.facts["created"],
+            agents=described.agents,
+            events=len(mdp.event_names) if mdp else 0,
+        ) | {
             "kind": described.kind,
             "spaces": json.dumps(described.spaces()),
             "environments": str(described.environments),
         }
-        try:
-            self._file.add_metadata("run", facts)
-            self._file.add_metadata("config", {"json": json.dumps(config, sort_keys=True)})
-            made_by = provenance()
-            self._file.add_metadata("provenance", made_by)
-            _write_environment(self._file, described, mdp)
-        except OSError as error:
-            raise storage_error(self._file, error) from error
+        made_by = provenance()
+        write_description(self._file, facts, config, made_by, _environment(described))
         told = {key: made_by[key] for key in runs.MADE_BY if key in made_by}
-        self.run = self.run.update(provenance=told)
+        self.run = run.update(provenance=told)
         return facts
 
     # --- what is recorded -----------------------------------------------------------------------------
@@ -368,8 +294,8 @@ class Loop(Generic[R]):
                 summary = self._finish(status, error)
             except BaseException as failure:
                 self._recorder.abandon()
-                with contextlib.suppress(OSError):
-                    self._file.finish("result", _result("failed", {"error": str(failure)}))
+                with contextlib.suppress(StorageError):
+                    write_result(self._file, "failed", {"error": str(failure)})
                 with contextlib.suppress(StorageError):
                     self.run = self.run.update(status="failed", summary={"error": str(failure)})
                 if self._follower:
@@ -387,21 +313,16 @@ class Loop(Generic[R]):
         for rows in self._rows.values():
             rows.commit()
         topics = self._recorder.drain()
-        counts = self._recorder.counts
-        result = {
-            "content_digest": combine(topics),
-            "topic_digests": topics,
-            "episodes": counts["/train/episode"],
-            "train_steps": self._recorder.steps["train"],
-            "eval_steps": self._recorder.steps["eval"],
-            "messages": {name: count for name, count in counts.items() if count},
-            "steps_recorded": True,
-            "last_evaluation": None,
-        } | ({"error": error} if error else {})
-        try:
-            self._file.finish("result", _result(status, result))
-        except OSError as failure:
-            raise storage_error(self._file, failure) from failure
+        result = (
+            self._recorder.totals(topics)
+            | {
+                "episodes": self._recorder.counts["/train/episode"],
+                "steps_recorded": True,
+                "last_evaluation": None,
+            }
+            | ({"error": error} if error else {})
+        )
+        write_result(self._file, status, result)
         seconds = round(time.monotonic() - self._started, 3)
         return result | {"seconds": seconds, "bytes": self._file.size}
 
@@ -424,8 +345,10 @@ class Loop(Generic[R]):
             rows.open()
 
 
-def _write_environment(file: RecordingFile, described: Described, mdp: Mdp | None) -> None:
-    """Attach what is said of the environment, and its arrays if it is tabular."""
+def _environment(described: Described) -> Attachments:
+    """Return the attachments that tell of an environment, with its arrays if it is tabular."""
+    if described.mdp is not None:
+        return environment_attachments(described.mdp.description(), described.mdp.arrays())
     said = {
         "env_id": described.env_id,
         "kwargs": described.kwargs,
@@ -437,17 +360,7 @@ def _write_environment(file: RecordingFile, described: Described, mdp: Mdp | Non
         "penalty_below": None,
         "scene": None,
     }
-    arrays = {}
-    if mdp is not None:
-        said, arrays = mdp.description(), mdp.arrays()
-    description = json.dumps(said | {"arrays": sorted(arrays)}, indent=1)
-    file.add_attachment("environment.json", "application/json", description.encode())
-    for name, array in sorted(arrays.items()):
-        file.add_attachment(f"environment/{name}.npy.zst", "application/zstd", pack_array(array))
-
-
-def _result(status: str, result: Mapping[str, Any]) -> dict[str, str]:
-    return {"json": json.dumps({"status": status, **result}, sort_keys=True)}
+    return environment_attachments(said, {})
 
 
 def _number(name: str, value: Any) -> float:

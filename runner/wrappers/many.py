@@ -15,7 +15,8 @@ from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.mdp import MAX_AGENTS
 from runner.wrappers.described import Described, describe, kind_of
 from runner.wrappers.loop import Loop
-from runner.wrappers.single import Recorded, plan_of
+from runner.wrappers.plan import plan_of
+from runner.wrappers.single import Recorded
 from runner.wrappers.staged import AgentRows, VectorRows
 
 

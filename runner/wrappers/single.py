@@ -9,12 +9,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Generic, Literal, Self
 
 import gymnasium
-import numpy as np
 
 from runner.errors import ConfigError
 from runner.runs import Run
 from runner.wrappers.described import describe
-from runner.wrappers.loop import PHASES, Loop, Plan, R
+from runner.wrappers.loop import PHASES, Loop, R
+from runner.wrappers.plan import plan_of
 from runner.wrappers.rows import ROWS, Rows
 
 
@@ -260,40 +260,3 @@ def _require_pictures(env: gymnasium.Env[Any, Any]) -> None:
             f"frames_every: found an environment with render_mode={env.render_mode!r}, expected "
             "'rgb_array': make it with render_mode=\"rgb_array\"."
         )
-
-
-def plan_of(
-    recordings: str | os.PathLike[str] | None,
-    name: str | None,
-    seed: int,
-    config: Mapping[str, Any] | None,
-    info: Sequence[str],
-    frames_every: int,
-    frame_format: str,
-    packing: Mapping[str, Any],
-) -> Plan:
-    """Return what a user asked for.
-
-    Raises:
-        ConfigError: there is no such argument, or Pillow is missing for frames.
-    """
-    given: Any = seed
-    known = ("compression", "level", "index", "chunk_steps")
-    if unknown := set(packing) - set(known):
-        raise ConfigError(f"found the argument {sorted(unknown)[0]!r}, expected one of {', '.join(known)}")
-    if isinstance(info, str):
-        raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
-    if frames_every:
-        from runner.wrappers.frames import pillow
-
-        pillow()
-    return Plan(
-        recordings=recordings,
-        name=name,
-        seed=given.item() if isinstance(given, np.integer) else given,
-        config=config or {},
-        info=tuple(info),
-        frames_every=frames_every,
-        frame_format=frame_format,
-        **packing,
-    )

@@ -1,0 +1,123 @@
+"""How a loop is recorded, as its user asked."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from runner.errors import ConfigError
+from runner.scene import is_whole
+from runner.wrappers.described import Described, as_json
+
+MADE_BY: Final = "runner.record"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a user asked for."""
+
+    recordings: str | os.PathLike[str] | None = None
+    name: str | None = None
+    seed: int = 0
+    config: Mapping[str, Any] = field(default_factory=dict)
+    info: tuple[str, ...] = ()
+    frames_every: int = 0
+    frame_format: str = "png"
+    compression: str = "zstd"
+    level: int = 3
+    index: str = "message"
+    chunk_steps: int = 16_384
+
+    def mapping(self, described: Described) -> dict[str, Any]:
+        """Return the configuration that the recording carries.
+
+        Raises:
+            ConfigError: it cannot be used.
+        """
+        self._check()
+        return {
+            "name": self.name or described.env_id.rpartition("/")[2].rpartition(":")[2],
+            "made_by": MADE_BY,
+            "env": {"id": described.env_id, "kwargs": described.kwargs},
+            "seeds": [self.seed],
+            "config": self._settings(),
+            "info": list(self.info),
+            "frames": {"every": self.frames_every, "format": self.frame_format},
+            "recording": {
+                "compression": self.compression,
+                "level": self.level,
+                "index": self.index,
+                "chunk_steps": self.chunk_steps,
+                "steps": "all",
+            },
+        }
+
+    def _settings(self) -> Any:
+        """Return the user's own settings as JSON holds them."""
+        try:
+            told = as_json(dict(self.config))
+            json.dumps(told, ensure_ascii=False).encode()
+        except (RecursionError, ValueError) as error:
+            raise ConfigError(
+                f"config: found what JSON cannot hold ({error}), expected text, numbers, lists and mappings."
+            ) from error
+        return told
+
+    def _check(self) -> None:
+        expectations = (
+            ("name", "text", self.name is None or isinstance(self.name, str)),
+            ("seed", "a whole number from 0", is_whole(self.seed, 0, 2**64 - 1)),
+            ("config", "a mapping", isinstance(self.config, Mapping)),
+            ("info", "names of fields", all(isinstance(name, str) for name in self.info)),
+            ("frames_every", "a whole number from 0", is_whole(self.frames_every, 0, 2**31)),
+            ("frame_format", "png or jpeg", self.frame_format in ("png", "jpeg")),
+            ("compression", "zstd, lz4 or none", self.compression in ("zstd", "lz4", "none")),
+            ("level", "1 to 19", is_whole(self.level, 1, 19)),
+            ("index", "message or chunk", self.index in ("message", "chunk")),
+            ("chunk_steps", "256 to 65,536", is_whole(self.chunk_steps, 256, 65_536)),
+        )
+        for key, expected, holds in expectations:
+            if not holds:
+                raise ConfigError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
+
+
+def plan_of(
+    recordings: str | os.PathLike[str] | None,
+    name: str | None,
+    seed: int,
+    config: Mapping[str, Any] | None,
+    info: Sequence[str],
+    frames_every: int,
+    frame_format: str,
+    packing: Mapping[str, Any],
+) -> Plan:
+    """Return what a user asked for.
+
+    Raises:
+        ConfigError: there is no such argument, or Pillow is missing for frames.
+    """
+    given: Any = seed
+    known = ("compression", "level", "index", "chunk_steps")
+    if unknown := set(packing) - set(known):
+        raise ConfigError(f"found the argument {sorted(unknown)[0]!r}, expected one of {', '.join(known)}")
+    if isinstance(info, str):
+        raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
+    if frames_every:
+        from runner.wrappers.frames import pillow
+
+        pillow()
+    return Plan(
+        recordings=recordings,
+        name=name,
+        seed=given.item() if isinstance(given, np.integer) else given,
+        config=config or {},
+        info=tuple(info),
+        frames_every=frames_every,
+        frame_format=frame_format,
+        **packing,
+    )
