@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -30,7 +31,7 @@ from runner.recording.telling import (
     write_result,
 )
 from runner.recording.writer import RecordingFile
-from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder
+from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
 from runner.service.outbox import Follower, connected, is_server, outbox_folder
 from runner.wrappers.described import Described, as_json
 from runner.wrappers.plan import Plan
@@ -75,10 +76,7 @@ class Loop(Generic[R]):
     """
 
     def __init__(self, described: Described, plan: Plan, rows: Callable[[Recorder, str], R]) -> None:
-        from runner.api import checked_name
-
         config = plan.mapping(described)
-        checked_name(plan.name)
         client = connected(str(plan.recordings)) if is_server(plan.recordings) else None
         folder = outbox_folder() if client else recordings_folder(plan.recordings)
         self._started = time.monotonic()
@@ -92,11 +90,14 @@ class Loop(Generic[R]):
         self.run = new_run(folder, config, plan.seed, config["name"])
         self._topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
         path = self.run.folder / RECORDING_FILE
+        with unless_empty(self.run):
+            self._file = _created(path, described.kind)
         try:
-            self._file = RecordingFile(path, schema.KINDS[described.kind])
-        except OSError as error:
-            raise StorageError(f"{path}: cannot be created ({error.strerror}).") from error
-        facts = self._describe(config)
+            facts = self._describe(config)
+        except BaseException as error:
+            self._file.close()
+            self._mark_failed(error)
+            raise
         self._recorder = Recorder(
             self._file,
             learners=len(described.agents),
@@ -296,8 +297,7 @@ class Loop(Generic[R]):
                 self._recorder.abandon()
                 with contextlib.suppress(StorageError):
                     write_result(self._file, "failed", {"error": str(failure)})
-                with contextlib.suppress(StorageError):
-                    self.run = self.run.update(status="failed", summary={"error": str(failure)})
+                self._mark_failed(failure)
                 if self._follower:
                     self._follower.stop()
                 raise
@@ -308,6 +308,10 @@ class Loop(Generic[R]):
         if self._follower:
             self._follower.finish(self.run)
         return self.run
+
+    def _mark_failed(self, error: BaseException) -> None:
+        with contextlib.suppress(StorageError):
+            self.run = self.run.update(status="failed", summary={"error": str(error)})
 
     def _finish(self, status: str, error: str) -> dict[str, Any]:
         for rows in self._rows.values():
@@ -343,6 +347,13 @@ class Loop(Generic[R]):
         self._recorder.flush()
         for rows in self._rows.values():
             rows.open()
+
+
+def _created(path: Path, kind: str) -> RecordingFile:
+    try:
+        return RecordingFile(path, schema.KINDS[kind])
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be created ({error.strerror}).") from error
 
 
 def _environment(described: Described) -> Attachments:

@@ -69,6 +69,8 @@ class Plan:
         return told
 
     def _check(self) -> None:
+        from runner.api import checked_name
+
         expectations = (
             ("name", "text", self.name is None or isinstance(self.name, str)),
             ("seed", "a whole number from 0", is_whole(self.seed, 0, 2**64 - 1)),
@@ -84,6 +86,7 @@ class Plan:
         for key, expected, holds in expectations:
             if not holds:
                 raise ConfigError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
+        checked_name(self.name)
 
 
 def plan_of(

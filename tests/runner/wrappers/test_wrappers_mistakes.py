@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from typing import Any
 
@@ -12,7 +13,9 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 import runner
-from runner.errors import RunnerError
+from runner.errors import RunnerError, StorageError
+from runner.recording.writer import RecordingFile
+from runner.runs import list_runs
 from tests.runner.wrappers.loops import Rooms, make, opened
 
 
@@ -62,6 +65,17 @@ def test_what_cannot_be_recorded_is_said_and_leaves_no_run(begin, told, tmp_path
     with pytest.raises(RunnerError, match=told):
         begin(tmp_path / "loops")
     assert not (tmp_path / "loops").exists()
+
+
+@pytest.mark.parametrize(("part", "left"), [("_append", []), ("add_metadata", ["failed"])])
+def test_a_recording_that_cannot_be_begun_leaves_no_run_that_seems_to_run(part, left, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(RecordingFile, part, full)
+    with pytest.raises(StorageError, match="No space left on device"):
+        runner.record(pole(), tmp_path)
+    assert [run.status for run in list_runs(tmp_path)] == left
 
 
 @pytest.mark.parametrize(
