@@ -220,13 +220,29 @@ class Rows:
 class BlockRows(Rows):
     """Rows whose steps have one size: put down in place."""
 
+    _brought: np.dtype[np.void]
+    """What a step brings that waits until its block is completed."""
+
+    def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
+        self._scratch = np.zeros(0, self._brought)
+        super().__init__(recorder, described, phase)
+
     def _open_steps(self) -> tuple[int, int]:
         self._block = self._recorder.block(self._steps)
         self._reset_block = self._recorder.block(self._resets)
-        return len(self._block), len(self._reset_block)
+        room = len(self._block)
+        if len(self._scratch) < room:
+            self._scratch = np.zeros(room, self._brought)
+            self._bytes = self._scratch.view(np.uint8).data
+        return room, len(self._reset_block)
+
+    def _rewards(self, n: int) -> NDArray[np.float64]:
+        return self._scratch["reward"][:n]
 
     def _take_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
-        block = self._block[:n]
+        block, rows = self._block[:n], self._scratch[:n]
+        block["rewards"] = rows["reward"][:, np.newaxis]
+        block["terminated"], block["truncated"] = rows["terminated"], rows["truncated"]
         block["step"] = self._recorder.steps[self._phase] + np.arange(n)
         block["episode"] = episode
         block["t"] = t
@@ -236,19 +252,17 @@ class BlockRows(Rows):
 class DiscreteRows(BlockRows):
     """Rows of `dualtaxi.Step`: both spaces are `Discrete`."""
 
+    _brought = _DISCRETE_DTYPE
+
     def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
         self._state_start = int(described.observation.start)  # type: ignore[attr-defined]
         self._action_start = int(described.action.start)  # type: ignore[attr-defined]
         self._state: int | None = None
         """The state before the first row; None before any reset."""
-        self._scratch = np.zeros(0, _DISCRETE_DTYPE)
         super().__init__(recorder, described, phase)
 
     def _open_steps(self) -> tuple[int, int]:
         rooms = super()._open_steps()
-        if len(self._scratch) < rooms[0]:
-            self._scratch = np.zeros(rooms[0], _DISCRETE_DTYPE)
-            self._bytes = self._scratch.view(np.uint8).data
         self._reset_column = self._reset_block["observation"]
         return rooms
 
@@ -271,9 +285,6 @@ class DiscreteRows(BlockRows):
     def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
         self._reset_column[len(self._reset_rows)] = whole_number(observation, "observation")
 
-    def _rewards(self, n: int) -> NDArray[np.float64]:
-        return self._scratch["reward"][:n]
-
     def _transitions(self, n: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
         rows = self._scratch[:n]
         next_state = rows["next_state"] - self._state_start
@@ -288,33 +299,28 @@ class DiscreteRows(BlockRows):
         return self._found
 
     def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
-        block, rows = self._block[:n], self._scratch[:n]
+        block = self._block[:n]
         for name, values in zip(("state", "action", "next_state"), self._found, strict=True):
             if n and not 0 <= values.min() <= values.max() <= _LARGEST:
                 raise RecordingError(
                     f"found {name} {values.min()} to {values.max()}, outside of its Discrete space."
                 )
             block[name] = values
-        block["rewards"] = rows["reward"][:, np.newaxis]
-        for name in ("terminated", "truncated"):
-            block[name] = rows[name]
         self._take_steps(n, episode, t, before)
 
 
 class ArrayRows(BlockRows):
     """Rows of `dualtaxi.Transition` in spaces of fixed width."""
 
+    _brought = _ENDING_DTYPE
+
     def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
         self._action_parts = parts_of(described.action, "the action space")
         self._observation_parts = parts_of(described.observation, "the observation space")
-        self._scratch = np.zeros(0, _ENDING_DTYPE)
         super().__init__(recorder, described, phase)
 
     def _open_steps(self) -> tuple[int, int]:
         rooms = super()._open_steps()
-        if len(self._scratch) < rooms[0]:
-            self._scratch = np.zeros(rooms[0], _ENDING_DTYPE)
-            self._bytes = self._scratch.view(np.uint8).data
         self._action = filler(self._action_parts, self._block["action"], "action")
         self._next = filler(self._observation_parts, self._block["next_observation"], "observation")
         self._first = filler(self._observation_parts, self._reset_block["observation"], "observation")
@@ -338,14 +344,8 @@ class ArrayRows(BlockRows):
         check_value(self._observation_parts, observation)
         self._first(len(self._reset_rows), observation)
 
-    def _rewards(self, n: int) -> NDArray[np.float64]:
-        return self._scratch["reward"][:n]
-
     def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
         block, rows = self._block[:n], self._scratch[:n]
-        block["rewards"] = rows["reward"][:, np.newaxis]
-        for name in ("terminated", "truncated"):
-            block[name] = rows[name]
         block["acted"] = 1
         block["agents_terminated"], block["agents_truncated"] = rows["terminated"], rows["truncated"]
         self._take_steps(n, episode, t, before)
@@ -361,7 +361,7 @@ class VariableRows(Rows):
         super().__init__(recorder, described, phase)
 
     def _open_steps(self) -> tuple[int, int]:
-        return _VARIABLE_ROWS, schema.NEVER
+        return _VARIABLE_ROWS, _VARIABLE_ROWS
 
     def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
         """Put down a step."""
