@@ -30,6 +30,12 @@ class Part:
     """The names of the same way in NumPy's records."""
     dtype: np.dtype[Any] | None
 
+    def of(self, value: Any) -> Any:
+        """Return the part that it is of a value of the space."""
+        for key in self.keys:
+            value = value[key]
+        return value
+
 
 @dataclass(frozen=True)
 class Described:

@@ -18,7 +18,7 @@ from runner.recording import schema
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
 from runner.wrappers.described import Described, Part, parts_of
-from runner.wrappers.values import check_value
+from runner.wrappers.values import put_batch, put_chosen
 
 Flags = NDArray[np.bool_]
 
@@ -165,7 +165,7 @@ class VectorRows(StagedRows):
         """
         stage, over = self._stage, terminated | truncated
         now = np.zeros_like(self._seen)
-        put_batch(self._observation_parts, observation, now, "observation")
+        put_batch(self._observation_parts, observation, now, "an observation")
         last = now
         if final is not None and over.any():
             last = now.copy()
@@ -176,7 +176,7 @@ class VectorRows(StagedRows):
             stage["action"] = actions - _start(self._action)
             stage["next_state"] = last - _start(self._observation)
         else:
-            put_batch(self._action_parts, action, stage["action"], "action")
+            put_batch(self._action_parts, action, stage["action"], "an action")
             stage["next_observation"] = last
             stage["acted"] = 1
             stage["agents_terminated"], stage["agents_truncated"] = terminated, truncated
@@ -193,7 +193,7 @@ class VectorRows(StagedRows):
         chosen = np.flatnonzero(which)
         self._abandon(chosen)
         now = np.zeros_like(self._seen)
-        put_batch(self._observation_parts, observation, now, "observation")
+        put_batch(self._observation_parts, observation, now, "an observation")
         self._seen[which] = now[which]
         self._begin(chosen, now[which], seeds)
 
@@ -250,7 +250,7 @@ class AgentRows(StagedRows):
                 raise RecordingError(
                     f"found the agent {agent!r}, expected one of possible_agents: {', '.join(self._agents)}"
                 )
-            put_batch(parts[agent], {agent: value}, into, f"value of {agent}")
+            put_batch(parts[agent], {agent: value}, into, f"a value of {agent}")
 
     def _mask(self, flags: Mapping[str, bool]) -> int:
         return sum(bool(flags.get(agent)) << i for i, agent in enumerate(self._agents))
@@ -263,40 +263,3 @@ def _by_agent(space: spaces.Dict) -> dict[str, list[Part]]:
 
 def _start(space: Any) -> int:
     return int(space.start)
-
-
-def put_batch(parts: Sequence[Part], value: Any, into: NDArray[Any], what: str) -> None:
-    """Put batched values of a space into a column, all rows at once.
-
-    Raises:
-        RecordingError: they are not of the space.
-    """
-    try:
-        for part in parts:
-            inside, column = value, into
-            for key in part.keys:
-                inside = inside[key]
-            for name in part.fields:
-                column = column[name]
-            column[...] = inside
-    except (TypeError, ValueError, LookupError) as error:
-        raise RecordingError(f"found an {what} that is not of its space ({error}).") from error
-
-
-def put_chosen(parts: Sequence[Part], values: Any, into: NDArray[Any], which: NDArray[np.intp]) -> None:
-    """Put values of single environments into their rows, as a vector's info holds them.
-
-    Raises:
-        RecordingError: they are not of the space.
-    """
-    for i in which.tolist():
-        own = _picked(values, i)
-        check_value(parts, own)
-        put_batch(parts, own, into[i : i + 1], "observation")
-
-
-def _picked(values: Any, i: int) -> Any:
-    """Return the value of one environment out of a mapping of batches."""
-    if isinstance(values, Mapping):
-        return {key: _picked(part, i) for key, part in values.items() if not str(key).startswith("_")}
-    return values[i]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -69,10 +69,8 @@ def check_value(parts: Sequence[Part], value: Any, what: str = "observation", le
         RecordingError: it is one.
     """
     for part in parts:
-        inside = value
         try:
-            for key in part.keys:
-                inside = inside[key]
+            inside = part.of(value)
         except (TypeError, LookupError) as error:
             raise _no_value(what, error) from error
         if part.dtype is None:
@@ -105,9 +103,7 @@ def value_bytes(parts: Sequence[Part], value: Any) -> bytes:
     pieces = []
     try:
         for part in parts:
-            inside = value
-            for key in part.keys:
-                inside = inside[key]
+            inside = part.of(value)
             if part.dtype is None:
                 pieces.append(encode_text(inside))
             else:
@@ -117,6 +113,38 @@ def value_bytes(parts: Sequence[Part], value: Any) -> bytes:
     except (TypeError, ValueError, LookupError, AttributeError, OverflowError) as error:
         raise _no_value("observation or action", error) from error
     return b"".join(pieces)
+
+
+def put_batch(parts: Sequence[Part], value: Any, into: NDArray[Any], what: str) -> None:
+    """Put batched values of a space into a column, all rows at once.
+
+    Raises:
+        RecordingError: they are not of the space.
+    """
+    try:
+        for part in parts:
+            _within(into, part)[...] = part.of(value)
+    except (TypeError, ValueError, LookupError, OverflowError) as error:
+        raise RecordingError(f"found {what} that is not of its space ({error}).") from error
+
+
+def put_chosen(parts: Sequence[Part], values: Any, into: NDArray[Any], which: NDArray[np.intp]) -> None:
+    """Put values of single environments into their rows, as a vector's info holds them.
+
+    Raises:
+        RecordingError: they are not of the space.
+    """
+    for i in which.tolist():
+        own = _picked(values, i)
+        check_value(parts, own)
+        put_batch(parts, own, into[i : i + 1], "an observation")
+
+
+def _picked(values: Any, i: int) -> Any:
+    """Return the value of one environment out of a mapping of batches."""
+    if isinstance(values, Mapping):
+        return {key: _picked(part, i) for key, part in values.items() if not str(key).startswith("_")}
+    return values[i]
 
 
 def lone_number(value: Any, what: str) -> float:
