@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from runner.errors import RecordingError
-from runner.frames import agents_of, environment_of, evaluation_records, training_records
+from runner.frames import agents_of, evaluation_records, training_records
 from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
 
@@ -34,7 +34,7 @@ def describe(run: Run, recording: Recording) -> dict[str, Any]:
         "seconds": summary.get("seconds"),
         "config": _config(run, recording),
         "provenance": recording.provenance,
-        "success_events": environment_of(recording)["success_events"],
+        "success_events": recording.environment["success_events"],
         "tables": _tables(recording),
         "eval": evaluation_records(recording),
         "optimality": [_without_times(measures) for measures in recording.optimality()],

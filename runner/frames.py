@@ -229,12 +229,7 @@ def agents_of(recording: Recording) -> list[str]:
 
 def event_names_of(recording: Recording) -> list[str]:
     """Return the names of the environment's events; none where it has none."""
-    return list(environment_of(recording)["event_names"])
-
-
-def environment_of(recording: Recording) -> dict[str, Any]:
-    """Return what the recording says of its environment beside the arrays."""
-    return dict(json.loads(recording.attachment("environment.json")))
+    return list(recording.environment["event_names"])
 
 
 def evaluation_record(

@@ -21,7 +21,7 @@ from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_o
 from runner.archive.pages import largest_page
 from runner.errors import RecordingError
 from runner.mdp import Mdp
-from runner.recording.facts import check_run, environment_of, json_object, kind_of
+from runner.recording.facts import check_run, environment_of, environment_said, json_object, kind_of
 from runner.recording.index import UNPACKED_A_BYTE
 from runner.recording.schema import Topic
 
@@ -124,18 +124,17 @@ class Archive:
 
     @cached_property
     def _environment(self) -> dict[str, Any]:
-        where = f"{self.folder}: {layout.ENVIRONMENT}"
-        return json_object(self.attachment(layout.ENVIRONMENT), where)
+        return environment_said(self.attachment(layout.ENVIRONMENT), str(self.folder))
 
     @cached_property
     def mdp(self) -> Mdp:
         """The run's environment."""
-        return environment_of(dict(self._environment), self.attachment, str(self.folder))
+        return environment_of(self._environment, self.attachment, str(self.folder))
 
     @cached_property
     def shape(self) -> Shape:
         """What fixes the tables of messages and their columns."""
-        tabular = self.kind in ("job", "step") and self._environment.get("arrays") != []
+        tabular = self.kind in ("job", "step") and bool(self._environment["arrays"])
         return shape_of(self.metadata["run"], self.mdp if tabular else None, str(self.folder))
 
     def attachment(self, name: str) -> bytes:

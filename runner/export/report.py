@@ -30,7 +30,7 @@ from runner.export.report_replay import (
     training_episode,
     trial,
 )
-from runner.frames import agents_of, environment_of, evaluation_records
+from runner.frames import agents_of, evaluation_records
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.words import event_in_words, spoken
@@ -105,7 +105,7 @@ def render_report(recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> 
 def _run(recording: Recording, series: RunSeries, number: int, chosen: Sequence[Choice]) -> dict[str, Any]:
     """Return all that the page says of a run."""
     evaluations = evaluation_records(recording)
-    environment = environment_of(recording)
+    environment = recording.environment
     episodes = _episodes(recording, chosen)
     drawing = None if environment["scene"] is None else svg.Drawing(environment["scene"])
     return {

@@ -58,15 +58,30 @@ def check_run(run: Mapping[str, str], path: str) -> None:
     for name, most in _FACTS.items():
         said = run.get(name, "")
         if not said or (most and not (said.isdecimal() and len(said) <= 20 and int(said) <= most)):
-            raise RecordingError(f"{path}: is damaged: of its run it says that {name} is {said!r}.")
-
+            raise _senseless(name, said, path)
+    if not _are_names(run["agents"], int(run["learners"])):
+        raise _senseless("agents", run["agents"], path)
     if kind_of(run) not in schema.KINDS:
         raise RecordingError(
             f"{path}: found a recording of the kind {run['kind']!r}, expected {', '.join(schema.KINDS)}."
         )
     environments = run.get("environments", "1")
     if not (environments.isdecimal() and len(environments) <= 7 and int(environments) > 0):
-        raise RecordingError(f"{path}: is damaged: of its run it says that environments is {environments!r}.")
+        raise _senseless("environments", environments, path)
+
+
+def _senseless(name: str, said: str, path: str) -> RecordingError:
+    return RecordingError(f"{path}: is damaged: of its run it says that {name} is {said[:200]!r}.")
+
+
+def _are_names(agents: str, learners: int) -> bool:
+    """Return whether a text lists a name for each learner."""
+    try:
+        names = json.loads(agents)
+    except (ValueError, RecursionError):
+        return False
+    known = isinstance(names, list) and all(isinstance(name, str | int) for name in names)
+    return known and len(names) == learners
 
 
 def kind_of(run: Mapping[str, str]) -> str:
@@ -142,11 +157,25 @@ def _are_holes(found: Any) -> bool:
     return whole and numbers == sorted(numbers)
 
 
-def environment_of(description: dict[str, Any], attachment: Callable[[str], bytes], path: str) -> Mdp:
+def environment_said(text: bytes, path: str) -> dict[str, Any]:
+    """Return what `environment.json` says.
+
+    Raises:
+        RecordingError: it does not name the environment's arrays and events.
+    """
+    said = json_object(text, f"{path}: environment.json")
+    for key in ("arrays", "event_names", "success_events"):
+        names = said.get(key)
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise RecordingError(f"{path}: environment.json does not name the environment's {key}.")
+    return said
+
+
+def environment_of(description: Mapping[str, Any], attachment: Callable[[str], bytes], path: str) -> Mdp:
     """Return the environment that a recording describes.
 
     Args:
-        description: what `environment.json` says.
+        description: what `environment_said` found.
         attachment: gives an attachment by its name.
         path: of the recording, for errors.
 
@@ -154,16 +183,13 @@ def environment_of(description: dict[str, Any], attachment: Callable[[str], byte
         RecordingError: an array is missing, damaged or too large.
         EnvironmentNotUsable: the parts contradict each other.
     """
-    names = description.pop("arrays", None)
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise RecordingError(f"{path}: environment.json does not name the environment's arrays.")
-    if not names:
+    if not description["arrays"]:
         raise RecordingError(
             f"{path}: has no transition table of {description.get('env_id')}, which is not tabular: it was "
             "recorded from a loop over it; `dualtaxi view` shows what was recorded."
         )
     arrays: dict[str, NDArray[Any]] = {}
-    for name in names:
+    for name in description["arrays"]:
         data = attachment(f"environment/{name}.npy.zst")
         room = MAX_ARRAYS_BYTES - sum(array.nbytes for array in arrays.values())
         arrays[name] = unpack_array(data, room, f"{path}: environment/{name}")

@@ -32,6 +32,7 @@ from runner.recording.contents import MAX_METADATA_BYTES, UNREADABLE, attachment
 from runner.recording.facts import (
     check_facts,
     environment_of,
+    environment_said,
     holes,
     json_object,
     kind_of,
@@ -223,15 +224,15 @@ class Recording:
         """The environment: arrays, agents, events, scene."""
         return environment_of(self.environment, self.attachment, str(self.path))
 
-    @property
+    @cached_property
     def environment(self) -> dict[str, Any]:
-        """What is said of the environment beside its arrays: agents, events, scene."""
-        return json_object(self.attachment("environment.json"), f"{self.path}: environment.json")
+        """What is said of the environment beside its arrays: agents, events, scene; not to be changed."""
+        return environment_said(self.attachment("environment.json"), str(self.path))
 
     @property
     def tabular(self) -> bool:
         """Whether the environment's arrays are there, so that it has an `mdp`."""
-        return self.kind in ("job", "step") and self.environment.get("arrays") != []
+        return self.kind in ("job", "step") and bool(self.environment["arrays"])
 
     # --- blocks ------------------------------------------------------------------------------------
 

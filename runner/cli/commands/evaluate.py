@@ -92,12 +92,12 @@ def command(
 
 def _summarise(run: Run, origin: dict[str, object]) -> None:
     from runner.cli.evaluations import evaluation_table
-    from runner.frames import environment_of, evaluation_records
+    from runner.frames import evaluation_records
     from runner.recording.reader import open_recording
 
     with open_recording(run.recording) as recording:
         table = evaluation_table(
-            evaluation_records(recording), environment_of(recording)["success_events"], console()
+            evaluation_records(recording), recording.environment["success_events"], console()
         )
     told = run_in_words(run)
     told |= {"table": f"of run {origin['run']} after {origin['step']:,} training steps"}

@@ -238,12 +238,12 @@ def _summarise(run: Run, blank: bool) -> None:
     """Print what came of a run and what to type next."""
     from runner.cli.evaluations import evaluation_table, some
     from runner.cli.output import console, draw, facts
-    from runner.frames import environment_of, evaluation_records
+    from runner.frames import evaluation_records
     from runner.recording.reader import open_recording
 
     with open_recording(run.recording) as recording:
         records = evaluation_records(recording)
-        successes = environment_of(recording)["success_events"]
+        successes = recording.environment["success_events"]
     parts: list[RenderableType] = [""] if blank else []
     if records:
         shown = some(records)

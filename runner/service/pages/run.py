@@ -14,7 +14,7 @@ from fastapi.responses import RedirectResponse
 
 from runner import amounts
 from runner.errors import RecordingError, RunnerError
-from runner.frames import agents_of, environment_of, evaluation_record
+from runner.frames import agents_of, evaluation_record
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
@@ -132,7 +132,7 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
     """Show the last evaluations."""
     is_job = recording.kind == "job"
     last = deque(recording.iter_metrics("eval") if is_job else (), MOST_EVALUATIONS)
-    learners, events = agents_of(recording), environment_of(recording)["event_names"]
+    learners, events = agents_of(recording), recording.environment["event_names"]
     return page(
         request,
         "run_evaluations.html",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 from collections.abc import Iterator
@@ -16,7 +17,9 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from runner.errors import RecordingError, RunnerError
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.facts import environment_said
 from runner.recording.integrity import check_integrity
+from runner.recording.rewriting import rewrite
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
 CHUNK, MESSAGE_INDEX, DATA_END = 6, 7, 15
@@ -316,6 +319,24 @@ def test_a_description_that_makes_no_sense_is_refused(entries, lake, tmp_path):
     path.write_bytes(damaged[: max(end for _, _, end in records_of(damaged[: len(damaged) - 500]))])
     with pytest.raises(RecordingError):
         everything(path)
+
+
+@pytest.mark.parametrize(
+    "agents", ["nonsense", "{}", "[]", '["a", "b"]', "[null]", "[" * 100_000], ids=range(6)
+)
+def test_learners_without_names_are_refused(agents, lake, tmp_path):
+    path = tmp_path / "nameless.mcap"
+    rewrite(lake.recording, path, lambda name, said: said | ({"agents": agents} if name == "run" else {}))
+    with pytest.raises(RecordingError, match="of its run it says that agents is"):
+        everything(path)
+
+
+@pytest.mark.parametrize("key", ["arrays", "event_names", "success_events"])
+@pytest.mark.parametrize("names", [None, "wall", [1]])
+def test_an_environment_that_names_nothing_is_refused(key, names):
+    said = {"arrays": [], "event_names": [], "success_events": []} | {key: names}
+    with pytest.raises(RecordingError, match=f"here: environment.json does not name the environment's {key}"):
+        environment_said(json.dumps(said).encode(), "here")
 
 
 def _text(text: str) -> bytes:
