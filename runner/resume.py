@@ -38,6 +38,7 @@ from runner.owner import owner
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.contents import Contents
+from runner.recording.facts import NEEDED
 from runner.recording.integrity import checked_survey, may_be_cut
 from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
@@ -50,7 +51,6 @@ DECISIVE: Final = (
     *("package.numpy", "package.numba", "package.llvmlite"),
 )
 """Provenance that a continued run must share with its beginning, unless told otherwise."""
-_NEEDED: Final = {"run", "config", "provenance"}
 _ANEW: Final = ".anew"
 
 Changes = dict[str, tuple[str, str]]
@@ -207,7 +207,7 @@ def _opened(
     path: Path, contents: Contents, job: Job, run: Run, learner: Learner, changes: Changes
 ) -> Iterator[RecordingFile]:
     """Give the file to go on with: cut behind what is good of it, or begun anew where that says nothing."""
-    described = bool(contents.chunks) and {entry.name for entry in contents.metadata} >= _NEEDED
+    described = bool(contents.chunks) and {entry.name for entry in contents.metadata} >= NEEDED
     try:
         if not described:
             path.unlink(missing_ok=True)

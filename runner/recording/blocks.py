@@ -43,8 +43,10 @@ HEADER: Final = [
 """An MCAP message record up to its data: 31 bytes. `sequence` is not used and is 0."""
 
 HEADER_BYTES: Final = np.dtype(HEADER).itemsize
+RECORD_HEAD: Final = struct.Struct("<BQ")
+"""What any MCAP record begins with: opcode, and the length of its body."""
 MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
-"""The same, for one message: opcode, length, channel, sequence, log time, publish time."""
+"""`HEADER` for one message: opcode, length, channel, sequence, log time, publish time."""
 
 
 @lru_cache(64)

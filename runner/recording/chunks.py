@@ -19,7 +19,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.blocks import MESSAGE_HEAD
+from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.schema import Topic
 
 MAX_CHUNK_BYTES: Final = 64 << 20
@@ -82,7 +82,7 @@ def encode_chunk(
         encoded_name,
         len(data),
     )
-    record = b"".join((struct.pack("<BQ", Opcode.CHUNK, len(body) + len(data)), body, data))
+    record = b"".join((RECORD_HEAD.pack(Opcode.CHUNK, len(body) + len(data)), body, data))
     index = message_index(topic.channel, log_times, offsets) if packing.index == "message" else b""
     return Chunk(record, index, name, len(data), size, start, end, len(log_times))
 

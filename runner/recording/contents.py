@@ -22,13 +22,12 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES
+from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, unpack_chunk
 from runner.recording.index import MAX_NAME_BYTES, MAX_NAMED
 
 MAX_METADATA_BYTES: Final = 4 << 20
 """The largest metadata record that is read, config and provenance among them."""
-_HEAD = struct.Struct("<BQ")
 _RESULT = "result"
 N = TypeVar("N", AttachmentIndex, MetadataIndex)
 UNREADABLE: Final = (struct.error, ValueError, KeyError, McapError)
@@ -163,7 +162,7 @@ def walk(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:
     offset = len(MCAP0_MAGIC)
     while offset + 9 <= size:
         stream.seek(offset)
-        opcode, length = _HEAD.unpack(stream.read(9))
+        opcode, length = RECORD_HEAD.unpack(stream.read(9))
         if length > min(size - offset - 9, MAX_CHUNK_BYTES) or not 1 <= opcode <= Opcode.DATA_END:
             return
         yield opcode, offset, stream.read(length)
@@ -198,9 +197,9 @@ def _messages(records: bytes, where: str) -> tuple[int, int]:
     if len(records) < HEADER_BYTES:
         raise RecordingError(f"{where}: holds no whole message")
     opcode, length, channel = struct.unpack_from("<BQH", records)
-    if opcode != Opcode.MESSAGE or channel not in {topic.channel for topic in schema.ALL_TOPICS}:
+    if opcode != Opcode.MESSAGE or channel not in schema.TOPIC_OF:
         raise RecordingError(f"{where}: holds no messages of ours")
-    if channel in {topic.channel for topic in schema.ALL_BLOCK_TOPICS}:
+    if schema.TOPIC_OF[channel] in schema.ALL_BLOCK_TOPICS:
         if len(records) % (9 + length) or 9 + length < HEADER_BYTES:
             raise RecordingError(f"{where}: its messages differ in size")
         return channel, len(records) // (9 + length)

@@ -26,6 +26,9 @@ _FACTS: Final = {
 }
 """What every recording says of its run; of a number, the largest it can be."""
 
+NEEDED: Final = frozenset({"run", "config", "provenance"})
+"""The metadata records without which nothing is known of a recording's messages."""
+
 
 def check_facts(run: Mapping[str, str], index: Index, path: str) -> None:
     """Refuse a file that is of another version, or does not say what every recording says.

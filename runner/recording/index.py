@@ -29,9 +29,9 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.blocks import MESSAGE_HEAD
+from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES
-from runner.recording.schema import ALL_TOPICS, PROFILE
+from runner.recording.schema import ALL_TOPICS, PROFILE, TOPIC_OF
 
 K = TypeVar("K")
 T = TypeVar("T")
@@ -47,10 +47,9 @@ UNPACKED_A_BYTE: Final = 1000
 _UNPACKED_ANYWAY: Final = 1 << 30
 MAX_NAME_BYTES: Final = 256
 _PIECE: Final = 1 << 20
-_HEAD: Final = struct.Struct("<BQ")
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
 _OFFSET_ENTRY: Final = struct.Struct("<HQ")
-_EXPECTED: Final = frozenset(
+IN_DATA: Final = frozenset(
     {
         *(Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK),
         *(Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT),
@@ -59,7 +58,6 @@ _EXPECTED: Final = frozenset(
 """What the data section has: behind anything else nothing can be believed."""
 _FOOTER_BYTES: Final = 9 + 20
 _TAIL_BYTES: Final = _FOOTER_BYTES + len(MCAP0_MAGIC)
-_CHANNELS: Final = frozenset(topic.channel for topic in ALL_TOPICS)
 
 
 class ChunkEntry(NamedTuple):
@@ -118,7 +116,7 @@ class ChunkTable:
             RecordingError: it was said before, or is no channel of ours.
         """
         last = self[len(self) - 1]
-        if last.channel or channel not in _CHANNELS:
+        if last.channel or channel not in TOPIC_OF:
             raise RecordingError(
                 f"{path}: chunk at {last.offset}: found messages of channel {channel}"
                 f"{f' and {last.channel}' if last.channel else ''}, expected those of one of ours."
@@ -164,6 +162,15 @@ def read_index(stream: BinaryIO, path: str) -> Index:
     return index
 
 
+def checksum(stream: BinaryIO, start: int, end: int) -> int:
+    """Return the checksum of a part of the file, which need not fit into memory."""
+    crc, at = 0, stream.seek(start)
+    while at < end and (piece := stream.read(min(_PIECE, end - at))):
+        crc = zlib.crc32(piece, crc)
+        at += len(piece)
+    return crc
+
+
 def _check_beginning(stream: BinaryIO, path: str) -> None:
     stream.seek(0)
     beginning = stream.read(len(MCAP0_MAGIC) + 9)
@@ -171,7 +178,7 @@ def _check_beginning(stream: BinaryIO, path: str) -> None:
         raise RecordingError(f"{path}: found an empty file, expected a recording.")
     if not beginning.startswith(MCAP0_MAGIC):
         raise RecordingError(f"{path}: found {beginning[:8]!r} at its start, expected an MCAP file.")
-    opcode, length = _HEAD.unpack(beginning[len(MCAP0_MAGIC) :].ljust(9, b"\0"))
+    opcode, length = RECORD_HEAD.unpack(beginning[len(MCAP0_MAGIC) :].ljust(9, b"\0"))
     header = _parse(Header, stream.read(min(length, 4096)), path, len(MCAP0_MAGIC))
     if opcode != Opcode.HEADER or header.profile != PROFILE:
         raise RecordingError(
@@ -186,7 +193,7 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
         return None
     stream.seek(size - _TAIL_BYTES)
     tail = stream.read(_TAIL_BYTES)
-    if not tail.endswith(MCAP0_MAGIC) or _HEAD.unpack(tail[:9]) != (Opcode.FOOTER, 20):
+    if not tail.endswith(MCAP0_MAGIC) or RECORD_HEAD.unpack(tail[:9]) != (Opcode.FOOTER, 20):
         return None
     return Footer.read(ReadDataStream(BytesIO(tail[9:])))
 
@@ -199,21 +206,12 @@ def _from_summary(stream: BinaryIO, path: str, footer: Footer, size: int) -> Ind
             f"{path}: the footer points to a summary at {start}, outside the file; try `repair`."
         )
     fields = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, footer.summary_offset_start)
-    if zlib.crc32(fields, _checksum(stream, start, end)) != footer.summary_crc:
+    if zlib.crc32(fields, checksum(stream, start, end)) != footer.summary_crc:
         raise RecordingError(f"{path}: the summary at {start} does not match its checksum; try `repair`.")
     index = Index(finished=True, end=start)
     for opcode, offset, body in _records(stream, start, end, path):
         _note_summary(index, path, opcode, offset, body, start)
     return index
-
-
-def _checksum(stream: BinaryIO, start: int, end: int) -> int:
-    """Return the checksum of a part of the file, which need not fit into memory."""
-    crc, at = 0, stream.seek(start)
-    while at < end and (piece := stream.read(min(_PIECE, end - at))):
-        crc = zlib.crc32(piece, crc)
-        at += len(piece)
-    return crc
 
 
 def _note_summary(index: Index, path: str, opcode: int, offset: int, body: bytes, data_end: int) -> None:
@@ -245,9 +243,9 @@ def _from_records(stream: BinaryIO, path: str, size: int) -> Index:
     offset = len(MCAP0_MAGIC)
     while offset + 9 <= size:
         stream.seek(offset)
-        opcode, length = _HEAD.unpack(stream.read(9))
+        opcode, length = RECORD_HEAD.unpack(stream.read(9))
         torn = offset + 9 + length > size
-        if torn or opcode not in _EXPECTED or (opcode == Opcode.MESSAGE_INDEX and not index.chunks):
+        if torn or opcode not in IN_DATA or (opcode == Opcode.MESSAGE_INDEX and not index.chunks):
             break
         _note(index, stream, path, opcode, offset, length)
         offset += 9 + length
@@ -296,7 +294,7 @@ def _records(stream: BinaryIO, start: int, end: int, path: str) -> Iterator[tupl
     while at < end:
         if at + 9 > end:
             raise RecordingError(f"{path}: found {end - at} stray bytes at {at}, expected a record.")
-        opcode, length = _HEAD.unpack(stream.read(9))
+        opcode, length = RECORD_HEAD.unpack(stream.read(9))
         if length > end - at - 9:
             raise RecordingError(
                 f"{path}: the record at {at} declares {length} bytes, {end - at - 9} are there."

@@ -10,7 +10,7 @@ import struct
 import zlib
 from functools import cache
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import BinaryIO
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -19,14 +19,12 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER, HEADER_BYTES
+from runner.recording.blocks import HEADER, HEADER_BYTES, RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head, message_index
 from runner.recording.contents import Contents, read_chunk, survey
 from runner.recording.writer import RecordingFile, schema_and_channel_bytes
 
-_HEAD: Final = struct.Struct("<BQ")
 Times = NDArray[np.uint64]
-_BLOCK_CHANNELS = {topic.channel for topic in schema.ALL_BLOCK_TOPICS}
 
 
 @cache
@@ -128,10 +126,10 @@ def _ends_torn(stream: BinaryIO, contents: Contents) -> bool:
         return contents.size == 0 or _only_zeros(stream, 0)
     for _ in range(2):
         stream.seek(offset)
-        head = stream.read(_HEAD.size)
-        if len(head) < _HEAD.size:
+        head = stream.read(RECORD_HEAD.size)
+        if len(head) < RECORD_HEAD.size:
             return True
-        opcode, length = _HEAD.unpack(head)
+        opcode, length = RECORD_HEAD.unpack(head)
         if offset + 9 + length > contents.size and 0 < opcode <= Opcode.DATA_END:
             return bool(length <= MAX_CHUNK_BYTES)
         if opcode != Opcode.CHUNK or not _is_good_chunk(stream.read(length), offset):
@@ -161,7 +159,7 @@ def _check_beginning(stream: BinaryIO, path: Path) -> None:
     start = stream.read(len(MCAP0_MAGIC) + 9)
     if start[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
         raise RecordingError(f"{path}: found {start[:8]!r} at 0, expected the MCAP magic.")
-    opcode, length = struct.unpack("<BQ", start[len(MCAP0_MAGIC) :].ljust(9, b"\0"))
+    opcode, length = RECORD_HEAD.unpack(start[len(MCAP0_MAGIC) :].ljust(9, b"\0"))
     stream.seek(len(MCAP0_MAGIC) + 9 + min(length, 4096))
     if opcode != Opcode.HEADER or not _begins(stream):
         raise RecordingError(f"{path}: found other schemas or channels than every recording begins with.")
@@ -212,7 +210,8 @@ def places(records: bytes, where: str) -> tuple[int, Times, Times]:
     at = 0
     if len(records) >= HEADER_BYTES:
         _, length, channel = struct.unpack_from("<BQH", records)
-        if channel in _BLOCK_CHANNELS and length and len(records) % (9 + length) == 0:
+        of_one_size = schema.TOPIC_OF.get(channel) in schema.ALL_BLOCK_TOPICS
+        if of_one_size and length and len(records) % (9 + length) == 0:
             return _block_places(records, 9 + length, channel, where)
     while at + HEADER_BYTES <= len(records):
         opcode, length, channel, sequence, log_time, publish_time = struct.unpack_from("<BQHIQQ", records, at)

@@ -1,4 +1,4 @@
-"""Messages of variable size, to and from protobuf: metrics, Q-tables, log lines."""
+"""Messages of variable size, to and from protobuf: metrics, tables, arrays, log lines, pictures."""
 
 from __future__ import annotations
 

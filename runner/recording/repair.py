@@ -22,7 +22,7 @@ from runner.errors import RecordingError, StorageError
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
 from runner.recording.contents import asks_for_indexes, attachment_of, metadata_of, read_chunk
-from runner.recording.facts import check_run, json_object, kind_of, sizes_of
+from runner.recording.facts import NEEDED, check_run, json_object, kind_of, sizes_of
 from runner.recording.integrity import check_integrity, places
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import copied_chunk
@@ -33,7 +33,6 @@ from runner.scene import is_whole
 
 _CHUNK_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
 _MOST_MESSAGES: Final = 2**62
-_NEEDED: Final = {"run", "config", "provenance"}
 
 
 @dataclass
@@ -185,7 +184,7 @@ class _Salvage:
         return self._done
 
     def _check_described(self, described: set[str]) -> None:
-        if missing := _NEEDED - described:
+        if missing := NEEDED - described:
             raise RecordingError(
                 f"{self._path}: its metadata {', '.join(sorted(missing))} is damaged or was never written: "
                 "the messages cannot be told apart. `dualtaxi resume` does the run anew."
@@ -211,8 +210,8 @@ class _Salvage:
     def _take_chunk(self, file: RecordingFile, offset: int, body: bytes) -> None:
         """Copy a good chunk, with its index made anew; note a hole before it."""
         part, records = read_chunk(body, offset)
-        topic = next((topic for topic in self._topics if topic.channel == part.channel), None)
-        if topic is None:
+        topic = schema.TOPIC_OF[part.channel]
+        if topic not in self._topics:
             raise RecordingError(f"{self._path}: chunk at {offset}: found messages of another kind of run.")
         _, times, offsets = places(records, f"{self._path}: chunk at {offset}")
         if topic in self._dtypes:

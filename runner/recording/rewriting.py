@@ -13,6 +13,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
+from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import Chunk, message_index
 from runner.recording.contents import (
     UNREADABLE,
@@ -26,16 +27,14 @@ from runner.recording.contents import (
 from runner.recording.digest import ContentHash, combine
 from runner.recording.integrity import check_integrity, places
 from runner.recording.reader import open_recording
-from runner.recording.schema import ALL_TOPICS, KINDS, STEP, TOPICS, Topic
+from runner.recording.schema import KINDS, STEP, TOPIC_OF, TOPICS, Topic
 from runner.recording.writer import RecordingFile
 
 Times = NDArray[np.uint64]
 Change = Callable[[str, dict[str, str]], dict[str, str]]
 """Takes the name and the entries of a metadata record, and gives the entries it shall have."""
 
-_HEAD: Final = struct.Struct("<BQ")
 _CHUNK_TIMES: Final = struct.Struct("<QQ")
-_TOPIC_OF: Final = {topic.channel: topic for topic in ALL_TOPICS}
 
 
 def rewrite(path: Path, fresh: Path, change: Change) -> None:
@@ -66,7 +65,7 @@ def rewrite(path: Path, fresh: Path, change: Change) -> None:
             elif opcode == Opcode.CHUNK:
                 part, records = read_chunk(body, offset)
                 _, times, offsets = places(records, f"{path}: chunk at {offset}")
-                file.add_chunk(_TOPIC_OF[part.channel], copied_chunk(part, body, times, offsets, indexed))
+                file.add_chunk(TOPIC_OF[part.channel], copied_chunk(part, body, times, offsets, indexed))
         file.finish("" if result is None else "result", result)
 
 
@@ -83,7 +82,7 @@ def copied_chunk(part: Part, body: bytes, times: Times, offsets: Times, indexed:
     start, end = int(times[0]), int(times[-1])
     body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
     return Chunk(
-        record=_HEAD.pack(Opcode.CHUNK, len(body)) + body,
+        record=RECORD_HEAD.pack(Opcode.CHUNK, len(body)) + body,
         index=message_index(part.channel, times, offsets) if indexed else b"",
         compression=part.index.compression,
         compressed_size=part.index.compressed_size,
@@ -114,7 +113,7 @@ def content_of(path: Path) -> str:
 def continues(path: Path, earlier: Path) -> bool:
     """Return whether a recording holds all that another of the same job does, and goes on from there.
 
-    Of every topic the other's messages are the first ones, byte for byte.
+    Of every topic that the digest covers, the other's messages are the first ones, byte for byte.
 
     Raises:
         RecordingError: one of them is damaged.
@@ -141,7 +140,7 @@ def _messages(path: Path) -> Iterator[tuple[Topic, bytes, Times]]:
         if opcode == Opcode.CHUNK:
             part, records = read_chunk(body, offset)
             _, _, offsets = places(records, f"{path}: chunk at {offset}")
-            yield _TOPIC_OF[part.channel], records, offsets
+            yield TOPIC_OF[part.channel], records, offsets
 
 
 def _whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:

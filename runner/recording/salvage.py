@@ -7,7 +7,6 @@ signal. What looks like a chunk and is none costs work; how much of that is done
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -16,14 +15,11 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError
+from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head
 from runner.recording.contents import UNREADABLE, attachment_of, metadata_of, read_chunk
+from runner.recording.index import IN_DATA
 
-_HEAD: Final = struct.Struct("<BQ")
-_EXPECTED: Final = {
-    *(Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK),
-    *(Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT),
-}
 _LIKE_A_CHUNK: Final = re.compile(
     rb"\x06(?=.{3}[\0-\x04]\0{4}"  # its length
     rb".{16}.{3}[\0-\x04]\0{4}"  # its times and its size unpacked
@@ -70,7 +66,7 @@ class DamagedFile:
         """
         offset = len(MCAP0_MAGIC)
         while offset + 9 <= self.size:
-            opcode, length = _HEAD.unpack(self._read(offset, 9))
+            opcode, length = RECORD_HEAD.unpack(self._read(offset, 9))
             if (opcode, length) == (Opcode.DATA_END, 4):
                 return
             body = self._good_body(opcode, length, offset)
@@ -91,7 +87,7 @@ class DamagedFile:
 
     def _good_body(self, opcode: int, length: int, offset: int) -> bytes | None:
         """Return the body of the record here if it is whole and sound."""
-        if opcode not in _EXPECTED or length > min(self.size - offset - 9, MAX_CHUNK_BYTES):
+        if opcode not in IN_DATA or length > min(self.size - offset - 9, MAX_CHUNK_BYTES):
             return None
         try:
             if opcode == Opcode.CHUNK:
@@ -122,7 +118,7 @@ class DamagedFile:
             piece = self._read(offset, _PIECE + _LIKE_BYTES)
             for like in _LIKE_A_CHUNK.finditer(piece, 0, len(piece)):
                 at = offset + like.start()
-                _, length = _HEAD.unpack_from(piece, like.start())
+                _, length = RECORD_HEAD.unpack_from(piece, like.start())
                 if like.start() < _PIECE and self._good_body(Opcode.CHUNK, length, at) is not None:
                     return at
             offset += _PIECE

@@ -296,6 +296,8 @@ KINDS: Final = {
 ALL_TOPICS: Final = tuple(
     sorted({topic for topics in KINDS.values() for topic in topics}, key=lambda topic: topic.channel)
 )
+TOPIC_OF: Final = {topic.channel: topic for topic in ALL_TOPICS}
+"""Channel -> its topic."""
 DIGESTED: Final = frozenset(topic.name for topic in ALL_TOPICS if topic.digested)
 """The names of the topics that the content digest covers."""
 MESSAGES: Final = tuple(dict.fromkeys(topic.message for topic in ALL_TOPICS))

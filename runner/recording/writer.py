@@ -37,6 +37,7 @@ from runner import __version__
 from runner.errors import StorageError
 from runner.recording.chunks import Chunk
 from runner.recording.contents import Contents
+from runner.recording.index import checksum
 from runner.recording.protobuf import file_descriptor_set
 from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPICS, Topic
 
@@ -103,21 +104,12 @@ class RecordingFile:
         return file
 
     def _take_over(self, contents: Contents) -> None:
-        self._crc = self._checksum(contents.end)
+        self._crc = checksum(self._stream, 0, contents.end)
         self._offset = self._stream.seek(contents.end)
         self._attachments = list(contents.attachments)
         self._metadata = list(contents.metadata)
         for part in contents.chunks:
             self._note_chunk(part.index, part.channel, part.messages)
-
-    def _checksum(self, end: int) -> int:
-        """Return the checksum of the first `end` bytes."""
-        crc, offset = 0, self._stream.seek(0)
-        while offset < end:
-            piece = self._stream.read(min(1 << 20, end - offset))
-            crc = zlib.crc32(piece, crc)
-            offset += len(piece)
-        return crc
 
     @property
     def size(self) -> int:
