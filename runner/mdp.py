@@ -94,6 +94,15 @@ class Mdp:
         """[S, J, K]: the reward of all agents together."""
         return np.asarray(self.rewards.sum(axis=-1))
 
+    def outcomes_to(
+        self, state: NDArray[Any], action: NDArray[Any], next_state: NDArray[Any]
+    ) -> NDArray[np.bool_]:
+        """Return which outcomes of steps, [N] each, lead to their next states: [N, K]; none if unknown."""
+        known = (state >= 0) & (state < self.states) & (action >= 0) & (action < self.joint_actions)
+        at = np.where(known, state, 0), np.where(known, action, 0)
+        leads = (self.next_state[at] == next_state[:, np.newaxis]) & (self.probability[at] > 0)
+        return np.asarray(leads & known[:, np.newaxis])
+
     def rewards_of(self, learners: int) -> NDArray[np.float64]:
         """Return rewards as [S, J, K, learners]: their own where there are several, else the shared one."""
         if self.rewards.shape[-1] in (learners, 1):

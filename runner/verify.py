@@ -235,12 +235,8 @@ def _impossible(recording: Recording, steps: NDArray[np.void]) -> int:
     """Return how many steps are not among the outcomes of a tabular environment, if it is one."""
     if not recording.environment["arrays"]:
         return 0
-    mdp = recording.mdp
-    state, action = steps["state"], steps["action"]
-    known = (state < mdp.states) & (action < mdp.joint_actions)
-    at = np.where(known, state, 0), np.where(known, action, 0)
-    likely = (mdp.next_state[at] == steps["next_state"][:, np.newaxis]) & (mdp.probability[at] > 0)
-    return int(np.count_nonzero(~(known & likely.any(axis=1))))
+    outcomes = recording.mdp.outcomes_to(steps["state"], steps["action"], steps["next_state"])
+    return int(np.count_nonzero(~outcomes.any(axis=1)))
 
 
 def _compare_result(found: Verification, recording: Recording, summary: dict[str, Any]) -> Verification:

@@ -47,11 +47,7 @@ def check_integrity(path: Path) -> None:
             raise RecordingError(
                 f"{path}: {contents.reason.removeprefix(f'{path}: ')}; `dualtaxi repair` mends it."
             )
-        with RecordingFile.inspect(path, contents) as file:
-            expected = file.tail()
-        with path.open("rb") as stream:
-            stream.seek(contents.end)
-            found = stream.read(len(expected) + 1)
+        found, expected = _tails(path, contents)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
     if found != expected:
@@ -70,11 +66,8 @@ def is_merely_cut_off(path: Path) -> bool:
         contents = survey(path, keep_result=True, check=_IndexCheck(path).take)
         if contents.reason:
             return may_be_cut(path, contents)
-        with RecordingFile.inspect(path, contents) as file:
-            expected = file.tail()
-        with path.open("rb") as stream:
-            stream.seek(contents.end)
-            return expected.startswith(stream.read(len(expected) + 1))
+        found, expected = _tails(path, contents)
+        return expected.startswith(found)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
 
@@ -114,6 +107,15 @@ def may_be_cut(path: Path, contents: Contents) -> bool:
             return _ends_torn(stream, contents)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+
+
+def _tails(path: Path, contents: Contents) -> tuple[bytes, bytes]:
+    """Return what stands behind the data of a recording, and what should stand there."""
+    with RecordingFile.inspect(path, contents) as file:
+        expected = file.tail()
+    with path.open("rb") as stream:
+        stream.seek(contents.end)
+        return stream.read(len(expected) + 1), expected
 
 
 def _ends_torn(stream: BinaryIO, contents: Contents) -> bool:

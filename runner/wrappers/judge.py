@@ -65,12 +65,9 @@ def _events(
     next_state: NDArray[Any],
 ) -> NDArray[np.uint32]:
     """Return the events of steps: those of the outcome that has their next state, and their reward if any."""
-    known = (state >= 0) & (state < mdp.states) & (action >= 0) & (action < mdp.joint_actions)
-    state, action = np.where(known, state, 0), np.where(known, action, 0)
-    likely = (mdp.next_state[state, action] == next_state[:, np.newaxis]) & (
-        mdp.probability[state, action] > 0
-    )
-    paid = mdp.rewards[state, action].sum(axis=-1) == rewards[:, np.newaxis]
+    likely = mdp.outcomes_to(state, action, next_state)
+    found = likely.any(axis=1)
+    at = np.where(found, state, 0), np.where(found, action, 0)
+    paid = mdp.rewards[at].sum(axis=-1) == rewards[:, np.newaxis]
     outcome = np.argmax(likely * 2 + (likely & paid), axis=1)
-    found = known & likely.any(axis=1)
-    return np.where(found, mdp.events[state, action, outcome], np.uint32(0))
+    return np.where(found, mdp.events[*at, outcome], np.uint32(0))
