@@ -192,7 +192,7 @@ def test_archiving_several_goes_on_behind_those_that_are_archived_already(run, r
 def test_a_damaged_recording_is_refused_and_repair_is_named(run, recordings, command):
     recording = recordings / run.run_id / "recording.mcap"
     with open_recording(recording) as opened:
-        place = opened._entry(schema.TRAIN_STEP, 0).offset + 100
+        place = opened._chunks(schema.TRAIN_STEP).entry(0).offset + 100
     data = bytearray(recording.read_bytes())
     data[place] ^= 255
     recording.write_bytes(data)
