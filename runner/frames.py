@@ -100,14 +100,17 @@ def steps(
     """Return a row for each step of a phase: of one episode, or number `start` up to `stop`.
 
     Columns: step, episode, t, state, action (joint), next_state, `reward.AGENT`, terminated, truncated,
-    explored (bit i: agent i). All steps of a long run take some 70 bytes of memory each.
+    explored (bit i: agent i); in spaces that are not `Discrete` action and next_observation, a column for
+    each part of a `Dict`, with an array in a cell where a value is several numbers. All steps of a long run
+    take some 70 bytes of memory each.
 
     Raises:
         MissingExtra: pandas is not installed.
         RecordingError: the recording cannot be read, or has no such episode.
     """
     with _opened(run) as recording:
-        return _frame(step_columns(recording, phase, episode=episode, start=start, stop=stop))
+        columns = step_columns(recording, phase, episode=episode, start=start, stop=stop)
+        return _frame({name: list(each) if each.ndim > 1 else each for name, each in columns.items()})
 
 
 def transition_table(

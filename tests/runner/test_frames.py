@@ -11,6 +11,7 @@ import pytest
 import runner
 from runner import frames
 from runner.errors import MissingExtra, RecordingError
+from tests.runner.wrappers.loops import recorded
 
 CONFIG = {
     "name": "framed",
@@ -92,6 +93,18 @@ def test_parts_are_read_alone(run):
     assert frames.episodes(run, "train", 3, 5)["episode"].tolist() == [3, 4]
     with pytest.raises(RecordingError, match="no evaluation episode 200"):
         frames.steps(run, "eval", episode=200)
+
+
+@pytest.mark.parametrize(
+    ("name", "column", "part"),
+    [("CartPole-v1", "next_observation", ()), ("Rooms", "next_observation.position", ("position",))],
+)
+def test_steps_have_arrays_in_their_cells_where_values_are_several_numbers(name, column, part, tmp_path):
+    path, seen = recorded(tmp_path, name, 20)
+    observations = [each[2] for each in seen if each[0] == "step"]
+    expected = [observation[part[0]] if part else observation for observation in observations]
+    frame = frames.steps(path)
+    assert np.array_equal(np.stack(frame[column]), np.stack(expected))
 
 
 def test_a_run_may_be_a_path_or_open(run):
