@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from runner.catalogue.index import look
+from runner.catalogue.index import Index, look
 from runner.errors import RunNotFound
 from runner.finding import run_at_once, the_one
 from runner.runs import Run, runs_in
@@ -29,13 +29,18 @@ class Candidate(NamedTuple):
         return datetime.fromtimestamp(self.milliseconds / 1000, UTC)
 
 
+def candidates_in(index: Index) -> list[Candidate]:
+    """Return what the runs of an index are called, the newest first."""
+    return [Candidate(*facts) for facts in index.names()]
+
+
 def candidates(recordings: Path, tell: Callable[[str], None] = lambda _: None) -> list[Candidate]:
     """Return what the runs of a folder are called, the newest first.
 
     Raises:
         StorageError: the folder is there and cannot be read.
     """
-    return look([recordings], lambda index: [Candidate(*facts) for facts in index.names()], tell)
+    return look([recordings], candidates_in, tell)
 
 
 def find_run(name: str, recordings: Path, tell: Callable[[str], None] = lambda _: None) -> Run:
@@ -47,7 +52,15 @@ def find_run(name: str, recordings: Path, tell: Callable[[str], None] = lambda _
     known = run_at_once(name, recordings)
     if known is not None:
         return known
-    found = the_one(name, candidates(recordings, tell), recordings)
+    return run_of(the_one(name, candidates(recordings, tell), recordings), recordings)
+
+
+def run_of(found: Candidate, recordings: Path) -> Run:
+    """Return the run that the index knows to be in a folder.
+
+    Raises:
+        RunNotFound: it is no more.
+    """
     for run in runs_in(recordings / found.entry):
         return run
     raise RunNotFound(f"run {found.run_id} was removed just now.")

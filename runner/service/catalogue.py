@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from runner.catalogue.database import Version, version
-from runner.catalogue.finding import Candidate
+from runner.catalogue.finding import candidates_in, run_of
 from runner.catalogue.index import look
 from runner.errors import RunNotFound
 from runner.finding import the_one
-from runner.runs import Run, run_of_id, runs_in
+from runner.runs import Run, run_of_id
 
 if TYPE_CHECKING:
     from runner.catalogue.index import Index
@@ -23,8 +23,6 @@ Found = TypeVar("Found")
 
 FRESH_SECONDS: Final = 1.0
 """Folders that were looked at so recently are not looked at again; up to five, where that takes long."""
-AGAIN_SECONDS: Final = 0.1
-"""A run that is not known is looked for in the folders so long after they were last looked at."""
 SHARE: Final = 20
 """One part in so many of the time is spent on looking."""
 MOST_SECONDS: Final = 5.0
@@ -88,12 +86,10 @@ class Catalogue:
             if known is not None:
                 return known
         try:
-            found = the_one(name, self._candidates(), self.roots[0])
-        except RunNotFound:
-            time.sleep(max(0.0, self._looked + AGAIN_SECONDS - time.monotonic()))
-            self.changed()  # it may be newer than the last look
-            found = the_one(name, self._candidates(), self.roots[0])
-        return _read(found)
+            found = the_one(name, self.read(candidates_in), self.roots[0])
+        except RunNotFound:  # it may be newer than the last look
+            found = the_one(name, look(self.roots, candidates_in, self._tell), self.roots[0])
+        return run_of(found, Path(found.root))
 
     def find_all(self, name: str) -> list[Run]:
         """Return all runs of a name, the oldest first; else the one that answers to it.
@@ -102,11 +98,8 @@ class Catalogue:
             RunNotFound: none does, or it is the beginning of several ids.
         """
         _refuse_path(name)
-        alike = [found for found in self._candidates() if found.name == name]
-        return [_read(found) for found in reversed(alike)] or [self.find(name)]
-
-    def _candidates(self) -> list[Candidate]:
-        return self.read(lambda index: [Candidate(*facts) for facts in index.names()])
+        alike = [found for found in self.read(candidates_in) if found.name == name]
+        return [run_of(found, Path(found.root)) for found in reversed(alike)] or [self.find(name)]
 
     def _is_known(self, now: Version) -> bool:
         """Return whether a look not long ago saw to it that the index agrees with the folders."""
@@ -140,9 +133,3 @@ class Catalogue:
 def _refuse_path(name: str) -> None:
     if "/" in name or "\\" in name or "\0" in name or name.endswith(".mcap"):
         raise RunNotFound(f"no run {name!r}: expected an id, the beginning of one, a name or @latest.")
-
-
-def _read(found: Candidate) -> Run:
-    for run in runs_in(Path(found.root, found.entry)):
-        return run
-    raise RunNotFound(f"run {found.run_id} was removed just now.")
