@@ -14,6 +14,8 @@ from runner.analysis.diff.sections import (
     in_short,
     sections,
     updates_in_words,
+    visits_grids,
+    visits_told,
     where_in_words,
 )
 from runner.analysis.diff.tables import common_snapshots
@@ -80,6 +82,7 @@ def told_of(difference: RunDiff, a: Recording, b: Recording) -> dict[str, Any]:
         "legend": [(i, COLOURS[i], "AB"[i], name) for i, name in enumerate(names)],
         "partings": [_parting(difference, *pair, a, b) for pair in _partings(difference)],
         "training": _overlap_told(told["Training"], difference) + _loops_told(told, difference),
+        "visits": visits_grids(difference),
         "tables": {"figures": _table_figures(difference, a, b), **_parts(told["Q-tables"])},
         "metrics": _parts(told["Metrics"]),
         "others": [
@@ -101,8 +104,9 @@ def _partings(difference: RunDiff) -> Iterator[tuple[Parting, Cause]]:
 
 
 def _overlap_told(section: Section, difference: RunDiff) -> list[str]:
-    """Return how far training is the same, in sentences: the last one of its section."""
-    return section.sentences[-1:] if difference.overlap is not None else []
+    """Return how far training is the same, in sentences: the last ones of its section."""
+    told = 1 + len(visits_told(difference))
+    return section.sentences[-told:] if difference.overlap is not None else []
 
 
 def _loops_told(told: Mapping[str, Section], difference: RunDiff) -> list[str]:

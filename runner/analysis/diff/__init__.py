@@ -36,6 +36,7 @@ from runner.analysis.diff.trajectory import (
     training_parting,
     unbroken,
 )
+from runner.analysis.diff.visits import StateVisits, VisitsDiff, visits_diff
 from runner.recording import schema
 from runner.recording.reader import Recording
 
@@ -49,9 +50,11 @@ __all__ = [
     "Parting",
     "Row",
     "RunDiff",
+    "StateVisits",
     "TableDiff",
     "TransitionChange",
     "Update",
+    "VisitsDiff",
     "can_compare_steps",
     "diff",
 ]
@@ -74,6 +77,7 @@ class RunDiff:
     parting: Parting | None = None
     cause: Cause | None = None
     overlap: Overlap | None = None
+    visits: VisitsDiff | None = None
     evaluations: list[tuple[Parting, Cause]] = field(default_factory=list)
     """The first evaluation that parts: where, and why; empty if none does."""
     loop_evaluation: Parting | None = None
@@ -81,7 +85,9 @@ class RunDiff:
     tables: list[TableDiff] = field(default_factory=list)
     metrics: list[MetricDiff] = field(default_factory=list)
     costs: list[Change] = field(default_factory=list)
-    """Steps, time and size."""
+    """Steps, seconds and size."""
+    ignored: list[str] = field(default_factory=list)
+    """Paths of what differs, and was left out as asked."""
     notes: list[str] = field(default_factory=list)
     """What could not be compared, and why."""
 
@@ -123,7 +129,9 @@ def diff(
         cause = None if parting is None else (kind_of if first else cause_of)(parting, a, b)
         facts |= {"parting": parting, "cause": cause}
         if not first:
-            facts["overlap"], seen = training_overlap(a, b)
+            facts["overlap"], visits = training_overlap(a, b)
+            facts["visits"] = visits_diff(a.mdp, *visits)
+            seen = visits[0] + visits[1]
             known = None if parting is None or cause is None else (parting, cause)
             parted = next(evaluation_partings(a, b), None)
             facts["evaluations"] = [] if parted is None else [(parted, cause_of(parted, a, b, known))]

@@ -8,21 +8,29 @@ from collections.abc import Sequence
 from typing import Any
 
 from runner.analysis.diff import Change, RunDiff
+from runner.analysis.diff.settings import changes_in
 from runner.errors import RunnerError
+from runner.runs import Run
+
+
+def with_seconds(difference: RunDiff, a: Run, b: Run) -> RunDiff:
+    """Return the difference with how long the runs took, which recordings do not say."""
+    took = [{"seconds": run.summary.get("seconds")} for run in (a, b)]
+    return dataclasses.replace(difference, costs=[*difference.costs, *changes_in(*took)])
 
 
 def without(difference: RunDiff, ignore: Sequence[str]) -> RunDiff:
-    """Return the difference without the settings and provenance whose path fits one of these patterns."""
+    """Return the difference without what has a path that fits a pattern; it is named as ignored."""
+    parts = {"config": difference.config, "provenance": difference.provenance, "costs": difference.costs}
+    kept: dict[str, Any] = {
+        part: [change for change in changes if not _fits(change, ignore)] for part, changes in parts.items()
+    }
+    ignored = [change.path for changes in parts.values() for change in changes if _fits(change, ignore)]
+    return dataclasses.replace(difference, **kept, ignored=ignored)
 
-    def kept(changes: list[Change]) -> list[Change]:
-        return [c for c in changes if not any(fnmatch.fnmatchcase(c.path, glob) for glob in ignore)]
 
-    return dataclasses.replace(
-        difference,
-        config=kept(difference.config),
-        provenance=kept(difference.provenance),
-        costs=kept(difference.costs),
-    )
+def _fits(change: Change, globs: Sequence[str]) -> bool:
+    return any(fnmatch.fnmatchcase(change.path, glob) for glob in globs)
 
 
 def as_json(difference: RunDiff) -> dict[str, Any]:

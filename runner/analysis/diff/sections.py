@@ -46,7 +46,10 @@ def _runs(difference: RunDiff) -> Section:
         for name, who in (("A", difference.a), ("B", difference.b))
     ]
     grid = Grid(("", "id", "name", "seed", "status"), rows)
-    return Section("Runs", [in_short(difference), *(f"Note: {note}." for note in difference.notes)], [grid])
+    notes = list(difference.notes)
+    if difference.ignored:
+        notes.append(f"left out as asked, though it differs: {', '.join(difference.ignored)}")
+    return Section("Runs", [in_short(difference), *(f"Note: {note}." for note in notes)], [grid])
 
 
 def in_short(difference: RunDiff) -> str:
@@ -63,7 +66,8 @@ def in_short(difference: RunDiff) -> str:
         more = f"; and {len(settings) - MOST_NAMED} more" if len(settings) > MOST_NAMED else ""
         said.append(f"Of the settings, {told}{more} {'differ' if len(settings) > 1 else 'differs'}.")
     else:
-        said.append("No setting that determines the content differs.")
+        other = "other " if difference.ignored else ""
+        said.append(f"No {other}setting that determines the content differs.")
     parting = difference.parting
     if parting is not None and parting.step:
         said.append(f"Training is the same for {parting.step:,} steps.")
@@ -122,7 +126,29 @@ def _trajectory(difference: RunDiff) -> Section:
             f"their steps {share:.1%} agree at the same time of the same episode. Mean length "
             f"{overlap.mean_length_a:.1f} in A, {overlap.mean_length_b:.1f} in B."
         )
+        sentences += visits_told(difference)
+        grids += visits_grids(difference)
     return Section("Training", sentences, grids)
+
+
+def visits_told(difference: RunDiff) -> list[str]:
+    """Return how alike both runs' training visits states, in a sentence, if that is known."""
+    visits = difference.visits
+    if visits is None:
+        return []
+    return [
+        f"A acted in {visits.states_a:,} states, B in {visits.states_b:,}; of their steps {visits.alike:.1%} "
+        "spread over the states alike."
+    ]
+
+
+def visits_grids(difference: RunDiff) -> list[Grid]:
+    """Return the states whose shares of all training steps differ most."""
+    visits = difference.visits
+    if visits is None or not visits.most_apart:
+        return []
+    rows = [(told.state, f"{told.a:,}", f"{told.b:,}") for told in visits.most_apart]
+    return [Grid(("training steps in a state, where the shares differ most", "A", "B"), rows)]
 
 
 def _evaluations(difference: RunDiff) -> Section:

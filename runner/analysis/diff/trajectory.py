@@ -212,11 +212,13 @@ def _parting(
     )
 
 
-def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, NDArray[np.int64]]:
+def training_overlap(
+    a: Recording, b: Recording
+) -> tuple[Overlap, tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """Return how far the training of two runs is the same, aligned by episode and time in it.
 
     Returns:
-        the overlap; and how often each state was acted in, [S], both runs together.
+        the overlap; and how often each state was acted in, [S], in either run.
 
     Raises:
         RecordingError: steps and episodes of a recording contradict each other.
@@ -242,7 +244,7 @@ def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, NDArray[np.in
         mean_length_a=float(mean[0]),
         mean_length_b=float(mean[1]),
     )
-    return overlap, left.all_visits() + right.all_visits()
+    return overlap, (left.all_visits(), right.all_visits())
 
 
 def _lengths_of_both(a: Recording, b: Recording) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:

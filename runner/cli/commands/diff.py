@@ -67,7 +67,7 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.diff import diff
     from runner.analysis.diff.asked import as_json as told
-    from runner.analysis.diff.asked import level_of, without
+    from runner.analysis.diff.asked import level_of, with_seconds, without
     from runner.recording.reader import open_recording
 
     require_one_form(as_json, as_markdown)
@@ -76,13 +76,14 @@ def command(
         require_page(html, force)
     left, right = find_recorded(a, recordings), find_recorded(b, recordings)
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
-        difference = without(diff(recording_a, recording_b, levels, first), ignore)
+        difference = diff(recording_a, recording_b, levels, first)
+        difference = without(difference if first else with_seconds(difference, left, right), ignore)
         if html is not None:
             page = _write_page(html, force, difference, recording_a, recording_b)
-            (say if as_json else click.echo)(page)
+            (say if as_json or as_markdown else click.echo)(page)
     if as_json:
         print_json(told(difference))
-    elif html is None:
+    elif html is None or as_markdown:
         _print(difference, everything, as_markdown)
     ctx.exit(0 if difference.same_content else 1)
 

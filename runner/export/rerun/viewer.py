@@ -174,13 +174,25 @@ def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> 
     """Draw a file at a step into a PNG.
 
     Raises:
-        ViewerError: the viewer cannot be started, or the picture not be written.
+        ViewerError: the viewer cannot be started, or draws nothing.
+        StorageError: the picture cannot be written.
     """
-    with headless(path, step, size) as client:
-        time.sleep(NOTICE_SECONDS)
-        client.save_screenshot(str(picture.absolute()))
-    if not picture.exists():
-        raise ViewerError(f"{picture}: the Rerun viewer has not written it.")
+    import shutil
+    import tempfile
+
+    from runner.export.places import write_new
+
+    def keep(fresh: Path) -> None:
+        shutil.copyfile(drawn, fresh)
+
+    with tempfile.TemporaryDirectory() as folder:
+        drawn = Path(folder) / "screenshot.png"
+        with headless(path, step, size) as client:
+            time.sleep(NOTICE_SECONDS)
+            client.save_screenshot(str(drawn))
+        if not drawn.exists():
+            raise ViewerError(f"{picture}: the Rerun viewer has not drawn it.")
+        write_new(picture, True, keep)
 
 
 def live_window(port: int) -> str:

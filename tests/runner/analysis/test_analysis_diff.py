@@ -24,6 +24,7 @@ from runner.execution import run_job
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.words import states_in_words
 from tests.runner.altering import altered
 
 BASE = {
@@ -141,6 +142,40 @@ def test_more_episodes_go_on_from_where_fewer_end(compare):
     assert difference.overlap.equal_episodes == 120
     assert difference.overlap.equal_steps == difference.overlap.steps_a
     assert all(table.largest == 0 for table in difference.tables)
+
+
+def test_visits_to_states_are_those_of_the_steps(compare, record):
+    visits = compare("discount=0.9").visits
+    counts = []
+    for path in (record(), record("discount=0.9")):
+        with open_recording(path) as recording:
+            states = np.concatenate([block["state"] for block in recording.blocks(schema.TRAIN_STEP)])
+            words = states_in_words(recording.mdp)
+            counts.append(np.bincount(states, minlength=len(words)))
+    assert (visits.states_a, visits.states_b) == tuple(np.count_nonzero(count) for count in counts)
+    shares = [count / count.sum() for count in counts]
+    assert visits.alike == pytest.approx(1 - np.abs(shares[0] - shares[1]).sum() / 2)
+    assert 0 < visits.alike < 1
+    first = int(np.abs(shares[0] - shares[1]).argmax())
+    most = visits.most_apart[0]
+    assert (most.state, most.a, most.b) == (words[first], counts[0][first], counts[1][first])
+
+
+def test_what_is_left_out_as_asked_is_named(record, folder):
+    ids = [record(*overrides).parent.name for overrides in ((), ("discount=0.9",))]
+    told = CliRunner().invoke(cli, ["diff", *ids, "--recordings", str(folder), "--ignore", "disc*"])
+    assert "Note: left out as asked, though it differs: discount." in told.stdout
+    assert "No other setting that determines the content differs." in told.stdout
+
+
+def test_a_page_and_markdown_are_given_together(record, folder, tmp_path):
+    ids, page = [record(*overrides).parent.name for overrides in ((), ("discount=0.9",))], tmp_path / "d.html"
+    asked = ["diff", *ids, "--recordings", str(folder), "--markdown", "--html", str(page)]
+    told = CliRunner().invoke(cli, asked)
+    assert "## Training" in told.stdout
+    assert str(page) in told.stderr
+    assert "where the shares differ most" in page.read_text("utf-8")
+    assert "| seconds |" in told.stdout
 
 
 def test_what_an_interrupted_run_has_is_compared(record, folder):

@@ -132,6 +132,12 @@ class TestCommand:
         assert "steps, in" in result.output
         assert path.read_bytes()[:4] == b"RRF2"
 
+    def test_a_place_where_no_file_can_be_is_told(self, pictured, tmp_path):
+        path = tmp_path / "missing" / "a.rrd"
+        result = invoke("export", "rerun", pictured("lake").folder, "-o", path)
+        assert result.exit_code == 1
+        assert f"{path}: cannot be written (No such file or directory)." in result.stderr
+
     @pytest.mark.parametrize("text", ["x", "1-2", ":x", ""])
     def test_ranges_that_are_none(self, pictured, text):
         result = invoke("export", "rerun", pictured("lake").folder, "--episodes", text)

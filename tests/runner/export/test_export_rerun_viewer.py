@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from runner.errors import RunnerError
+from runner.errors import RunnerError, StorageError
 from runner.export.rerun import live as live_view
 from runner.export.rerun import viewer
 from runner.export.rerun.cache import exported
@@ -82,6 +85,20 @@ def test_a_viewer_that_cannot_start_says_why(monkeypatch, tmp_path):
         viewer.viewer(viewer.free_port(), log=tmp_path / "log"),
     ):
         pass
+
+
+def test_a_screenshot_is_kept_whole_or_its_place_is_told(monkeypatch, tmp_path):
+    @contextlib.contextmanager
+    def headless(path, step, size):
+        yield SimpleNamespace(save_screenshot=lambda picture: Path(picture).write_bytes(b"drawn"))
+
+    monkeypatch.setattr(viewer, "headless", headless)
+    monkeypatch.setattr(viewer, "NOTICE_SECONDS", 0)
+    picture = tmp_path / "step.png"
+    viewer.screenshot(tmp_path / "a.rrd", 0, picture)
+    assert picture.read_bytes() == b"drawn"
+    with pytest.raises(StorageError, match="cannot be written"):
+        viewer.screenshot(tmp_path / "a.rrd", 0, tmp_path / "missing" / "step.png")
 
 
 def test_a_live_view_takes_one_episode_in_so_many(pictured, monkeypatch):
