@@ -11,6 +11,7 @@ from runner.analysis.diff.sections import where_in_words
 from runner.analysis.diff.trajectory import evaluation_partings, training_parting
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.errors import RecordingError
+from runner.export.contents import require_steps
 from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
@@ -35,11 +36,12 @@ def with_spot(run: Run, request: Request, spot: tuple[int, ...] | None) -> Spot:
             beginning of what is most worth looking at.
 
     Raises:
-        RecordingError: there is no such step.
+        RecordingError: there is no such step, or none at all.
     """
     with open_recording(run.recording) as recording:
         if spot is None:
             return Spot(_beginning(recording, request), request)
+        require_steps(recording, "look at")
         phase, step, more = _train_step(recording, *spot) if len(spot) == 2 else _eval_step(recording, *spot)
         topic = schema.PHASES[phase][0]
         record = next(recording.blocks(topic, step, step + 1))[0]

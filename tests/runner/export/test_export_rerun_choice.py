@@ -98,6 +98,9 @@ class TestWithoutSteps:
         result = invoke("export", "rerun", run.folder, "-o", tmp_path / "b.rrd", "--all")
         assert result.exit_code == 2
         assert "rerecord" in result.output
+        result = invoke("view", run.folder, "--at", "1:1", "--screenshot", tmp_path / "a.png")
+        assert result.exit_code == 2
+        assert "rerecord" in result.output
 
 
 def test_an_interrupted_run_is_exported_as_far_as_it_came(pictured, tmp_path):
