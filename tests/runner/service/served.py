@@ -1,95 +1,88 @@
-"""A real server process, to be asked, stopped and killed."""
+"""A service in a process of its own, to be asked, stopped, killed and started again."""
 
 from __future__ import annotations
 
 import contextlib
-import json
-import os
-import signal
+import socket
 import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import httpx2
 import psutil
 
+from tests.waiting import until
+
 
 class Served:
-    """A server of a recordings folder that can be killed and started again."""
+    """`dualtaxi serve` over a folder, always at the same port and with one log; a `with` starts and stops it.
+
+    Before it is started, nothing listens at its address.
+    """
 
     def __init__(self, recordings: Path, *options: str) -> None:
         self.recordings, self.options = recordings, options
         self.log = recordings.with_name(f"{recordings.name}.log")
-        self.start()
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+        self.origin = {"Origin": self.url}
+        self.process: subprocess.Popen[str] | None = None
 
-    def start(self, port: str = "0") -> None:
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def start(self) -> None:
         """Start it, and wait until it can be asked."""
-        words = ["-m", "runner", "serve", "--port", port, "--recordings", str(self.recordings), *self.options]
-        # Its log goes to a file: a pipe that nobody empties would stop it after 64 KiB.
+        words = ["serve", "--port", str(self.port), "--recordings", str(self.recordings), *self.options]
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, *words], stdout=subprocess.PIPE, stderr=log, text=True
+                [sys.executable, "-m", "runner", *words], stdout=subprocess.PIPE, stderr=log, text=True
             )
-        assert self.process.stdout is not None
-        self.url = self.process.stdout.readline().strip()
-        assert self.url, self.log.read_text()
-        self.client = httpx2.Client(
-            base_url=f"{self.url}api/v1", headers={"Origin": self.url.rstrip("/")}, timeout=60
-        )
+        assert self.process.stdout.readline() == f"{self.url}/\n", self.log.read_text()
+        self.client = httpx2.Client(base_url=f"{self.url}/api/v1", headers=self.origin, timeout=60)
+
+    def stop(self) -> int | None:
+        """Have it end properly, if it runs; return its exit code."""
+        if self.process is None:
+            return None
+        self.process.terminate()
+        return self._ended()
+
+    def kill(self, with_workers: bool = False) -> list[psutil.Process]:
+        """End it without warning, its workers too if that is asked for; return those that it had."""
+        workers = self.workers()
+        self.process.kill()
+        for worker in workers if with_workers else ():
+            with contextlib.suppress(psutil.NoSuchProcess):
+                worker.kill()
+        self._ended()
+        return workers
+
+    def _ended(self) -> int:
+        code = self.process.wait(60)
+        self.process.stdout.close()
+        self.process = None
+        self.client.close()
+        return code
 
     def workers(self) -> list[psutil.Process]:
         """Return the processes that it has started, and theirs."""
         return psutil.Process(self.process.pid).children(recursive=True)
 
-    def kill(self, with_workers: bool = False) -> list[psutil.Process]:
-        """End it without warning, its workers too if that is asked for; return those that it had."""
-        workers = self.workers()
-        os.kill(self.process.pid, signal.SIGKILL)
-        for worker in workers if with_workers else ():
-            with contextlib.suppress(psutil.NoSuchProcess):
-                worker.kill()
-        self._forget()
-        return workers
-
-    def stop(self) -> int:
-        """Have it end properly; return its exit code."""
-        self.process.terminate()
-        code = self.process.wait(60)
-        self._forget()
-        return code
-
-    def _forget(self) -> None:
-        self.process.wait(60)
-        self.client.close()
-        if self.process.stdout is not None:
-            self.process.stdout.close()
-
     def get(self, path: str) -> Any:
-        """Return what is at a path."""
+        """Return what is at a path of the API."""
         return self.client.get(path).raise_for_status().json()
 
     def post(self, path: str, text: str = "") -> Any:
-        """Return the answer to a text that is sent to a path."""
+        """Return the answer to a text that is sent to a path of the API."""
         return self.client.post(path, content=text.encode()).raise_for_status().json()
 
     def until(self, is_so: Any, seconds: float = 90) -> dict[int, dict[str, Any]]:
         """Wait until the jobs, by number, are so; return them."""
-        deadline = time.monotonic() + seconds
-        while not is_so(jobs := {job["number"]: job for job in self.get("/jobs")["jobs"]}):
-            assert time.monotonic() < deadline, json.dumps(jobs, indent=1)
-            time.sleep(0.05)
-        return jobs
-
-
-@contextlib.contextmanager
-def served(recordings: Path, *options: str) -> Iterator[Served]:
-    """Give a server; it is ended at the end."""
-    server = Served(recordings, *options)
-    try:
-        yield server
-    finally:
-        if server.process.poll() is None:
-            server.stop()
+        return until(is_so, lambda: {job["number"]: job for job in self.get("/jobs")["jobs"]}, seconds)

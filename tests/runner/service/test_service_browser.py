@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import subprocess
-import sys
 import urllib.request
 
 import numpy as np
@@ -17,6 +15,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
+from served import Served
 
 import runner
 from runner.export.svg import Drawing, transform
@@ -58,20 +57,11 @@ def folder(recorded, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def served(folder, tmp_path_factory):
+def served(folder):
     """Return the address of a service in a process of its own."""
-    path = tmp_path_factory.mktemp("log") / "serve.log"
-    arguments = [sys.executable, "-m", "runner", "serve", "--port", "0", "--recordings", folder]
-    with (
-        path.open("w") as log,
-        subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=log, text=True) as process,
-    ):
-        address = process.stdout.readline().strip().rstrip("/")
-        assert address.startswith("http://127.0.0.1:"), path.read_text()
-        yield address
-        process.terminate()
-        process.wait(60)
-    assert "Traceback" not in path.read_text()
+    with Served(folder) as server:
+        yield server.url
+    assert "Traceback" not in server.log.read_text()
 
 
 @pytest.fixture(scope="module")

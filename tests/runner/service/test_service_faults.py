@@ -16,7 +16,7 @@ import time
 
 import httpx2 as httpx
 import pytest
-from serving import serving
+from served import Served
 
 from runner.catalogue.database import index_path
 from runner.service.app import create_app
@@ -163,8 +163,9 @@ def test_a_stop_lets_an_answer_come_to_its_end(recordings, how):
     large = next(recordings.glob("*/recording.mcap"))
     with large.open("r+b") as stream:
         stream.truncate(40 << 20)
-    with serving(recordings) as served:
-        address = f"{served.url}api/v1/runs/{large.parent.name}/recording"
+    log = recordings.with_name("service.log")
+    with Served(recordings, "--log", str(log)) as served:
+        address = f"{served.url}/api/v1/runs/{large.parent.name}/recording"
         with httpx.stream("GET", address) as answer:
             parts = answer.iter_bytes()
             received = len(next(parts))
@@ -174,13 +175,13 @@ def test_a_stop_lets_an_answer_come_to_its_end(recordings, how):
             received += sum(map(len, parts))
         assert received == 40 << 20
         assert served.process.wait(10) == 0
-        assert served.process.stderr.read() == ""
-        events = [json.loads(line)["event"] for line in served.log.read_text().splitlines()]
+    assert served.log.read_text() == "", "all that it says is in the log"
+    events = [json.loads(line)["event"] for line in log.read_text().splitlines()]
     assert events.count("stopping") == 1
 
 
 def test_a_port_that_is_taken_and_a_folder_that_is_served_are_said(recordings):
-    with serving(recordings) as served:
+    with Served(recordings) as served:
         port, elsewhere = str(served.port), recordings.with_name("elsewhere")
         taken, twice = (
             subprocess.run(

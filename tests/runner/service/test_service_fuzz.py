@@ -18,7 +18,7 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
-from serving import serving
+from served import Served
 
 CHECKS = [
     not_a_server_error,
@@ -36,12 +36,12 @@ LONGEST = 60_000
 @pytest.fixture(scope="module")
 def served(recorded, tmp_path_factory):
     recordings = shutil.copytree(recorded, tmp_path_factory.mktemp("fuzz") / "recordings")
-    with serving(recordings) as found:
-        yield found
+    with Served(recordings) as server:
+        yield server
 
 
 def test_every_answer_is_documented_and_none_is_a_fault(served):
-    schema = schemathesis.openapi.from_url(f"{served.url}api/v1/openapi.json")
+    schema = schemathesis.openapi.from_url(f"{served.url}/api/v1/openapi.json")
     failed, tried = {}, 0
     for result in schema.get_all_operations():
         operation = result.ok()

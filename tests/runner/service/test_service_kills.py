@@ -9,7 +9,7 @@ import threading
 import httpx2
 import psutil
 import pytest
-from served import served
+from served import Served
 
 import runner
 from runner.runs import list_runs
@@ -67,7 +67,7 @@ def digests(recordings):
 
 
 def test_five_jobs_survive_that_the_server_and_then_everything_is_killed(tmp_path, undisturbed):
-    with served(tmp_path) as server:
+    with Served(tmp_path) as server:
         submitted(server, range(5))
         server.until(is_under_way)
         workers = server.kill()
@@ -90,7 +90,7 @@ def test_five_jobs_survive_that_the_server_and_then_everything_is_killed(tmp_pat
 
 
 def test_a_new_server_waits_for_a_worker_that_has_not_stopped_yet(tmp_path, undisturbed):
-    with served(tmp_path, "--workers", "1") as server:
+    with Served(tmp_path, "--workers", "1") as server:
         submitted(server, [0])
         server.until(is_under_way)
         usual = psutil.Process().nice()
@@ -109,13 +109,13 @@ def test_a_new_server_waits_for_a_worker_that_has_not_stopped_yet(tmp_path, undi
 
 def test_a_server_that_is_told_to_stop_leaves_its_job_resumable_and_lets_watchers_go(tmp_path):
     config = CONFIG | {"evaluation": {"every": 100, "trials": 3500}, "recording": {"steps": "none"}}
-    with served(tmp_path, "--workers", "1") as server:
+    with Served(tmp_path, "--workers", "1") as server:
         server.post("/jobs", json.dumps(config))
         server.until(is_under_way)
         seen = []
 
         def watch():
-            with httpx2.stream("GET", f"{server.url}api/v1/jobs/1/events", timeout=30) as answer:
+            with httpx2.stream("GET", f"{server.url}/api/v1/jobs/1/events", timeout=30) as answer:
                 seen.extend(answer.iter_lines())
 
         watcher = threading.Thread(target=watch)
@@ -131,7 +131,7 @@ def test_a_server_that_is_told_to_stop_leaves_its_job_resumable_and_lets_watcher
         server.start()
         last = next(line for line in reversed(seen) if line.startswith("id: ")).removeprefix("id: ")
         server.until(are_finished)
-        rest = httpx2.get(f"{server.url}api/v1/jobs/1/events", headers={"Last-Event-ID": last}).text
+        rest = httpx2.get(f"{server.url}/api/v1/jobs/1/events", headers={"Last-Event-ID": last}).text
         states = [
             json.loads(line.removeprefix("data: "))["state"]
             for line in rest.splitlines()
@@ -171,7 +171,7 @@ def test_a_sweep_that_was_killed_ends_as_if_it_never_had_been(tmp_path):
     sweep = from_values(SWEEP)
     state.begin(sweep, calm, resume=False, accept_changes=False)
     run_sweep(sweep, calm, Here())
-    with served(killed) as server:
+    with Served(killed) as server:
         server.post("/jobs", json.dumps(SWEEP))
         server.until(lambda jobs: (jobs[1]["progress"] or {}).get("done", 0) >= 1)
         server.kill()
@@ -186,7 +186,7 @@ def test_a_second_server_of_the_same_folder_is_refused(tmp_path):
 
     from runner.cli import cli
 
-    with served(tmp_path):
+    with Served(tmp_path):
         result = CliRunner().invoke(cli, ["serve", "--port", "0", "--recordings", str(tmp_path)])
     assert "is served by another process already" in result.output
     assert result.exit_code == 2

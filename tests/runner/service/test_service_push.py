@@ -7,7 +7,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -21,7 +20,7 @@ import gymnasium
 import pytest
 from blake3 import blake3
 from click.testing import CliRunner
-from restarting import Server
+from served import Served
 
 import runner
 from runner.cli import cli
@@ -40,19 +39,16 @@ from tests.runner.recording.making import TAXIS, make_run
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    started = Server(tmp_path_factory.mktemp("server") / "runs")
-    started.start()
-    yield started
-    started.end()
+    with Served(tmp_path_factory.mktemp("server") / "runs") as started:
+        yield started
 
 
 @pytest.fixture
 def own_server(tmp_path):
     """Return a server that may be killed; it is not started yet."""
-    made = Server(tmp_path / "server" / "runs")
-    made.recordings.parent.mkdir()
+    made = Served(tmp_path / "theirs")
     yield made
-    made.end(signal.SIGKILL)
+    made.stop()
 
 
 @pytest.fixture(autouse=True)
@@ -160,8 +156,8 @@ def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recor
     (tmp_path / "token").write_text(token + "\n")
     taken = dualtaxi(*push, "--token-file", tmp_path / "token")
     assert taken.exit_code == 0, taken.stderr
-    own_server.end()
-    log = (own_server.recordings.parent / "server.log").read_text()
+    own_server.stop()
+    log = own_server.log.read_text()
     assert not [
         text for text in (log, taken.output, refused.output) if token in text or "dualtaxi_wrong" in text
     ]
@@ -202,7 +198,7 @@ def test_a_server_killed_in_the_middle_of_twenty_uploads_loses_none(own_server, 
         sent = [pool.submit(push, parcel) for parcel in parcels]
         for _ in range(40):
             assert some.acquire(timeout=60)
-        own_server.end(signal.SIGKILL)
+        own_server.kill()
         visible = [path for path in own_server.recordings.iterdir() if path.name[0] != "."]
         assert all((folder / "run.json").exists() for folder in visible)
         received = [path.stat().st_size for path in own_server.recordings.glob(".uploads/*/body")]

@@ -8,15 +8,13 @@ import json
 import logging
 import os
 import stat
-import subprocess
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
 import httpx2
 import pytest
 from click.testing import CliRunner
-from serving import serving
+from served import Served
 
 from runner.cli import cli
 from runner.errors import RunnerError
@@ -254,19 +252,14 @@ def test_a_log_that_nobody_reads_keeps_nobody_waiting_and_says_what_it_left_out(
     assert lines[-1]["event"] == "last"
 
 
-def test_a_service_whose_log_is_never_read_answers_and_stops_all_the_same(recordings):
-    words = [sys.executable, "-m", "runner", "serve", "--port", "0", "--recordings", str(recordings)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        url = process.stdout.readline().strip()
-        try:
-            with httpx2.Client(base_url=url) as asking:
-                for number in range(100):  # 2 kB of log each, more than a pipe holds
-                    asked = {"filter": f"name:n{number}{'x' * 2_000}"}
-                    assert asking.get(RUNS, params=asked).status_code == 200
-            process.terminate()
-            assert process.wait(30) == 0
-        finally:
-            process.kill()
+def test_a_service_whose_log_is_never_read_answers_and_stops_all_the_same(recordings, tmp_path):
+    os.mkfifo(tmp_path / "log")
+    unread = os.open(tmp_path / "log", os.O_RDWR)
+    with os.fdopen(unread), Served(recordings, "--log", str(tmp_path / "log")) as served:
+        for number in range(100):  # 2 kB of log each, more than a pipe holds
+            asked = {"filter": f"name:n{number}{'x' * 2_000}"}
+            assert served.client.get("/runs", params=asked).status_code == 200
+        assert served.stop() == 0
 
 
 def test_no_message_says_where_the_server_keeps_its_files(client, recordings):
@@ -307,18 +300,19 @@ def test_tokens_are_made_listed_and_revoked_by_the_command(monkeypatch, tmp_path
     assert kept.scopes_of(secret) is None
 
 
-def test_a_proxy_that_is_believed_tells_who_asks_and_how(recordings, tmp_path):
+def test_a_proxy_that_is_believed_tells_who_asks_and_how(recordings, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     tokens = Tokens(tmp_path / "dualtaxi" / "tokens.json")
     _, secret = tokens.create("laptop", (READ,))
     words = ("--require-token", "--allow-host", "Runs.example.org", "--proxy", "127.0.0.1")
     said = {"Host": "runs.example.org", "Origin": "https://runs.example.org"}
     said |= {"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.7"}
-    with serving(recordings, *words, environment={"XDG_CONFIG_HOME": str(tmp_path)}) as served:
-        assert httpx2.get(f"{served.url}api/v1/runs").status_code == 401
-        entered = httpx2.post(f"{served.url}login", data={"token": secret}, headers=said)
+    with Served(recordings, *words) as served:
+        assert httpx2.get(f"{served.url}/api/v1/runs").status_code == 401
+        entered = httpx2.post(f"{served.url}/login", data={"token": secret}, headers=said)
         for _ in range(10):
-            httpx2.get(f"{served.url}api/v1/runs", headers=said | _bearer("wrong"))
-        assert httpx2.get(f"{served.url}api/v1/runs", headers=said | _bearer(secret)).status_code == 429
-        assert httpx2.get(f"{served.url}api/v1/runs", headers=_bearer(secret)).status_code == 200
+            httpx2.get(f"{served.url}/api/v1/runs", headers=said | _bearer("wrong"))
+        assert httpx2.get(f"{served.url}/api/v1/runs", headers=said | _bearer(secret)).status_code == 429
+        assert httpx2.get(f"{served.url}/api/v1/runs", headers=_bearer(secret)).status_code == 200
     assert entered.status_code == 303
     assert "Secure" in entered.headers["set-cookie"]

@@ -7,7 +7,7 @@ import json
 import pytest
 import yaml
 from click.testing import CliRunner
-from served import served
+from served import Served
 
 from runner.cli import cli
 from runner.cli.commands.submit import text_of
@@ -26,7 +26,7 @@ def file(tmp_path):
 
 
 def test_a_file_is_done_by_a_server_and_watched(file, tmp_path):
-    with served(tmp_path / "recordings") as server:
+    with Served(tmp_path / "recordings") as server:
         words = ["submit", str(file), "--server", server.url]
         result = CliRunner().invoke(cli, [*words, "--watch", "--json"])
         assert result.exit_code == 0, result.output

@@ -6,7 +6,7 @@ import json
 import threading
 
 import pytest
-from served import served
+from served import Served
 
 from runner.errors import RunnerError
 from runner.runs import list_runs
@@ -19,11 +19,10 @@ TINY = {"name": "icy", "env": {"id": "FrozenLake-v1"}, "episodes": 20, "seeds": 
 
 
 def test_a_watcher_sees_everything_once_though_the_server_is_killed_meanwhile(tmp_path):
-    with served(tmp_path) as server:
+    with Served(tmp_path) as server:
         seen = []
         with Client(server.url) as client:
             number = client.submit(json.dumps(CONFIG)).number
-        port = server.url.rstrip("/").rpartition(":")[2]
 
         def watch():
             with Client(server.url) as client:
@@ -33,7 +32,7 @@ def test_a_watcher_sees_everything_once_though_the_server_is_killed_meanwhile(tm
         watcher.start()
         server.until(lambda jobs: (jobs[number]["progress"] or {}).get("episode", 0) > 0)
         server.kill()
-        server.start(port)
+        server.start()
         watcher.join(60)
         assert not watcher.is_alive()
     states = [happened.data["state"] for happened in seen if happened.kind == "state"]
@@ -49,7 +48,7 @@ def test_a_watcher_sees_everything_once_though_the_server_is_killed_meanwhile(tm
 
 
 def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
-    with served(tmp_path, "--workers", "1") as server, Client(server.url) as client:
+    with Served(tmp_path, "--workers", "1") as server, Client(server.url) as client:
         first = client.submit(json.dumps(CONFIG | ENDLESS))
         second = client.submit(json.dumps(TINY), "tiny.yaml")
         assert (second.name, second.state, second.runs) == ("icy", "queued", 2)
