@@ -15,7 +15,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -23,6 +22,7 @@ from blake3 import blake3
 
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
+from benchmarks.serving import Service, serving
 from runner.finding import find_run
 from runner.service.client import Client
 from runner.service.parcel import Parcel
@@ -48,9 +48,9 @@ def measure(quick: bool) -> list[Figure]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recording = _large_recording(folder / "mine", megabytes)
-        with _served(folder / "theirs") as (url, server):
-            figures = _speed(recording, folder, url, repetitions)
-            return [*figures, *_memory(recording, folder, url, server, steps)]
+        with serving(folder / "theirs") as service:
+            figures = _speed(recording, folder, service.url, repetitions)
+            return [*figures, *_memory(recording, folder, service, steps)]
 
 
 def _large_recording(folder: Path, megabytes: int) -> Parcel:
@@ -59,18 +59,6 @@ def _large_recording(folder: Path, megabytes: int) -> Parcel:
     sets += ["evaluation.every=1000000", "snapshots.every=1000000"]
     run(run_command("quick", str(folder), *sets))
     return Parcel.of(find_run("@latest", folder))
-
-
-@contextlib.contextmanager
-def _served(recordings: Path) -> Iterator[tuple[str, psutil.Process]]:
-    """Give the address of a service and its process."""
-    command = [sys.executable, "-m", "runner", "serve", "--port", "0", "--recordings", str(recordings)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-        assert process.stdout is not None
-        try:
-            yield process.stdout.readline().strip().rstrip("/"), psutil.Process(process.pid)
-        finally:
-            process.terminate()
 
 
 def _speed(parcel: Parcel, folder: Path, url: str, repetitions: int) -> list[Figure]:
@@ -116,10 +104,11 @@ def _digest(path: Path) -> str:
     return blake3().update_mmap(path).hexdigest()
 
 
-def _memory(parcel: Parcel, folder: Path, url: str, server: psutil.Process, steps: int) -> list[Figure]:
+def _memory(parcel: Parcel, folder: Path, service: Service, steps: int) -> list[Figure]:
     """Return the server's memory while much is asked of it, and see that nothing was lost."""
     shutil.rmtree(folder / "theirs" / parcel.run_id)
     own, children, over = [], [], threading.Event()
+    server = psutil.Process(service.process)
 
     def watch() -> None:
         while not over.wait(0.1):
@@ -130,7 +119,7 @@ def _memory(parcel: Parcel, folder: Path, url: str, server: psutil.Process, step
     watcher = threading.Thread(target=watch)
     watcher.start()
     begin = time.perf_counter()
-    told = _load(parcel, folder, url, steps)
+    told = _load(parcel, folder, service.url, steps)
     took = time.perf_counter() - begin
     over.set()
     watcher.join()
