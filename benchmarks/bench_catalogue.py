@@ -27,7 +27,7 @@ def measure(quick: bool) -> list[Figure]:
     """Return seconds of whole commands; clock and processor time, since others' work disturbs the clock."""
     repetitions = 3 if quick else 10
     with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {CACHE_VARIABLE: f"{folder}/cache", "COLUMNS": "120"}
+        environment = {CACHE_VARIABLE: f"{folder}/cache", "COLUMNS": "120"}
         small = one_run(Path(folder, "one"))
         described = many(small, Path(folder, "described"), LISTED, recordings=False)
         recorded = many(small, Path(folder, "recorded"), RECORDED, recordings=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import tempfile
 from pathlib import Path
@@ -21,7 +20,7 @@ LOADED: Final = "return performance.getEntriesByType('navigation')[0].loadEventE
 def measure(quick: bool) -> list[Figure]:
     """Return milliseconds from asking for the page until it is loaded, each time in a new browser."""
     with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {CACHE_VARIABLE: f"{folder}/cache"}
+        environment = {CACHE_VARIABLE: f"{folder}/cache"}
         recordings = many(one_run(Path(folder, "one")), Path(folder, "many"), LISTED, recordings=False)
         with serving(recordings, environment=environment) as service:
             asked(service, ["/api/v1/runs"], clients=1, seconds=0.5)
