@@ -94,15 +94,6 @@ def test_diff_says_where_loops_part(folder):
     assert "other spaces" in foreign.stdout
 
 
-def looped(folder: Path, name: str, tested: int = 0, logged: float = 0.0) -> None:
-    """Record a loop in whose evaluation and log others may differ."""
-    with runner.record(make("CartPole-v1"), folder, name=name) as env:
-        list(play(env, 50, 0))
-        with env.phase("eval"):
-            list(play(env, 50, tested))
-        env.log("loss", logged)
-
-
 def test_loops_that_have_their_seed_among_their_settings_are_one_group(tmp_path):
     for seed in (1, 2):
         for rate in (0.1, 0.2):
@@ -118,13 +109,23 @@ def test_loops_that_have_their_seed_among_their_settings_are_one_group(tmp_path)
     assert (tmp_path / "plot.svg").read_text().count("2 runs: ") == 2
 
 
-def test_diff_says_where_evaluations_of_loops_part(tmp_path):
-    looped(tmp_path, "one")
-    looped(tmp_path, "two", tested=1)
-    told = dualtaxi(tmp_path, "diff", "one", "two")
+def told_of_two(folder: Path, tested: int = 0, logged: float = 0.0) -> str:
+    """Record the loops `one` and `two`, of which two was tested and logged so; return their diff."""
+    for name, seed, value in (("one", 0, 0.0), ("two", tested, logged)):
+        with runner.record(make("CartPole-v1"), folder, name=name) as env:
+            list(play(env, 50, 0))
+            with env.phase("eval"):
+                list(play(env, 50, seed))
+            env.log("loss", value)
+    told = dualtaxi(folder, "diff", "one", "two")
     assert told.exit_code == 1
-    assert "Training took the same steps, evaluation did not." in told.stdout
-    assert "They part in the reset before evaluation step 0" in told.stdout
+    return str(told.stdout)
+
+
+def test_diff_says_where_evaluations_of_loops_part(tmp_path):
+    told = told_of_two(tmp_path, tested=1)
+    assert "Training took the same steps, evaluation did not." in told
+    assert "They part in the reset before evaluation step 0" in told
     parted = json.loads(dualtaxi(tmp_path, "diff", "one", "two", "--json").stdout)
     assert (parted["parting"], parted["loop_evaluation"]["step"]) == (None, 0)
     page = tmp_path / "diff.html"
@@ -133,11 +134,8 @@ def test_diff_says_where_evaluations_of_loops_part(tmp_path):
 
 
 def test_diff_says_what_differs_between_loops_of_the_same_steps(tmp_path):
-    looped(tmp_path, "one")
-    looped(tmp_path, "two", logged=1.0)
-    told = dualtaxi(tmp_path, "diff", "one", "two")
-    assert told.exit_code == 1
-    assert "all steps are the same; what differs is in /scalar." in told.stdout
+    told = told_of_two(tmp_path, logged=1.0)
+    assert "all steps are the same; what differs is in /scalar." in told
 
 
 class Pictures(gymnasium.Env[Any, Any]):
