@@ -2,9 +2,7 @@
 
 import math
 import sys
-from typing import ClassVar
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -29,22 +27,11 @@ def run(tmp_path_factory):
     return runner.run(CONFIG, recordings=tmp_path_factory.mktemp("framed"))
 
 
-class Steps(gymnasium.Env):
-    """Three states in a row; one action leads on, the other stays."""
-
-    P: ClassVar = {s: {a: [(1.0, min(s + a, 2), -1.0, s + a == 2)] for a in (0, 1)} for s in range(3)}
-    initial_state_distrib = np.array([1.0, 0, 0])
-    observation_space = gymnasium.spaces.Discrete(3)
-    action_space = gymnasium.spaces.Discrete(2)
-
-
 @pytest.fixture(scope="module")
-def steps_run(tmp_path_factory):
+def corridor_run(tmp_path_factory):
     """A run of an environment that has neither events nor agents, nor says what success is."""
-    if "Steps-v0" not in gymnasium.registry:
-        gymnasium.register("Steps-v0", Steps, max_episode_steps=10)
-    config = CONFIG | {"env": {"id": "Steps-v0"}, "mode": "cooperative"}
-    return runner.run(config, recordings=tmp_path_factory.mktemp("steps"))
+    config = CONFIG | {"env": {"id": "tests.runner.corridor:Corridor-v0"}, "mode": "cooperative"}
+    return runner.run(config, recordings=tmp_path_factory.mktemp("corridor"))
 
 
 def test_evaluations(run):
@@ -116,10 +103,10 @@ def test_a_run_may_be_a_path_or_open(run):
         assert recording.finished  # and still open
 
 
-def test_where_success_is_unknown(steps_run):
-    assert frames.evaluations(steps_run)["finish_percent"].isna().all()
-    assert {"return.agent"} <= set(frames.episodes(steps_run))
-    with runner.open_recording(steps_run.recording) as recording:
+def test_where_success_is_unknown(corridor_run):
+    assert frames.evaluations(corridor_run)["finish_percent"].isna().all()
+    assert {"return.agent"} <= set(frames.episodes(corridor_run))
+    with runner.open_recording(corridor_run.recording) as recording:
         (first, *_) = frames.evaluation_records(recording)
     assert (first["finish_percent"], first["successes"], first["events"]) == (None, None, {})
 

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import ClassVar
 
-import gymnasium
-import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
@@ -25,25 +22,6 @@ evaluation: {every: 10, trials: 5}
 log: {every_steps: 200, window: 100}
 """
 """Done in a blink: 30 episodes of at most 40 steps, evaluations after 0, 10, 20 and 30."""
-
-
-class Corridor(gymnasium.Env):
-    """Five cells in a row, the last one the end; it has a table, and says nothing of what it means."""
-
-    P: ClassVar = {
-        state: {
-            action: [(1.0, next_state, -1.0, next_state == 4)]
-            for action, next_state in ((0, max(state - 1, 0)), (1, min(state + 1, 4)))
-        }
-        for state in range(5)
-    }
-    initial_state_distrib = np.array([1.0, 0, 0, 0, 0])
-    observation_space = gymnasium.spaces.Discrete(5)
-    action_space = gymnasium.spaces.Discrete(2)
-
-
-if "Corridor-v0" not in gymnasium.registry:
-    gymnasium.register("Corridor-v0", Corridor, max_episode_steps=40)
 
 
 class Command:

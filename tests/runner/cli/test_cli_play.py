@@ -90,7 +90,8 @@ def test_without_evaluations_the_last_episode_is_played(command, tiny):
 
 
 def test_without_a_scene_states_are_numbers(command, tiny):
-    command("run", tiny, "--set", "env={id: Corridor-v0}", "--set", "mode=cooperative")
+    env = "env={id: tests.runner.corridor:Corridor-v0}"
+    command("run", tiny, "--set", env, "--set", "mode=cooperative")
     frames = command("play", "@latest", "--episode", 0).stdout
     assert "\nstate 0\n" in frames
     assert "\naction " in frames

@@ -74,9 +74,9 @@ def test_what_it_tells_to_type_next_works(command, tiny, settings):
 
 
 def test_what_has_no_episode_is_not_said_to_be_played(command, tiny):
-    assert (
-        "dualtaxi play" not in command("run", tiny, "--set", "evaluation=null", "--set", "episodes=0").stdout
-    )
+    said = command("run", tiny, "--set", "evaluation=null", "--set", "episodes=0").stdout
+    assert "dualtaxi show" in said
+    assert "dualtaxi play" not in said
 
 
 def test_an_environment_that_cannot_be_used_is_told_before_any_estimate(command, tiny):
@@ -163,7 +163,8 @@ def test_without_evaluation(command, tiny):
 
 
 def test_where_success_is_unknown_it_is_null(command, tiny):
-    words = ("run", tiny, "--set", "env={id: Corridor-v0}", "--set", "mode=cooperative")
+    env = "env={id: tests.runner.corridor:Corridor-v0}"
+    words = ("run", tiny, "--set", env, "--set", "mode=cooperative")
     assert command.json(*words)["last_evaluation"]["finish_percent"] is None
     assert "–" in command(*words).stdout
 

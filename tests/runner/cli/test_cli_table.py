@@ -29,7 +29,7 @@ def test_the_competitive_table_has_the_reward_of_each(command):
 
 
 def test_json_is_a_line_for_each_row(command):
-    lines = command("table", "--env", "Corridor-v0", "--json").stdout.splitlines()
+    lines = command("table", "--env", "tests.runner.corridor:Corridor-v0", "--json").stdout.splitlines()
     assert len(lines) == 5 * 2
     assert json.loads(lines[7]) == {
         "state": "state 3",

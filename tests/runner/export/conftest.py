@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
-import gymnasium
-import numpy as np
 import pytest
 
 import runner
@@ -19,26 +15,13 @@ WORLDS = {
     "taxi": {"env": {"id": "Taxi-v4"}},
     "lake": {"env": {"id": "FrozenLake-v1"}},
     "cliff": {"env": {"id": "CliffWalking-v1", "kwargs": {"max_episode_steps": 60}}},
-    "stairs": {"env": {"id": "Stairs-v0"}},
+    "corridor": {"env": {"id": "tests.runner.corridor:Corridor-v0"}},
 }
-
-
-class Stairs(gymnasium.Env):
-    """Four states, one action up and one down; it says nothing of what it means."""
-
-    P: ClassVar = {
-        s: {a: [(1.0, min(max(s + 2 * a - 1, 0), 3), -1.0, s + a == 4)] for a in (0, 1)} for s in range(4)
-    }
-    initial_state_distrib = np.array([1.0, 0, 0, 0])
-    observation_space = gymnasium.spaces.Discrete(4)
-    action_space = gymnasium.spaces.Discrete(2)
 
 
 @pytest.fixture(scope="session")
 def pictured(tmp_path_factory):
     """Return a function that gives the run of a world, made when first asked for."""
-    if "Stairs-v0" not in gymnasium.registry:
-        gymnasium.register("Stairs-v0", Stairs, max_episode_steps=25)
     folder, made = tmp_path_factory.mktemp("pictured"), {}
 
     def run_of(world, **changes):

@@ -32,7 +32,7 @@ def text_of(page):
     return re.sub(r"\s+", " ", html.unescape(re.sub(r"<[^>]*>", "", page)))
 
 
-@pytest.mark.parametrize("world", ["taxi", "cliff", "stairs"])
+@pytest.mark.parametrize("world", ["taxi", "cliff", "corridor"])
 def test_the_page_of_another_discount_shows_where_and_why_the_runs_part(world, pictured):
     difference, page = page_of(pictured(world), pictured(world, discount=0.7))
     check_page(page)
@@ -41,7 +41,7 @@ def test_the_page_of_another_discount_shows_where_and_why_the_runs_part(world, p
     assert f"In training episode {parting.episode:,}, at t = {parting.t}" in text
     assert "Why that update differs: the discount was" in text
     assert text.count("\N{BLACK LEFT-POINTING TRIANGLE} greedy") >= 2
-    drawn = world != "stairs"
+    drawn = world != "corridor"
     assert ("Before, in both: " in page) == drawn
     assert ('aria-label="Largest difference of' in page) == drawn
     assert "Difference of the Q-tables over training episodes" in page
@@ -54,7 +54,7 @@ def test_the_page_of_another_seed_shows_where_the_runs_part(world, pictured):
     assert f"at t = {difference.parting.t}" in text_of(page)
     starts = difference.cause.kind == "start"
     drawn = page.count("B, where it stood: " if starts else "B, after its step: ")
-    assert (drawn > 0) == (world != "stairs")
+    assert (drawn > 0) == (world != "corridor")
 
 
 def test_a_page_of_runs_that_hardly_have_anything_in_common_is_whole(pictured):

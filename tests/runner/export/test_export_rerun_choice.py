@@ -83,7 +83,7 @@ class TestChoice:
 
 
 def test_an_environment_without_a_scene_is_named(pictured):
-    with open_recording(pictured("stairs").recording) as recording:
+    with open_recording(pictured("corridor").recording) as recording:
         assert "no scene: state and action" in select(recording, Request()).warnings[0]
 
 

@@ -47,7 +47,7 @@ class Exported:
         return np.concatenate(list(self.recording.blocks(TOPICS[phase])))
 
 
-@pytest.fixture(scope="module", params=["taxis", "rivals", "taxi", "lake", "cliff", "stairs"])
+@pytest.fixture(scope="module", params=["taxis", "rivals", "taxi", "lake", "cliff", "corridor"])
 def exported(request, pictured, tmp_path_factory):
     with open_recording(pictured(request.param).recording) as recording:
         yield Exported(recording, tmp_path_factory.mktemp("rerun") / "run.rrd")
