@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -35,7 +34,7 @@ from runner.recording.telling import (
     write_description,
     write_result,
 )
-from runner.recording.writer import RecordingFile
+from runner.recording.writer import RecordingFile, create_recording
 from runner.runs import Run
 
 REPORT_SECONDS: Final = 0.1
@@ -90,7 +89,7 @@ def run_job(
         mdp = mdp or load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
         job, run = settle(job, run)
         learner = Learner(job.config, mdp, job.seed, configured_tables(job, run, mdp))
-        file = _create(run.folder / runs.RECORDING_FILE)
+        file = create_recording(run.folder / runs.RECORDING_FILE)
     with file:
         with _failing(run):
             made_by = provenance()
@@ -135,15 +134,6 @@ def _tell_what_next(run: Run, error: BaseException) -> None:
     """Add to the error of a full disk how to go on with what was recorded."""
     if isinstance(error, StorageError) and run.recording.exists():
         error.add_note(f"`dualtaxi resume {run.run_id}` goes on when there is room.")
-
-
-def _create(path: Path) -> RecordingFile:
-    try:
-        return RecordingFile(path)
-    except OSError as error:
-        raise StorageError(
-            f"{path}: cannot be created ({error.strerror}); choose another --recordings."
-        ) from error
 
 
 class Session:

@@ -143,7 +143,7 @@ def _lost(recording: Recording) -> Verification | None:
 
 def _compare(recording: Recording, rerun: bool, report: Report) -> Verification:
     if recording.kind != "job":
-        return compare_loop(recording)
+        return _compare_loop(recording)
     config = from_mapping(recording.config)
     job = Job(config, int(recording.run["seed"]))
     if recording.run["job"] != job.identity:
@@ -180,7 +180,7 @@ def _tells_its_digest(recording: Recording) -> bool:
     return bool(recording.result.get("content_digest") and recording.result.get("steps_recorded"))
 
 
-def compare_loop(recording: Recording) -> Verification:
+def _compare_loop(recording: Recording) -> Verification:
     """Verify a recording of somebody's own loop, which cannot be done again here.
 
     Compared are the numbers of its messages, its steps with the environment's outcomes where it is

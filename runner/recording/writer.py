@@ -254,6 +254,20 @@ class RecordingFile:
         )
 
 
+def create_recording(path: Path, topics: Sequence[Topic] = TOPICS) -> RecordingFile:
+    """Return the file of a new recording with these topics.
+
+    Raises:
+        StorageError: it exists, or cannot be created.
+    """
+    try:
+        return RecordingFile(path, topics)
+    except OSError as error:
+        raise StorageError(
+            f"{path}: cannot be created ({error.strerror}); choose another --recordings."
+        ) from error
+
+
 def schemas_and_channels(topics: Sequence[Topic]) -> tuple[list[Schema], list[Channel]]:
     """Return the schema and channel records of a recording with these topics."""
     used = {topic.message for topic in topics}

@@ -8,7 +8,6 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -30,7 +29,7 @@ from runner.recording.telling import (
     write_description,
     write_result,
 )
-from runner.recording.writer import RecordingFile
+from runner.recording.writer import create_recording
 from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
 from runner.service.outbox import Follower, connected, is_server, outbox_folder
 from runner.wrappers.described import Described, as_json
@@ -91,7 +90,7 @@ class Loop(Generic[R]):
         self._topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
         path = self.run.folder / RECORDING_FILE
         with unless_empty(self.run):
-            self._file = _created(path, described.kind)
+            self._file = create_recording(path, schema.KINDS[described.kind])
         try:
             facts = self._describe(config)
         except BaseException as error:
@@ -347,13 +346,6 @@ class Loop(Generic[R]):
         self._recorder.flush()
         for rows in self._rows.values():
             rows.open()
-
-
-def _created(path: Path, kind: str) -> RecordingFile:
-    try:
-        return RecordingFile(path, schema.KINDS[kind])
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be created ({error.strerror}).") from error
 
 
 def _environment(described: Described) -> Attachments:

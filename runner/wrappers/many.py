@@ -85,7 +85,7 @@ def record_vector(
 
     Args:
         envs: a vector environment.
-        recordings: as all others, as for `record`.
+        recordings: as for `record`, like what follows.
         name: what the run is called.
         seed: what the run is listed with.
         config: your own settings.
@@ -176,7 +176,7 @@ def record_parallel(
 
     Args:
         env: a `pettingzoo.ParallelEnv`; `pettingzoo.utils.aec_to_parallel` makes one of a game in turns.
-        recordings: as all others, as for `record`.
+        recordings: as for `record`, like what follows.
         name: what the run is called.
         seed: what the run is listed with.
         config: your own settings.
