@@ -37,7 +37,6 @@ from runner.wrappers.plan import Plan
 from runner.wrappers.values import lone_number
 
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
-PHASES: Final = ("train", "eval")
 
 
 class Putting(Protocol):
@@ -145,8 +144,8 @@ class Loop(Generic[R]):
         Raises:
             ConfigError: there is no such phase.
         """
-        if phase not in PHASES:
-            raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(PHASES)}")
+        if phase not in schema.PHASES:
+            raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
         if phase not in self._rows:
             with self.lock:
                 self._rows[phase] = self._make_rows(self._recorder, phase)

@@ -11,9 +11,10 @@ from typing import Any, Generic, Literal, Self
 import gymnasium
 
 from runner.errors import ConfigError
+from runner.recording import schema
 from runner.runs import Run
 from runner.wrappers.described import describe
-from runner.wrappers.loop import PHASES, Loop, R
+from runner.wrappers.loop import Loop, R
 from runner.wrappers.plan import plan_of
 from runner.wrappers.rows import ROWS, Rows
 
@@ -216,8 +217,8 @@ def record(
             f"found {type(env).__name__}, expected a Gymnasium environment, such as gymnasium.make gives; "
             "record_vector is for vector environments, record_parallel for PettingZoo's."
         )
-    if phase not in PHASES:
-        raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(PHASES)}")
+    if phase not in schema.PHASES:
+        raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
     if into is not None:
         if recordings is not None or name is not None or config or info or frames_every or packing:
             raise ConfigError(

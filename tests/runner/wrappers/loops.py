@@ -12,7 +12,6 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 import runner
-from runner.recording.reader import Recording, open_recording
 
 KWARGS = {"FrozenLake-v1": {"is_slippery": True}}
 
@@ -94,10 +93,6 @@ def recorded(folder: Path, name: str, steps: int, **options: Any) -> tuple[Path,
     with runner.record(make(name), folder, **options) as env:
         seen = list(play(env, steps))
     return env.run.recording, seen
-
-
-def opened(path: Path) -> Recording:
-    return open_recording(path)
 
 
 class Leaving:

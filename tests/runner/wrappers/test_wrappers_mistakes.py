@@ -14,9 +14,10 @@ from gymnasium.vector import SyncVectorEnv
 
 import runner
 from runner.errors import RunnerError, StorageError
+from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
 from runner.runs import list_runs
-from tests.runner.wrappers.loops import Rooms, make, opened
+from tests.runner.wrappers.loops import Rooms, make
 
 
 def pole() -> gymnasium.Env[Any, Any]:
@@ -120,7 +121,7 @@ def test_a_reward_may_stand_in_an_array_of_one(reward, tmp_path):
     with runner.record(Paid(reward), tmp_path) as rec:
         rec.reset()
         rec.step(np.zeros(2, np.float32))
-    with opened(rec.run.recording) as recording:
+    with open_recording(rec.run.recording) as recording:
         assert next(recording.transitions("train"))["rewards"] == 1
 
 
@@ -167,7 +168,7 @@ def test_a_forked_process_leaves_the_recording_alone(tmp_path):
         os.waitpid(child, 0)
         rec.step(1)
     assert rec.run.summary["train_steps"] == 2
-    with opened(rec.run.recording) as recording:
+    with open_recording(rec.run.recording) as recording:
         assert len(list(recording.transitions("train"))) == 2
 
 
@@ -197,7 +198,7 @@ def test_what_render_returns_is_a_picture_or_refused(tmp_path, monkeypatch, pict
 def test_a_lone_number_is_logged_however_it_comes(tmp_path, value):
     with runner.record(pole(), tmp_path) as rec:
         rec.log("loss", value)
-    with opened(rec.run.recording) as recording:
+    with open_recording(rec.run.recording) as recording:
         (scalar,) = recording.decoded(recording.topic("/scalar"))
     assert scalar["value"] == 1.5
 
