@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from runner.analysis.outcomes import events_of
 from runner.cli.drawing import Drawing
 from runner.cli.output import number
 from runner.frames import agents_of
@@ -34,6 +35,7 @@ class Episode:
     def __init__(self, recording: Recording, phase: str, number: int, title: str) -> None:
         self._mdp = recording.mdp
         self._records = recording.episode_steps(phase, number)
+        self._events = events_of(self._mdp, self._records)
         self._agents = agents_of(recording)
         self._title = title
         self._drawing = Drawing(self._mdp.scene) if self._mdp.scene is not None else None
@@ -41,7 +43,7 @@ class Episode:
 
     def steps(self) -> Iterator[dict[str, Any]]:
         """Yield each step as JSON can hold it, numbers and words."""
-        for record in self._records:
+        for record, events in zip(self._records, self._events.tolist(), strict=True):
             state, action, next_state = (int(record[name]) for name in ("state", "action", "next_state"))
             yield {
                 "t": int(record["t"]),
@@ -52,7 +54,7 @@ class Episode:
                 "next_state": next_state,
                 "next_state_in_words": self._states[next_state],
                 "rewards": dict(zip(self._agents, record["rewards"].tolist(), strict=True)),
-                "events": self._events(record),
+                "events": [name for bit, name in enumerate(self._mdp.event_names) if events >> bit & 1],
                 "explored": [
                     agent for i, agent in enumerate(self._agents) if int(record["explored"]) >> i & 1
                 ],
@@ -90,16 +92,6 @@ class Episode:
         happened = [event_in_words(name) for name in step["events"]]
         happened += ["the end"] if step["terminated"] else ["the step limit"] if step["truncated"] else []
         return [f"{step['action_in_words']}{chosen}", paid, ", ".join(happened)]
-
-    def _events(self, record: np.void) -> list[str]:
-        """Return the names of what happened in a step: the environment's outcome that it took."""
-        mdp, state, action = self._mdp, int(record["state"]), int(record["action"])
-        outcomes = mdp.next_state[state, action] == record["next_state"]
-        outcomes &= (mdp.probability[state, action] > 0) & (
-            mdp.terminated[state, action] == record["terminated"]
-        )
-        bits = int(mdp.events[state, action, int(outcomes.argmax())]) if outcomes.any() else 0
-        return [name for i, name in enumerate(mdp.event_names) if bits >> i & 1]
 
 
 def _figures(values: list[float]) -> str:

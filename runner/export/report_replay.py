@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_after, evaluations_of
+from runner.analysis.outcomes import events_of
 from runner.analysis.tables import TableReplay, check_steps, tables_at
 from runner.errors import RecordingError
 from runner.export.contents import require_steps
@@ -225,7 +226,7 @@ def _episode(
         states=np.append(shown["state"], shown["next_state"][-1]).astype(np.int64),
         actions=shown["action"].astype(np.int64),
         rewards=shown["rewards"].astype(np.float64),
-        events=events_of(mdp, shown),
+        events=events_of(mdp, shown).astype(np.int64),
         explored=shown["explored"].astype(np.int64),
         values=_values(recording, shown, table_step),
         first=part.start,
@@ -240,22 +241,6 @@ def _end(recording: Recording, phase: str, number: int, last: np.void) -> str:
     if len(record) and record[0]["success"]:
         return "success"
     return "terminated" if last["terminated"] else "truncated"
-
-
-def events_of(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.int64]:
-    """Return the events of recorded steps, a bit mask each: those of the outcome that was recorded."""
-    state, action = steps["state"], steps["action"]
-    alike = mdp.next_state[state, action] == steps["next_state"][:, np.newaxis]
-    alike &= mdp.terminated[state, action] == steps["terminated"][:, np.newaxis]
-    alike &= mdp.probability[state, action] > 0
-    rewards = mdp.rewards[state, action].sum(axis=-1)
-    recorded = steps["rewards"].sum(axis=-1)[:, np.newaxis]
-    learners = steps["rewards"].shape[1]
-    if mdp.rewards.shape[-1] == 1 and learners > 1:  # every learner was paid the shared reward
-        rewards = rewards * learners
-    alike &= np.isclose(rewards, recorded)
-    outcome = alike.argmax(axis=1)
-    return np.asarray(mdp.events[state, action, outcome].astype(np.int64))
 
 
 def _values(

@@ -8,8 +8,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from runner.analysis.outcomes import events_of
 from runner.export.rerun.columns import Batch, Sender, instances, texts
-from runner.export.rerun.scene import events_of_steps
 from runner.mdp import Mdp
 from runner.words import events_in_words, states_in_words
 
@@ -32,7 +32,7 @@ class EventWriter(Sender):
     def write(self, batch: Batch) -> None:
         """Send the events of a batch; an illegal action is none, there are too many at first."""
         records = batch.records
-        masks = events_of_steps(self._mdp, records) & self._told
+        masks = events_of(self._mdp, records) & self._told
         begins = np.flatnonzero(records["t"] == 0)
         happens = np.flatnonzero((masks != 0) | records["truncated"] | records["terminated"])
         rows = np.concatenate((begins, happens))

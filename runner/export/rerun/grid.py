@@ -8,6 +8,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from runner.analysis.outcomes import events_of
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, ink, instances, place, rgba, strips, texts
 from runner.export.rerun.scene import (
@@ -16,7 +17,6 @@ from runner.export.rerun.scene import (
     TRAIL_STEPS,
     Marks,
     Scene,
-    events_of_steps,
 )
 
 TITLE_Y: Final = -0.62
@@ -90,7 +90,7 @@ class GridWriter(Sender):
     def _classes(self, records: NDArray[np.void], state: NDArray[np.int64]) -> NDArray[np.uint16]:
         """Return the label of each point of each step, by number."""
         scene, words = self._scene, self._words
-        events = events_of_steps(scene.mdp, records)
+        events = events_of(scene.mdp, records)
         waits = np.arange(len(scene.passengers)) + words.passenger
         parts = [
             self._marks.of(scene.carried[state], events) + np.uint16(words.mark),

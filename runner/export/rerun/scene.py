@@ -179,19 +179,6 @@ def own_actions(mdp: Mdp) -> NDArray[np.int64]:
     return np.stack(np.unravel_index(joint, mdp.action_counts), axis=1).astype(np.int64)
 
 
-def events_of_steps(mdp: Mdp, block: NDArray[np.void]) -> NDArray[np.uint32]:
-    """Return the event bits of each recorded step, from its state, action and next state."""
-    if not mdp.event_names:
-        return np.zeros(len(block), np.uint32)
-    state, action = block["state"].astype(np.int64), block["action"].astype(np.int64)
-    outcome = 0
-    if mdp.next_state.shape[2] > 1:
-        fits = mdp.next_state[state, action] == block["next_state"][:, None].astype(np.int64)
-        fits &= mdp.probability[state, action] > 0
-        outcome = np.argmax(fits, axis=1)
-    return np.asarray(mdp.events[state, action, outcome])
-
-
 @dataclass(frozen=True, eq=False)
 class Marks:
     """The label of each mover in the grid, by whether it carries someone and what just happened to it."""

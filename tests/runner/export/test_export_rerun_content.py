@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from runner.analysis.outcomes import events_of
 from runner.analysis.tables import TableReplay, tables_at
-from runner.export.rerun.scene import events_of_steps, marks_of, own_actions, scene_of
+from runner.export.rerun.scene import marks_of, own_actions, scene_of
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import viewer_program
 from runner.export.rerun.writing import Source, export
@@ -164,7 +165,7 @@ class TestSteps:
         assert sum("time-out" in text for text in said) == (steps["truncated"] & ~steps["terminated"]).sum()
         if "collision" in mdp.event_names:
             bit = mdp.event_names.index("collision")
-            happened = events_of_steps(mdp, steps) >> bit & 1
+            happened = events_of(mdp, steps) >> bit & 1
             assert sum(text.startswith("collision") for text in said) == happened.sum()
         if phase == "eval":
             results = len(exported.recording.metrics("eval"))
@@ -176,7 +177,7 @@ def test_the_marks_say_what_went_wrong(exported):
     scene = scene_of(mdp)
     if scene is None or "collision" not in mdp.event_names:
         return
-    marks, events = marks_of(scene), events_of_steps(mdp, steps)
+    marks, events = marks_of(scene), events_of(mdp, steps)
     said = np.array(marks.labels)[marks.of(scene.carried[steps["state"]], events)]
     illegal = events >> mdp.event_names.index("taxi_2.illegal_pickup") & 1
     assert [("illegal pickup" in label) for label in said[:, 1]] == illegal.astype(bool).tolist()
