@@ -145,9 +145,8 @@ def lists(archetype: Any, lengths: NDArray[np.int64], **parts: NDArray[Any]) -> 
     offsets = pa.array(np.concatenate(([0], np.cumsum(lengths))).astype(np.int32))
     columns = []
     for name, flat in parts.items():
-        items = pa.FixedSizeListArray.from_arrays(flat.reshape(-1), type=_POINT) if flat.ndim == 2 else flat
         descriptor = getattr(archetype, f"descriptor_{name}")()
-        columns.append(_Column(descriptor, pa.ListArray.from_arrays(offsets, pa.array(items))))
+        columns.append(_Column(descriptor, pa.ListArray.from_arrays(offsets, _items(flat))))
     return columns
 
 
@@ -181,6 +180,13 @@ def images(values: NDArray[np.float32]) -> list[Any]:
 def _aligned(values: NDArray[Any]) -> NDArray[Any]:
     """Return values as Arrow wants them in memory; a lone record's field is contiguous but not aligned."""
     return np.require(values, requirements=["C", "A"])
+
+
+def _items(flat: NDArray[Any]) -> pa.Array:
+    """Return all instances one after another: text or numbers [n], or points [n, 2]."""
+    return (
+        pa.FixedSizeListArray.from_arrays(flat.reshape(-1), type=_POINT) if flat.ndim == 2 else pa.array(flat)
+    )
 
 
 def _offsets(count: int, size: int) -> pa.Array:

@@ -152,7 +152,7 @@ class LoopExporter:
     def _send_episodes(self, phase: str) -> None:
         topic = schema.PHASES[phase][1]
         sender = Sender(self._stream, f"{self._root}/{phase}")
-        names = [f"{phase} {agent}" if len(self._learners) > 1 else phase for agent in self._learners]
+        names = self._names(phase)
         for k, block in enumerate(self._recording.blocks(topic)):
             if not k:
                 colours = None if len(names) > 1 else _COLOURS[phase]
@@ -161,6 +161,10 @@ class LoopExporter:
             times = _times(block["log_time"], block["episode"])
             sender.send("return", times, scalars(block["returns"]))
             sender.send("length", times, scalars(block["length"].astype(np.float64)[:, np.newaxis]))
+
+    def _names(self, phase: str) -> list[str]:
+        """Return the name of each learner's series in a phase."""
+        return [f"{phase} {agent}" for agent in self._learners] if len(self._learners) > 1 else [phase]
 
     def _send_logged(self) -> None:
         """Send the scalars, some thousands of a name at a time."""
@@ -210,7 +214,7 @@ class LoopExporter:
         """Send steps of the first environment, in all their views."""
         recording, sender = self._recording, Sender(self._stream, f"{self._root}/{phase}")
         lines, grid = self._lines(), self._grid(phase)
-        names = [f"{phase} {agent}" if len(self._learners) > 1 else phase for agent in self._learners]
+        names = self._names(phase)
         colours = None if len(names) > 1 else _COLOURS[phase]
         dressed = False
         for steps in self._batches(recording.topic(f"/{phase}/step"), spans):
