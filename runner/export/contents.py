@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
 
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
+
+_PHASES: Final = {"train": "training", "eval": "evaluation"}
 
 
 def shortcomings(recording: Recording) -> list[str]:
@@ -45,6 +47,24 @@ def why_no_steps(recording: Recording) -> str:
         run_id = recording.run["run_id"]
         return f"they were left out (recording.steps: none); `dualtaxi rerecord {run_id}` records them"
     return "it ended before one was recorded"
+
+
+def whole_ranges(
+    ranges: Iterable[tuple[int, int | None]], count: int, phase: str, where: str
+) -> list[tuple[int, int]]:
+    """Return ranges of episodes, the second number not included, with an end where none is said.
+
+    Raises:
+        RecordingError: one is empty, or goes beyond the `count` that there are; it begins with `where`.
+    """
+    whole = [(start, count if stop is None else stop) for start, stop in ranges]
+    for start, stop in whole:
+        if not start < stop <= count:
+            raise RecordingError(
+                f"{where}: found no {_PHASES[phase]} episodes {start}:{stop}; there are {count:,}, from 0. "
+                "Ranges are START:STOP, STOP not included."
+            )
+    return whole
 
 
 def flat_text(config: Mapping[str, Any]) -> dict[str, str]:

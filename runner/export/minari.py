@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import MissingExtra, RecordingError
+from runner.export.contents import whole_ranges
 from runner.export.minari_loops import Episode, loop_episodes, space_of
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -82,7 +83,8 @@ def write_dataset(
     from minari.dataset.minari_storage import MinariStorage
 
     folder = folder.absolute()  # Minari looks for a relative one within itself
-    wanted = _checked(recording, phase, ranges)
+    ended = recording.count(recording.topic(f"/{phase}/episode"))
+    wanted = tuple(whole_ranges(ranges, ended, phase, str(recording.path))) or ((0, None),)
     observations, actions, spec, notes = _spaces(recording)
     (folder / "data").mkdir()
     storage = MinariStorage.new(
@@ -151,17 +153,6 @@ def episodes_of(recording: Recording, phase: str, ranges: Ranges) -> Iterator[ND
             ends = np.flatnonzero(steps["terminated"] | steps["truncated"]) + 1
             *whole, rest = np.split(steps, ends)
             yield from whole
-
-
-def _checked(recording: Recording, phase: str, ranges: Ranges) -> Ranges:
-    ended = recording.count(recording.topic(f"/{phase}/episode"))
-    for start, stop in ranges:
-        if not start < (ended if stop is None else stop) <= ended:
-            raise RecordingError(
-                f"{recording.path}: found no {phase} episodes {start}:{'' if stop is None else stop}; "
-                f"there are {ended:,}, from 0. Ranges are START:STOP, STOP not included."
-            )
-    return ranges or ((0, None),)
 
 
 def _buffer(steps: NDArray[np.void]) -> Any:

@@ -20,6 +20,7 @@ import pyarrow.parquet
 
 from runner.archive import layout
 from runner.archive.batches import Batches
+from runner.export.contents import whole_ranges
 from runner.export.scalars import measures
 from runner.recording.reader import Recording
 
@@ -73,10 +74,13 @@ def write_tables(
         report: called with the steps written so far.
 
     Raises:
-        RecordingError: the recording is damaged.
+        RecordingError: the recording is damaged, or has no such episodes.
         OSError: the folder cannot be written.
     """
     ending = f".{form}.gz" if gz else f".{form}"
+    if choice.episodes:
+        phase = choice.phase or "train"
+        whole_ranges(choice.episodes, _episodes(recording, phase), phase, str(recording.path))
     reading = Batches(recording)
     own = {table.name: table for table in reading.shape.tables}
     tables = {
@@ -88,6 +92,13 @@ def write_tables(
             folder / (name + ending), form, gz, batches, report if name == "steps" else lambda _: None
         )
     return {name: count for name, count in rows.items() if count}
+
+
+def _episodes(recording: Recording, phase: str) -> int:
+    """Return how many episodes of a phase have steps, one that never ended among them."""
+    ended = recording.count(recording.topic(f"/{phase}/episode"))
+    taken = int(recording.episodes(phase, ended - 1, ended)[0]["last_step"]) + 1 if ended else 0
+    return ended + (recording.count(recording.topic(f"/{phase}/step")) > taken)
 
 
 def metric_batches(recording: Recording) -> Iterator[pa.RecordBatch]:

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import Evaluation, evaluation_after
-from runner.errors import RecordingError
-from runner.export.contents import has_steps, require_steps, shortcomings, why_no_steps
+from runner.export.contents import has_steps, require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
 
@@ -169,14 +168,8 @@ def _training_episodes(recording: Recording, request: Request, train: Episodes) 
     numbers = [_spread(train)] if request.is_default else []
     if request.every:
         numbers.append(np.arange(0, train.count, request.every))
-    for start, stop in request.episodes:
-        end = train.count if stop is None else stop
-        if start >= end or end > train.count:
-            raise RecordingError(
-                f"{recording.path}: found no training episodes {start}:{end}; "
-                f"there are {train.count:,}, from 0. Ranges are START:STOP, STOP not included."
-            )
-        numbers.append(np.arange(start, end))
+    ranges = whole_ranges(request.episodes, train.count, "train", str(recording.path))
+    numbers += [np.arange(start, stop) for start, stop in ranges]
     return np.unique(np.concatenate(numbers)) if numbers else np.empty(0, np.int64)
 
 

@@ -122,6 +122,13 @@ def assert_measures(run, metrics):
     assert named["events/taxi_1.drop_off"] + named["events/taxi_2.drop_off"] == last["successes"]
 
 
+@pytest.mark.parametrize("form", ["csv", "parquet", "minari"])
+@pytest.mark.parametrize("ranges", ["9999:", "0:9999", "5:3"])
+def test_episodes_that_are_not_there_are_refused(export, taxis, form, ranges):
+    assert "found no training episodes" in export(form, taxis.recording, "--episodes", ranges, code=2).stderr
+    assert not [path for path in Path().rglob("*") if path.is_file()]
+
+
 def test_tables_of_chosen_episodes(export, taxis):
     export("csv", taxis.recording, "-o", "out", "--episodes", "3:5,58:")
     steps = read_table(Path("out/steps.csv")).to_pandas()
