@@ -34,7 +34,7 @@ def _seeds_kind(value: object) -> str | None:
     return "array" if isinstance(value, list | tuple) else None
 
 
-_SeveralSeeds = Annotated[
+SeveralSeeds = Annotated[
     Annotated[Seeds, Tag("array")] | Annotated[SeedRange, Tag("SeedRange")], Discriminator(_seeds_kind)
 ]
 
@@ -78,6 +78,6 @@ class ExperimentFile(Settings):
     seed: Annotated[Seed | None, _given(Seed)] = Field(
         default=None, description="What every random draw follows from; 0 unless given. One run."
     )
-    seeds: Annotated[_SeveralSeeds | None, _given(_SeveralSeeds)] = Field(
+    seeds: Annotated[SeveralSeeds | None, _given(SeveralSeeds)] = Field(
         default=None, description="Several seeds instead of one: a list, or the first and how many."
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -12,7 +11,7 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from runner.config import ConfigError, ExperimentConfig, from_mapping, load
+from runner.config import ConfigError, ExperimentConfig, load
 from runner.config.document import Document, Problem, read_yaml
 from runner.config.loading import experiment_in, read_text
 from runner.config.overrides import put
@@ -63,15 +62,6 @@ def from_values(values: Mapping[str, Any]) -> Sweep:
         ConfigError: they do not.
     """
     return _sweep(Document(dict(values)), None, "sweep", Path())
-
-
-def with_values(base: ExperimentConfig, values: Mapping[str, Any]) -> ExperimentConfig:
-    """Return an experiment with other values, by path.
-
-    Raises:
-        ConfigError: they do not go together.
-    """
-    return from_mapping(base.to_mapping(), [f"{path}={json.dumps(value)}" for path, value in values.items()])
 
 
 @cache

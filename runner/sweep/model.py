@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,9 +11,9 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from runner.config import ExperimentConfig
-from runner.config.file import SeedRange
-from runner.config.model import Name, Seed, Seeds
+from runner.config import ExperimentConfig, from_mapping
+from runner.config.file import SeveralSeeds
+from runner.config.model import Name, Seed
 from runner.config.values import Count, Section, refusal
 
 Strategy = Literal["grid", "random", "tpe", "genetic"]
@@ -147,10 +148,6 @@ class Limits(Section):
     disk: Count | None = Field(default=None, description="The most bytes of all its recordings.")
 
 
-_SweepSeeds = Annotated[
-    Annotated[Seeds, Tag("array")] | Annotated[SeedRange, Tag("SeedRange")],
-    Discriminator(lambda value: "SeedRange" if isinstance(value, Mapping | SeedRange) else "array"),
-]
 _Base = Annotated[
     Annotated[str, Tag("path")] | Annotated[dict[str, Any], Tag("mapping")],
     Discriminator(lambda value: "mapping" if isinstance(value, Mapping) else "path"),
@@ -178,7 +175,7 @@ class SweepFile(Section):
         description="How many trials are suggested at once; a generation, if genetic. What is suggested "
         "follows from the batches before, so that it does not depend on the number of workers.",
     )
-    seeds: _SweepSeeds = Field(
+    seeds: SeveralSeeds = Field(
         default=(0,), description="Each trial is run with each: a list, or the first and how many."
     )
     search_seed: Seed = Field(default=0, description="What the suggestions follow from.")
@@ -248,9 +245,8 @@ class Sweep:
         Raises:
             ConfigError: they do not go together.
         """
-        from runner.sweep.loading import with_values
-
-        return with_values(self.base, values)
+        changes = [f"{path}={json.dumps(value)}" for path, value in values.items()]
+        return from_mapping(self.base.to_mapping(), changes)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, fit for JSON and YAML, which `from_values` takes back to an equal sweep."""
