@@ -48,11 +48,12 @@ def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
     clumsy = min(config.episodes, CLUMSY_EPISODES) if learns else config.episodes
     typical = round(step_limit * (CLUMSY * (clumsy + trials) + SKILLED * (config.episodes - clumsy)))
     most = step_limit * (config.episodes + trials)
-    rate = _bytes_a_step(config)
+    rate = bytes_a_step(config)
     return Estimate(typical, typical * rate, most, most * rate)
 
 
-def _bytes_a_step(config: ExperimentConfig) -> int:
+def bytes_a_step(config: ExperimentConfig) -> int:
+    """Return about how many bytes of a recording fall to a step."""
     plan = config.recording
     if plan.steps == "none":
         return OTHER_BYTES

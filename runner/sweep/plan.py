@@ -10,7 +10,7 @@ from typing import Final
 from runner.amounts import size
 from runner.config import ConfigError, ExperimentConfig, from_mapping
 from runner.errors import StorageError
-from runner.estimate import free_bytes
+from runner.estimate import bytes_a_step, free_bytes
 from runner.execution import run_job
 from runner.job import Job
 from runner.mdp import Mdp, load_mdp
@@ -22,7 +22,6 @@ from runner.sweep.search import Search
 from runner.sweep.task import Task
 from runner.sweep.trials import Room, Standing
 
-BYTES_A_STEP: Final = 17
 BYTES_AN_EPISODE: Final = 40
 BYTES_AN_EVALUATION: Final = 1500
 TYPICAL_LENGTH: Final = 0.1
@@ -100,7 +99,7 @@ def _growth(config: ExperimentConfig, mdp: Mdp) -> int:
         snapshots * table * TABLE_SHARE
         + (config.episodes + trials) * BYTES_AN_EPISODE
         + evaluations * BYTES_AN_EVALUATION
-        + (steps * BYTES_A_STEP if config.recording.steps == "all" else 0)
+        + (steps * bytes_a_step(config) if config.recording.steps == "all" else 0)
     )
 
 
