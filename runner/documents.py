@@ -71,3 +71,16 @@ def write_whole(path: Path, value: dict[str, Any], mode: int = 0o666) -> None:
     except OSError:
         fresh.unlink(missing_ok=True)
         raise
+
+
+def sync(path: Path) -> None:
+    """Ask the system to put a file, or the names in a folder, on disk.
+
+    Raises:
+        OSError: it could not.
+    """
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -19,12 +19,11 @@ from runner.archive.restoring import check
 from runner.archive.targets import Target, no_archive, split_place, target_of, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.finding import run_at_once
 from runner.locking import locked
 from runner.recording.integrity import checked_survey, may_be_cut
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
-from runner.runs import RECORDING_FILE, RUN_FILE, Run
+from runner.runs import RECORDING_FILE, RUN_FILE, Run, run_of_id
 
 Report = Callable[[int], None]
 
@@ -192,7 +191,7 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
         raise no_archive(place)
     if manifest.run_id != run_id:
         raise RecordingError(f"{place}: found an archive of run {manifest.run_id}, expected {run_id}.")
-    known = run_at_once(run_id, recordings)
+    known = run_of_id(run_id, recordings)
     if known is not None and known.status == "archived":
         return restore_run(known, report)
     folder = recordings / run_id

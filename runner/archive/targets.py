@@ -16,6 +16,7 @@ from typing import Final, Protocol
 
 from runner.archive import layout
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Manifest, read_manifest
+from runner.documents import sync
 from runner.errors import MissingExtra, RecordingError, RunnerError, StorageError
 
 ASIDE: Final = ".partial"
@@ -147,14 +148,6 @@ class FolderTarget:
 def no_archive(place: str) -> RecordingError:
     """Return the error that there is none."""
     return RecordingError(f"{place}: found no archive there (no {layout.MANIFEST}), expected one.")
-
-
-def sync(path: Path) -> None:
-    """Ask the system to put a file on disk."""
-    import os
-
-    with path.open("rb") as stream:
-        os.fsync(stream.fileno())
 
 
 @contextlib.contextmanager

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from runner.config.model import NAME_EXPECTED, NAME_PATTERN
-from runner.documents import write_whole
+from runner.documents import sync, write_whole
 from runner.errors import RecordingError
 from runner.labels import LABELS_FILE, Labels, as_json
 from runner.packing.packing import facts_bytes, run_facts
-from runner.packing.present import Occupied, known, link, met, settled, sync
+from runner.packing.present import Occupied, known, link, met, settled
 from runner.packing.unpacking import workplace
 from runner.recording.integrity import is_merely_cut_off
 from runner.recording.reader import Recording, open_recording

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.catalogue.finding import candidates
-from runner.documents import write_whole
+from runner.documents import sync, write_whole
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.labels import MAX_TAGS, Labels, change_labels
 from runner.locking import locked
@@ -119,19 +119,6 @@ def _merged(said: Labels, more: Labels) -> Labels:
     """Return what is said of a run here and elsewhere; here, where only one of the two can hold."""
     tags = tuple(sorted({*said.tags, *more.tags})[:MAX_TAGS])
     return Labels(said.name or more.name, tags, said.note or more.note)
-
-
-def sync(path: Path) -> None:
-    """Ask the system to put a file, or the names in a folder, on disk.
-
-    Raises:
-        OSError: it could not.
-    """
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def link(source: Path, target: Path) -> None:

@@ -22,10 +22,9 @@ from typing import Any, Final, Self
 
 from filelock import FileLock
 
-from runner.documents import write_whole
+from runner.documents import sync, write_whole
 from runner.errors import RunnerError, RunNotFound, StorageError
 from runner.locking import acquired
-from runner.packing.present import sync
 from runner.runs import run_of_id
 from runner.service.appending import Appending, on_disk
 from runner.service.upload import (

@@ -21,6 +21,7 @@ from typing import Any, Final
 from filelock import FileLock
 from mcap.writer import MCAP0_MAGIC
 
+from runner.documents import sync
 from runner.errors import RunnerError, StorageError
 from runner.hashing import hash_of
 from runner.labels import labels_from
@@ -137,7 +138,6 @@ def _taken(body: Path, completion: Completion, recordings: Path) -> Verdict:
         RunnerError: it is neither, is damaged, or another run has its id.
     """
     from runner.packing.admission import admit
-    from runner.packing.present import sync
     from runner.packing.unpacking import unpack
 
     with body.open("rb") as stream:
