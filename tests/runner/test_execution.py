@@ -23,7 +23,7 @@ from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.protobuf import message_class
 from runner.runs import create_run, list_runs
-from tests.runner.learning.oracle import Twin
+from tests.runner.learning.twin import Twin
 from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
 
 

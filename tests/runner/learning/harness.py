@@ -13,7 +13,7 @@ from runner.learning.learner import Learner
 from runner.mdp import Mdp, load_mdp
 from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts
-from tests.runner.learning.oracle import Twin
+from tests.runner.learning.twin import Twin
 
 SMALL_MAP = ["+---+", "|A: |", "| |B|", "+---+"]
 SMALL = {"env": {"kwargs": {"map": SMALL_MAP, "max_episode_steps": 90}}}

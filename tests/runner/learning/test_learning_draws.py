@@ -10,7 +10,7 @@ import pytest
 
 from runner.learning import draws
 from runner.learning.learner import Learner
-from tests.runner.learning import oracle
+from tests.runner.learning import plain_draws
 from tests.runner.learning.harness import SMALL, experiment, train
 
 PUBLISHED = [
@@ -55,23 +55,23 @@ def chi_squared(counts: np.ndarray) -> float:
 
 def test_the_generator_is_the_published_one():
     assert outputs(np.uint64(1234567), 5).tolist() == PUBLISHED
-    assert [oracle.splitmix64(1234567, index) for index in range(5)] == PUBLISHED
+    assert [plain_draws.splitmix64(1234567, index) for index in range(5)] == PUBLISHED
 
 
 @pytest.mark.parametrize("seed", [0, 7, 2**63 + 1, 2**64 - 1])
 def test_keys_and_numbers_are_the_twins(seed):
     for stream, episode in [(0, 0), (1, 0), (7, 1), (3, 10**12)]:
         bits, floats, small = drawn(np.uint64(seed), stream, episode, 50)
-        expected = [oracle.draw(seed, stream, episode, index) for index in range(50)]
+        expected = [plain_draws.draw(seed, stream, episode, index) for index in range(50)]
         assert bits.tolist() == expected
-        assert floats.tolist() == [[oracle.uniform(each), oracle.coin(each)] for each in expected]
-        assert small.tolist() == [oracle.below(each, 36) for each in expected]
+        assert floats.tolist() == [[plain_draws.uniform(each), plain_draws.coin(each)] for each in expected]
+        assert small.tolist() == [plain_draws.below(each, 36) for each in expected]
 
 
 def test_the_streams_have_the_specified_numbers():
     names = ("START", "EXPLORATION", "OUTCOME", "UPDATE")
     names += ("EVALUATION_START", "EVALUATION_OUTCOME", "EVALUATION_ACTION", "INITIAL_Q", "POLICY")
-    assert [getattr(draws, name) for name in names] == [getattr(oracle, name) for name in names]
+    assert [getattr(draws, name) for name in names] == [getattr(plain_draws, name) for name in names]
 
 
 @pytest.mark.parametrize("stream", STREAMS)

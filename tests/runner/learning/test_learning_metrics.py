@@ -9,7 +9,7 @@ import pytest
 
 from runner.learning.learner import Learner
 from tests.runner.learning.harness import SMALL, evaluate, experiment, train
-from tests.runner.learning.oracle import Twin
+from tests.runner.learning.twin import Twin
 
 CASES = {
     "cooperative": {},

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from runner.config import Exponential, Linear, Piecewise
 from runner.learning.schedules import compile_schedule, schedule_value
-from tests.runner.learning import oracle
+from tests.runner.learning import plain_schedules
 
 positions = st.integers(0, 300) | st.integers(0, 10**12)
 fractions = st.floats(0.0, 1.0)
@@ -38,7 +38,7 @@ def value(schedule, episode=0, step=0):
 @settings(deadline=None)
 @given(linear | exponential | piecewise | fractions, positions, positions)
 def test_the_value_is_the_twins(schedule, episode, step):
-    assert value(schedule, episode, step) == oracle.value_of(schedule, episode, step)
+    assert value(schedule, episode, step) == plain_schedules.value_of(schedule, episode, step)
 
 
 @settings(deadline=None)

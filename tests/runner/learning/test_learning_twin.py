@@ -27,7 +27,7 @@ from tests.runner.learning.harness import (
     experiment,
     train,
 )
-from tests.runner.learning.oracle import Episode, Step, Twin
+from tests.runner.learning.twin import Episode, Step, Twin
 
 
 def assert_kernel_is_twin(config, mdp, seed, blocks, until=(10**6, 1200), trials=2) -> Twin:

@@ -17,7 +17,7 @@ from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import pipeline, recorder, schema
 from runner.recording.digest import combine
-from tests.runner.learning.oracle import Twin
+from tests.runner.learning.twin import Twin
 from tests.runner.recording.making import LAKE, SAMPLED, TAXIS, experiment, make_run
 
 PACKINGS = [

@@ -1,97 +1,32 @@
 """The algorithms in plain Python: what the compiled kernel must equal to the last bit.
 
-Written from the sources, slow and obvious: Sutton and Barto's pseudo-code, SplitMix64 in Python
-integers, one step after the other through the arrays of the `Mdp`. Nothing is imported from the kernel.
+Written from the sources, slow and obvious: Sutton and Barto's pseudo-code, one step after the other
+through the arrays of the `Mdp`. Nothing is imported from the kernel.
 """
 
 from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-START, EXPLORATION, OUTCOME, UPDATE = range(4)
-EVALUATION_START, EVALUATION_OUTCOME, EVALUATION_ACTION, INITIAL_Q, POLICY = range(4, 9)
-
-BITS_64 = 2**64 - 1
-
-
-def splitmix64(state: int, index: int) -> int:
-    """Return output number `index`, from 0, of the generator that starts at `state`."""
-    z = (state + (index + 1) * 0x9E3779B97F4A7C15) & BITS_64
-    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 & BITS_64
-    z = (z ^ (z >> 27)) * 0x94D049BB133111EB & BITS_64
-    return z ^ (z >> 31)
-
-
-def key(seed: int, stream: int, episode: int) -> int:
-    """Return a generator's state: seed, stream and episode mixed in, one after the other."""
-    state = 0
-    for part in (seed, stream, episode):
-        state = splitmix64((state + part) & BITS_64, 0)
-    return state
-
-
-def draw(seed: int, stream: int, episode: int, index: int) -> int:
-    """Return 64 random bits."""
-    return splitmix64(key(seed, stream, episode), index)
-
-
-def uniform(bits: int) -> float:
-    """Return a number in [0, 1) of the upper 53 bits."""
-    return (bits >> 11) / 2**53
-
-
-def coin(bits: int) -> float:
-    """Return a number in [0, 1) of the upper 32 bits."""
-    return (bits >> 32) / 2**32
-
-
-def below(bits: int, n: int) -> int:
-    """Return a whole number below n of the lower 32 bits."""
-    return (bits % 2**32) * n // 2**32
-
-
-def pick(chances: list[tuple[int, float]], u: float) -> int:
-    """Return the first of (item, probability) at which the running sum of probabilities exceeds u."""
-    total = 0.0
-    for item, probability in chances:
-        total += probability
-        if u < total:
-            return item
-    return [item for item, probability in chances if probability > 0][-1]
-
-
-def value_of(schedule: Any, episode: int, step: int) -> float:
-    """Return a constant's or schedule's value, by + - * / alone."""
-    if isinstance(schedule, int | float):
-        return float(schedule)
-    n = step if schedule.by == "step" else episode
-    if schedule.schedule == "linear":
-        value = line(n, (0, schedule.start), (schedule.over, schedule.end))
-    elif schedule.schedule == "exponential":
-        value = schedule.start * power(schedule.factor, n)
-    else:
-        value = schedule.points[-1][1]
-        for before, after in zip(schedule.points, schedule.points[1:], strict=False):
-            if before[0] <= n < after[0]:
-                value = line(n, before, after)
-    return max(value, schedule.floor)
-
-
-def line(n: int, first: tuple[int, float], last: tuple[int, float]) -> float:
-    """Return the height at n of the line between two points (x, y); y of the last one from there on."""
-    if n >= last[0]:
-        return last[1]
-    return first[1] + (last[1] - first[1]) * ((n - first[0]) / (last[0] - first[0]))
-
-
-def power(base: float, n: int) -> float:
-    """Return base ** n by repeated squaring."""
-    result = 1.0
-    for bit in reversed(bin(n)[2:]):
-        if bit == "1":
-            result *= base
-        base *= base
-    return result
+from tests.runner.learning.plain_draws import (
+    EVALUATION_ACTION,
+    EVALUATION_OUTCOME,
+    EVALUATION_START,
+    EXPLORATION,
+    INITIAL_Q,
+    OUTCOME,
+    POLICY,
+    START,
+    UPDATE,
+    below,
+    coin,
+    draw,
+    key,
+    pick,
+    splitmix64,
+    uniform,
+)
+from tests.runner.learning.plain_schedules import value_of
 
 
 class Step(NamedTuple):
