@@ -22,6 +22,7 @@ from runner.catalogue.database import index_path
 from runner.service.app import create_app
 from runner.service.server import bind, serve
 from runner.service.settings import Limits
+from tests.waiting import until
 
 
 @pytest.fixture
@@ -141,10 +142,7 @@ def test_a_run_that_appears_or_goes_is_told_soon(client, recordings):
 
     assert client.get("/api/v1/runs").json()["total"] == 2
     shutil.rmtree(next(recordings.glob("*/recording.mcap")).parent)
-    deadline = time.monotonic() + 10
-    while client.get("/api/v1/runs").json()["total"] == 2:
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    until(lambda total: total == 1, lambda: client.get("/api/v1/runs").json()["total"], 10)
 
 
 def test_a_full_disk_is_said(client, monkeypatch):

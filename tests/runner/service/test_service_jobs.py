@@ -13,6 +13,7 @@ from runner.config import from_mapping
 from runner.runs import list_runs
 from runner.service import work
 from runner.service.work import Jobs
+from tests.waiting import until
 
 CONFIG = ICY | {"episodes": 200, "evaluation": {"every": 100, "trials": 5}}
 SWEEP = {
@@ -40,12 +41,8 @@ def job(client, number):
     return client.get(f"/api/v1/jobs/{number}").json()
 
 
-def until(client, number, is_so, seconds=60):
-    deadline = time.monotonic() + seconds
-    while not is_so(found := job(client, number)):
-        assert time.monotonic() < deadline, found
-        time.sleep(0.05)
-    return found
+def job_until(client, number, is_so):
+    return until(is_so, lambda: job(client, number))
 
 
 def watched(client, number, last=None):
@@ -97,7 +94,7 @@ def test_a_watcher_comes_back_to_where_it_was(client, submit):
 
 def test_a_watcher_that_comes_after_the_end_is_told_how_far_the_job_came(client, submit):
     number = submit(CONFIG)
-    until(client, number, lambda job: job["state"] == "finished" and job["progress"] is None)
+    job_until(client, number, lambda job: job["state"] == "finished" and job["progress"] is None)
     (progress,) = [data for _, event, data in watched(client, number) if event == "progress"]
     assert (progress["run"], progress["runs"], progress["episode"]) == (2, 2, 200)
 
@@ -105,7 +102,7 @@ def test_a_watcher_that_comes_after_the_end_is_told_how_far_the_job_came(client,
 def test_a_running_job_is_cancelled_and_goes_on_when_it_is_resumed(client, submit, recordings):
     config = {"episodes": 1500, "mode": "cooperative", "evaluation": {"every": 100, "trials": 200}}
     number = submit(config)
-    until(client, number, lambda job: (job["progress"] or {}).get("episode", 0) > 0)
+    job_until(client, number, lambda job: (job["progress"] or {}).get("episode", 0) > 0)
     begun = job(client, number)["begun"][0]["run_id"]
     listed = client.get("/api/v1/runs").json()["runs"]
     assert {run["run_id"]: run["status"] for run in listed}[begun] == "running"
@@ -116,7 +113,7 @@ def test_a_running_job_is_cancelled_and_goes_on_when_it_is_resumed(client, submi
     assert "is cancelled already" in again.json()["error"]["message"]
 
     assert client.post(f"/api/v1/jobs/{number}/resume").json()["state"] == "queued"
-    done = until(client, number, lambda job: job["state"] == "finished")
+    done = job_until(client, number, lambda job: job["state"] == "finished")
     assert [run["run_id"] for run in done["begun"]] == [begun]
     run = next(run for run in list_runs(recordings) if run.run_id == begun)
     assert run.status == "finished"
@@ -132,7 +129,7 @@ def test_no_more_jobs_run_than_there_are_workers_and_those_that_wait_can_be_canc
     connect, settings, client
 ):
     numbers = [client.post("/api/v1/jobs", content=json.dumps(ENDLESS)).json()["number"] for _ in range(4)]
-    until(client, numbers[1], lambda job: job["progress"] is not None)
+    job_until(client, numbers[1], lambda job: job["progress"] is not None)
     page = client.get("/api/v1/jobs").json()
     assert [job["state"] for job in page["jobs"]] == ["queued", "queued", "running", "running"]
     assert (page["queue"]["workers"], page["queue"]["running"], page["queue"]["queued"]) == (2, 2, 2)
@@ -140,7 +137,7 @@ def test_no_more_jobs_run_than_there_are_workers_and_those_that_wait_can_be_canc
     assert (only["total"], [job["number"] for job in only["jobs"]]) == (2, [numbers[3]])
     assert client.post(f"/api/v1/jobs/{numbers[2]}/cancel").json()["state"] == "cancelled"
     client.post(f"/api/v1/jobs/{numbers[0]}/cancel")
-    until(client, numbers[3], lambda job: job["state"] == "running")
+    job_until(client, numbers[3], lambda job: job["state"] == "running")
 
 
 def test_a_sweep_is_done_and_may_use_the_workers_that_nobody_waits_for(client, submit, recordings, tmp_path):
@@ -164,24 +161,24 @@ def test_a_job_whose_worker_dies_is_tried_again_and_then_fails(client, submit):
 
     number = submit(ENDLESS)
     for _ in range(2):
-        until(client, number, lambda job: job["progress"] is not None)
+        job_until(client, number, lambda job: job["progress"] is not None)
         for process in psutil.Process().children():
             if "spawn_main" in " ".join(process.cmdline()) and process.nice() > psutil.Process().nice():
                 process.kill()
-        until(client, number, lambda job: job["progress"] is None)
-    failed = until(client, number, lambda job: job["state"] == "failed")
+        job_until(client, number, lambda job: job["progress"] is None)
+    failed = job_until(client, number, lambda job: job["state"] == "failed")
     assert failed["error"].startswith("its worker died 2 times, at last with exit code -9")
 
 
 def test_a_job_that_cannot_be_done_says_why_and_is_tried_again_when_asked(client, submit):
     number = submit(SWEEP | {"objective": {"metric": "training.mean_rewards"}})
-    failed = until(client, number, lambda job: job["state"] == "failed")
+    failed = job_until(client, number, lambda job: job["state"] == "failed")
     assert "Did you mean 'training.mean_reward'?" in failed["error"]
     told = watched(client, number)[-1][2]
     assert (told["state"], told["error"]) == ("failed", failed["error"])
     again = client.post(f"/api/v1/jobs/{number}/resume").json()
     assert (again["state"], again["error"]) == ("queued", "")
-    assert until(client, number, lambda job: job["state"] == "failed")["error"] == failed["error"]
+    assert job_until(client, number, lambda job: job["state"] == "failed")["error"] == failed["error"]
 
 
 def test_mistakes_are_told_with_line_and_key(client, recordings):
@@ -214,7 +211,7 @@ def test_what_the_disk_would_not_hold_is_refused_and_a_full_one_is_waited_for(cl
     assert job(client, number)["state"] == "queued"
     assert client.get("/api/v1/jobs").json()["queue"]["waiting_for"].startswith("disk: 268 MB are free")
     monkeypatch.undo()
-    until(client, number, lambda job: job["state"] == "finished")
+    job_until(client, number, lambda job: job["state"] == "finished")
 
 
 def test_unknown_jobs_are_told(client):
@@ -230,18 +227,15 @@ def test_what_was_submitted_is_given_back(client, submit):
     assert json.loads(client.get(f"/api/v1/jobs/{number}/submitted").text) == ENDLESS
 
 
-def test_a_run_that_was_promised_but_never_made_is_made(tmp_path):
+@pytest.mark.parametrize("folder", ["missing", "there"])
+def test_a_run_that_was_promised_but_never_made_is_made(tmp_path, folder):
     """The worker wrote the run's id down, or made its folder, and was killed."""
-    for made in (False, True):
-        with Jobs(tmp_path / str(made), 1) as jobs:
-            queued = jobs.queue.add(
-                "config", "icy", 1, "", from_mapping(CONFIG | {"seeds": [3]}).to_mapping()
-            )
-            (jobs.queue.folder_of(queued.number) / "runs.json").write_text('{"3": "abcdefgh"}')
-            if made:
-                (jobs.recordings / "abcdefgh").mkdir()
-            while not jobs.queue.job(queued.number).is_over:
-                time.sleep(0.05)
-            assert jobs.queue.job(queued.number).state == "finished"
-            runs = list_runs(jobs.recordings)
-            assert [run.run_id for run in runs] == [jobs.queue.runs_of(queued.number)[3]]
+    with Jobs(tmp_path, 1) as jobs:
+        queued = jobs.queue.add("config", "icy", 1, "", from_mapping(CONFIG | {"seeds": [3]}).to_mapping())
+        (jobs.queue.folder_of(queued.number) / "runs.json").write_text('{"3": "abcdefgh"}')
+        if folder == "there":
+            (jobs.recordings / "abcdefgh").mkdir()
+        over = until(lambda job: job.is_over, lambda: jobs.queue.job(queued.number))
+        assert over.state == "finished"
+        runs = list_runs(jobs.recordings)
+        assert [run.run_id for run in runs] == [jobs.queue.runs_of(queued.number)[3]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 
 import pytest
 from submitted import ENDLESS, ICY
@@ -12,6 +11,7 @@ import runner
 from runner.recording.reader import open_recording
 from runner.runs import list_runs
 from runner.service.work import Jobs
+from tests.waiting import until
 
 pytest.importorskip("ray")
 from runner.sweep.cluster import connect
@@ -27,19 +27,12 @@ def cluster():
     ray.shutdown()
 
 
-def until(jobs, number, is_so):
-    deadline = time.monotonic() + 60
-    while not is_so(jobs.queue.job(number)):
-        assert time.monotonic() < deadline, (jobs.queue.job(number), jobs.queue.events(number))
-        time.sleep(0.05)
-
-
 def test_a_job_is_done_by_ray_as_beside_the_server_and_can_be_cancelled(cluster, tmp_path):
     here = runner.run_all(ICY, recordings=tmp_path / "here")
     with Jobs(tmp_path / "far", 1, ray=cluster) as jobs:
         number = jobs.submit(json.dumps(ICY), "job.yaml").number
-        until(jobs, number, lambda job: job.is_over)
-        assert jobs.queue.job(number).state == "finished", jobs.queue.job(number).error
+        over = until(lambda job: job.is_over, lambda: jobs.queue.job(number))
+        assert over.state == "finished", over.error
         far = sorted(list_runs(tmp_path / "far"), key=lambda run: run.seed)
         digests = [[run.summary["content_digest"] for run in runs] for runs in (far, here)]
         assert digests[0] == digests[1]
@@ -49,9 +42,8 @@ def test_a_job_is_done_by_ray_as_beside_the_server_and_can_be_cancelled(cluster,
         with open_recording(far[0].recording) as recording:
             assert "ray" in recording.provenance["command"]
         endless = jobs.submit(json.dumps(ENDLESS), "job.yaml").number
-        until(jobs, endless, lambda _: (jobs.progress(endless) or {}).get("episode", 0) > 0)
+        until(lambda progress: progress and progress.get("episode", 0) > 0, lambda: jobs.progress(endless))
         jobs.cancel(endless)
-        until(jobs, endless, lambda job: job.is_over and not jobs.standing().running)
-        assert jobs.queue.job(endless).state == "cancelled"
+        until(lambda job: job.state == "cancelled", lambda: jobs.queue.job(endless))
     (run,) = [run for run in list_runs(tmp_path / "far") if run.name == "endless"]
     assert run.status == "interrupted"
