@@ -24,7 +24,7 @@ from runner.recording.integrity import check_integrity
 from runner.recording.protobuf import message_class
 from runner.runs import create_run, list_runs
 from tests.runner.learning.twin import Twin
-from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
+from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run, stopping_after
 
 
 def positions(run) -> dict[str, list[tuple[int, int]]]:
@@ -214,8 +214,7 @@ def test_progress_is_told_with_every_evaluation(tmp_path):
 def test_a_run_that_is_told_to_stop_is_interrupted_and_closed_properly(asked, tmp_path):
     config = experiment(TAXIS, recording={"chunk_steps": 256})
     whole = run_job(Job(config, 0), create_run(tmp_path, config, 0))
-    times = iter(range(1000))
-    run = run_job(Job(config, 0), create_run(tmp_path, config, 0), stop=lambda: next(times) >= asked)
+    run = run_job(Job(config, 0), create_run(tmp_path, config, 0), stop=stopping_after(asked))
     assert run.status == "interrupted"
     assert find_run(run.run_id, tmp_path).facts == run.facts
     check_integrity(run.recording)

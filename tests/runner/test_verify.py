@@ -22,7 +22,7 @@ from runner.recording.repair import repair
 from runner.runs import create_run
 from runner.verify import verify
 from tests.runner.altering import altered
-from tests.runner.recording.making import TAXIS, make_run
+from tests.runner.recording.making import TAXIS, make_run, stopping_after
 
 
 @pytest.fixture(scope="module", params=["competitive", "cooperative"])
@@ -217,8 +217,7 @@ def test_an_interrupted_recording_is_compared_to_its_end(run, tmp_path):
 
 def test_what_an_interrupted_run_says_at_its_end(run, tmp_path):
     job = Job(from_mapping(run.facts["config"]), run.seed)
-    times = iter(range(1000))
-    stopped = run_job(job, create_run(tmp_path, job.config, job.seed), stop=lambda: next(times) > 4)
+    stopped = run_job(job, create_run(tmp_path, job.config, job.seed), stop=stopping_after(5))
     assert stopped.status == "interrupted"
     found = verify(stopped.recording)
     assert found.sound, found.finding

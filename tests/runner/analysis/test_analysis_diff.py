@@ -26,6 +26,7 @@ from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.words import states_in_words
 from tests.runner.altering import altered
+from tests.runner.recording.making import stopping_after
 
 BASE = {
     "name": "base",
@@ -181,8 +182,7 @@ def test_a_page_and_markdown_are_given_together(record, folder, tmp_path):
 def test_what_an_interrupted_run_has_is_compared(record, folder):
     config = from_mapping(BASE)
     run = runs.create_run(folder, config, 0)
-    asked = iter(range(10**9))
-    run = run_job(Job(config, 0), run, stop=lambda: next(asked) > 20)
+    run = run_job(Job(config, 0), run, stop=stopping_after(21))
     with open_recording(record()) as a, open_recording(run.recording) as b:
         difference = diff(a, b)
     assert difference.b["status"] == "interrupted"

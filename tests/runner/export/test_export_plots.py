@@ -19,8 +19,7 @@ from runner.export.plots_figure import draw_figure, draw_panel
 from runner.finding import find_run
 from runner.frames import evaluation_records
 from runner.recording.reader import open_recording
-from runner.recording.rewriting import rewrite
-from tests.runner.recording.making import TAXIS, make_run
+from tests.runner.recording.making import TAXIS, make_run, with_id
 
 
 def series(*runs):
@@ -57,11 +56,7 @@ def test_seeds_are_one_group_with_median_and_band(seeds):
 def again(run, folder, run_id):
     """Return the same content, recorded under another id."""
     (folder / run_id).mkdir(parents=True)
-
-    def renamed(name, said):
-        return said | {"run_id": run_id} if name == "run" else said
-
-    rewrite(run.recording, folder / run_id / "recording.mcap", renamed)
+    with_id(run_id, run.recording, folder / run_id / "recording.mcap")
     return find_run(run_id, folder)
 
 
@@ -129,7 +124,7 @@ def test_the_figure_names_its_runs_and_what_bands_are(seeds, pictured):
 @pytest.mark.parametrize(("suffix", "magic"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_the_command_writes_the_file_once(pictured, tmp_path, suffix, magic):
     path = tmp_path / f"plot.{suffix}"
-    result = plot(pictured("stairs", log=None).recording, "-o", path)
+    result = plot(pictured("corridor", log=None).recording, "-o", path)
     assert result.exit_code == 0, result.output
     assert path.read_bytes().startswith(magic)
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
@@ -138,15 +133,15 @@ def test_the_command_writes_the_file_once(pictured, tmp_path, suffix, magic):
 def test_a_file_is_replaced_only_when_asked(pictured, tmp_path):
     path = tmp_path / "plot.svg"
     path.write_text("mine")
-    result = plot(pictured("stairs", log=None).recording, "-o", path)
+    result = plot(pictured("corridor", log=None).recording, "-o", path)
     assert (result.exit_code, path.read_text()) == (2, "mine")
     assert "--force" in result.stderr
-    assert plot(pictured("stairs", log=None).recording, "-o", path, "--force").exit_code == 0
+    assert plot(pictured("corridor", log=None).recording, "-o", path, "--force").exit_code == 0
     assert path.read_text() != "mine"
 
 
 def test_a_file_that_cannot_be_written_is_said_as_a_full_disk_is(pictured, tmp_path):
-    result = plot(pictured("stairs", log=None).recording, "-o", tmp_path / "nowhere" / "plot.svg")
+    result = plot(pictured("corridor", log=None).recording, "-o", tmp_path / "nowhere" / "plot.svg")
     assert result.exit_code == 1
     assert "cannot be written (No such file or directory)" in result.stderr
 
@@ -173,7 +168,7 @@ def test_a_missing_package_is_named(pictured, tmp_path, monkeypatch):
 
 
 def test_where_success_is_unknown_there_is_no_panel_of_it(pictured):
-    metrics = {panel.metric for panel in panels_of(groups_of(series(pictured("stairs"))))}
+    metrics = {panel.metric for panel in panels_of(groups_of(series(pictured("corridor"))))}
     assert "finish_percent" not in metrics
     assert "mean_length" in metrics
 

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from selenium import webdriver
-from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
@@ -24,9 +20,6 @@ from runner.export.svg import Drawing, trail_points, transform
 from runner.recording.reader import open_recording
 from runner.words import states_in_words
 from tests.runner.export.outline import Outline, check_page
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-CHROMEDRIVER = shutil.which("chromedriver")
 
 
 def report(*words):
@@ -150,20 +143,6 @@ def test_names_cannot_break_out_of_the_page(pictured):
 # --- in a browser -------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def browser():
-    if (CHROMIUM is None or CHROMEDRIVER is None) and "DUALTAXI_CI" not in os.environ:
-        pytest.skip("needs Debian's chromium and chromium-driver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(CHROMEDRIVER))
-    yield driver
-    driver.quit()
-
-
 @pytest.fixture
 def opened(browser, page_of, tmp_path):
     """Return a function that opens the report of a world's run in the browser."""
@@ -220,7 +199,7 @@ def test_the_space_bar_plays_and_pauses(opened):
 
 
 def test_without_a_scene_state_and_action_are_told(opened):
-    driver = opened("stairs")
+    driver = opened("corridor")
     slider = driver.find_element(By.CSS_SELECTOR, ".step")
     slider.send_keys(Keys.ARROW_RIGHT)
     told = driver.find_element(By.CSS_SELECTOR, ".replay").text

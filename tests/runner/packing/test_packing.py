@@ -28,17 +28,7 @@ from runner.packing.unpacking import unpack
 from runner.recording.reader import open_recording
 from runner.runs import list_runs
 from runner.verify import verify
-from tests.runner.recording.making import LAKE, TAXIS, make_run
-
-
-@pytest.fixture(scope="module")
-def lake(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("packing"), LAKE)
-
-
-@pytest.fixture(scope="module")
-def taxis(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("packing"), TAXIS)
+from tests.runner.recording.making import LAKE, make_run
 
 
 def copy_of(run, folder, **facts):

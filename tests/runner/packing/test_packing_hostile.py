@@ -17,12 +17,6 @@ from runner.packing.packing import pack
 from runner.packing.unpacking import unpack
 from runner.recording.schema import TRAIN_STEP
 from tests.runner.altering import altered
-from tests.runner.recording.making import LAKE, make_run
-
-
-@pytest.fixture(scope="module")
-def lake(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("hostile"), LAKE)
 
 
 @pytest.fixture(scope="module")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from runner.config import ExperimentConfig, from_mapping
 from runner.execution import run_job
 from runner.job import Job
+from runner.recording.rewriting import rewrite
 from runner.runs import Run, create_run
 
 SMALL_MAP = ["+---+", "|A: |", "| |B|", "+---+"]
@@ -45,6 +47,18 @@ def experiment(*parts: dict[str, Any], **values: Any) -> ExperimentConfig:
     for part in (*parts, values):
         merged |= part
     return from_mapping(merged)
+
+
+def stopping_after(times: int) -> Callable[[], bool]:
+    """Return what says to stop when it has been asked so many times."""
+    asked = iter(range(10**9))
+    return lambda: next(asked) >= times
+
+
+def with_id(run_id: str, source: Path, target: Path) -> Path:
+    """Write a recording anew under another run's id, and return where; all else stays as it is."""
+    rewrite(source, target, lambda name, entries: entries | {"run_id": run_id} if name == "run" else entries)
+    return target
 
 
 def make_run(folder: Path, *parts: dict[str, Any], seed: int = 0, **values: Any) -> Run:

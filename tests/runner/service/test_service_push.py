@@ -27,14 +27,14 @@ from runner.cli import cli
 from runner.finding import find_run
 from runner.labels import change_labels
 from runner.packing.packing import pack
-from runner.recording.rewriting import rewrite
 from runner.runs import list_runs
 from runner.service import client as client_module
 from runner.service.address import checked_url, found_token
 from runner.service.client import Client
 from runner.service.outbox import outbox_folder
 from runner.service.parcel import Parcel, Sent, ServerAway, ServerError
-from tests.runner.recording.making import TAXIS, make_run
+from tests.runner.recording.making import TAXIS, make_run, with_id
+from tests.waiting import until
 
 
 @pytest.fixture(scope="module")
@@ -84,16 +84,11 @@ def dualtaxi(*words):
 
 def copies(run, folder, count):
     """Return runs of the same content, each with an id of its own."""
-    parcels = []
-    for number in range(count):
-        path = folder / f"{number}.mcap"
-        rewrite(run.recording, path, lambda name, entries, n=number: _with_id(name, entries, n))
-        parcels.append(Parcel(path, "copy", f"copy{number}", run={"status": "finished"}))
-    return parcels
-
-
-def _with_id(name, entries, number):
-    return entries | {"run_id": f"copy{number}"} if name == "run" else entries
+    paths = {f"copy{number}": folder / f"{number}.mcap" for number in range(count)}
+    return [
+        Parcel(with_id(run_id, run.recording, path), "copy", run_id, run={"status": "finished"})
+        for run_id, path in paths.items()
+    ]
 
 
 # --- commands ---------------------------------------------------------------------------------------------
@@ -227,10 +222,7 @@ def test_a_connection_that_lies_or_is_cut_leaves_what_came(server, run):
             with pytest.raises(ServerError, match="another request") as refused:
                 client.append(sent, run.recording, len(data))
             assert refused.value.status == 409
-        for _ in range(100):
-            if (now := client.standing(sent)).offset:
-                break
-            time.sleep(0.05)
+        now = until(lambda now: now.offset, lambda: client.standing(sent))
         assert now.offset == 1000
         with pytest.raises(ServerError, match="expected the"):
             client.complete(now, Parcel(run.recording), len(data), "0" * 64)

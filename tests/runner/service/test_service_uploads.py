@@ -19,7 +19,6 @@ from runner.finding import find_run
 from runner.job import Job
 from runner.labels import Labels, change_labels
 from runner.packing.packing import pack
-from runner.recording.rewriting import rewrite
 from runner.resume import resume
 from runner.runs import create_run, list_runs
 from runner.service.upload import (
@@ -33,19 +32,10 @@ from runner.service.upload import (
     TooMany,
 )
 from runner.service.uploads import FOLDER, Uploads
-from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
+from tests.runner.recording.making import TAXIS, experiment, make_run, stopping_after, with_id
+from tests.waiting import until
 
 ANNA, BEN = "anna", "ben"
-
-
-@pytest.fixture(scope="module")
-def lake(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("uploads"), LAKE)
-
-
-@pytest.fixture(scope="module")
-def taxis(tmp_path_factory):
-    return make_run(tmp_path_factory.mktemp("uploads"), TAXIS)
 
 
 @pytest.fixture
@@ -72,12 +62,9 @@ def send(uploads, data, owner=ANNA, whole=None, **told):
 
 
 def over(uploads, upload):
-    for _ in range(600):
-        upload = uploads.get(upload.upload_id, upload.owner)
-        if upload.state != "verifying":
-            return upload
-        time.sleep(0.05)
-    raise AssertionError("the verification did not end")
+    return until(
+        lambda upload: upload.state != "verifying", lambda: uploads.get(upload.upload_id, upload.owner)
+    )
 
 
 def visible(folder: Path) -> list[str]:
@@ -233,8 +220,8 @@ def test_a_run_that_was_cut_off_is_taken_as_interrupted(uploads, taxis, tmp_path
 def stopped(tmp_path_factory):
     """Return a run that was interrupted, and the same one gone on with to its end."""
     folder = tmp_path_factory.mktemp("stopped")
-    config, asked = experiment(TAXIS, episodes=400), iter(range(1_000_000))
-    run = run_job(Job(config, 0), create_run(folder, config, 0), stop=lambda: next(asked) > 30)
+    config = experiment(TAXIS, episodes=400)
+    run = run_job(Job(config, 0), create_run(folder, config, 0), stop=stopping_after(31))
     assert run.status == "interrupted"
     early = find_run(shutil.copytree(run.folder, folder / "early" / run.run_id).as_posix(), folder)
     return early, resume(run)
@@ -275,12 +262,7 @@ def test_what_only_says_that_it_goes_on_does_not_replace_anything(uploads, stopp
     assert find_run(early.run_id, tmp_path / "runs").status == "interrupted"
     other = make_run(tmp_path / "other", TAXIS, seed=1)
     facts = json.loads((run.folder / "run.json").read_text())
-    fake = tmp_path / "fake.mcap"
-    rewrite(
-        other.recording,
-        fake,
-        lambda name, entries: entries | {"run_id": run.run_id} if name == "run" else entries,
-    )
+    fake = with_id(run.run_id, other.recording, tmp_path / "fake.mcap")
     assert "another run" in send(uploads, fake.read_bytes(), status="finished").problem
     assert run.recording.read_bytes() == cut
     assert json.loads((run.folder / "run.json").read_text()) == facts
