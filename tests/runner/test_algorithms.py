@@ -17,8 +17,8 @@ from runner.recording.blocks import blank_records, block_counts
 from runner.resume import resume
 from runner.runs import list_runs
 from runner.verify import verify
+from tests.runner.killing import LONG, kill_when, posix, start
 from tests.runner.recording.making import SAMPLED, TAXIS, experiment, make_run
-from tests.runner.test_resume import LONG, kill_when, posix, start
 
 TEAM = {"mode": "cooperative"}
 TWO = {"mode": "competitive", "exploration": "independent"}

@@ -1,4 +1,4 @@
-"""Runs that were killed, cut off or damaged end as if nothing had happened; living ones are left alone."""
+"""Runs that were cut off or damaged end as if nothing had happened; living ones are left alone."""
 
 from __future__ import annotations
 
@@ -6,9 +6,6 @@ import errno
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -25,124 +22,19 @@ from runner.locking import locked
 from runner.recording import open as open_recording
 from runner.recording.contents import survey
 from runner.recording.repair import repair
-from runner.recording.schema import BLOCK_TOPICS, EVAL_STEP, TRAIN_STEP
+from runner.recording.schema import TRAIN_STEP
 from runner.recording.writer import RecordingFile
 from runner.resume import resume
 from runner.runs import Run, create_run, list_runs
-from tests.runner.recording.making import SAMPLED, SMALL_MAP, TAXIS, make_run
-
-REPOSITORY = Path(__file__).parents[2]
-LONG = {
-    "name": "long",
-    "env": {"kwargs": {"map": SMALL_MAP, "max_episode_steps": 200}},
-    "episodes": 5000,
-    "epsilon": {"schedule": "linear", "start": 1.0, "end": 0.3, "over": 5000},
-    "step_size": {"schedule": "exponential", "start": 0.5, "factor": 0.9999, "floor": 0.1},
-    "evaluation": {"every": 2000, "trials": 300},
-    "log": {"every_steps": 20_000},
-    "snapshots": {"every": 3000},
-}
-"""Long enough to be killed in: a second, some 10 MB."""
-MOSTLY_EVALUATION = LONG | {"episodes": 40, "evaluation": {"every": 20, "trials": 4000}}
-
-posix = pytest.mark.skipif(sys.platform == "win32", reason="kills by signal")
-
-
-# --- real kills ---------------------------------------------------------------------------------------
-
-
-def start(*words: object) -> subprocess.Popen[str]:
-    """Start the command line in a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "runner", *map(str, words)],
-        cwd=REPOSITORY,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def recorded_bytes(recordings: Path) -> int:
-    """Return the size of the one run's recording; -1 before there is a run."""
-    found = list_runs(recordings)
-    if not found:
-        return -1
-    return found[0].recording.stat().st_size if found[0].recording.exists() else 0
-
-
-def kill_when(process: subprocess.Popen[str], recordings: Path, size: int) -> None:
-    """Kill a process, with no warning, when the recording has grown to a size."""
-    deadline = time.monotonic() + 60
-    while recorded_bytes(recordings) < size:
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
-    process.kill()
-    process.communicate()
-    assert process.returncode == -signal.SIGKILL
-
-
-@posix
-@pytest.mark.parametrize(
-    ("mode", "config", "sizes"),
-    [
-        pytest.param("cooperative", LONG, [0, 1_000_000, 3_000_000], id="at the start, in training"),
-        pytest.param("competitive", LONG, [1_500_000, 3_500_000], id="in training, two learners"),
-        pytest.param("competitive", MOSTLY_EVALUATION, [1_500_000], id="in an evaluation"),
-    ],
-)
-def test_killed_again_and_again(tmp_path, mode, config, sizes):
-    whole = make_run(tmp_path / "whole", config, mode=mode, seed=5)
-    recordings = tmp_path / "killed"
-    path = tmp_path / "experiment.yaml"
-    path.write_text(json.dumps(config | {"mode": mode, "seed": 5}))  # JSON is YAML
-    words: tuple[object, ...] = ("run", path)
-    for size in sizes:
-        kill_when(start(*words, "--recordings", recordings), recordings, size)
-        (run,) = list_runs(recordings)
-        assert run.status == "interrupted"
-        words = ("resume", run.run_id)
-    with open_recording(run.recording) as recording:
-        assert not recording.finished
-        for topic in BLOCK_TOPICS:
-            assert recording.count(topic) == sum(len(block) for block in recording.blocks(topic))
-        assert recording.count(TRAIN_STEP) + recording.count(EVAL_STEP) > 0
-    done = resume(run)
-    assert done.status == find_run(run.run_id, recordings).status == "finished"
-    assert done.summary["content_digest"] == whole.summary["content_digest"]
-    assert done.summary["messages"] == whole.summary["messages"]
-    assert verify.verify(done.recording).sound
-
-
-@posix
-def test_one_of_two_processes_may_resume(tmp_path):
-    recordings = tmp_path / "runs"
-    config = from_mapping(LONG | {"episodes": 10**8, "evaluation": None})
-    run = run_job(Job(config, 0), create_run(recordings, config, 0), stop=stopping_after(3))
-    process = start("resume", run.run_id, "--recordings", recordings)
-    while find_run(run.run_id, recordings).status != "running":
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.005)
-    with pytest.raises(RunnerError, match="is being worked on by another process"):
-        resume(run)
-    second = start("resume", run.run_id, "--recordings", recordings)
-    _, told = second.communicate(timeout=60)
-    assert second.returncode == 2
-    assert "another process" in told
-    process.send_signal(signal.SIGTERM)
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "Interrupted again" in told
-    assert find_run(run.run_id, recordings).status == "interrupted"
-
+from tests.runner.recording.making import SAMPLED, TAXIS, make_run, stopping_after
 
 # --- every state that a file can be in ----------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+@pytest.fixture
+def whole(taxis):
     """A finished run, not to be changed."""
-    return make_run(tmp_path_factory.mktemp("whole"), TAXIS, recording={"chunk_steps": 256})
+    return taxis
 
 
 def copy_of(run: Run, folder: Path, status: str = "interrupted", **facts: object) -> Run:
@@ -225,12 +117,6 @@ def test_stopped_and_resumed_step_by_step(whole, tmp_path):
     assert_same(run, whole)
 
 
-def stopping_after(times: int):
-    """Return what says to stop when it has been asked some times."""
-    asked = iter(range(10**9))
-    return lambda: next(asked) >= times
-
-
 def test_a_stop_while_it_catches_up_forgets_nothing(whole, tmp_path):
     run = copy_of(whole, tmp_path, summary={})
     cut(run, int(0.8 * run.recording.stat().st_size))
@@ -258,17 +144,16 @@ def damage(run: Run, share: float) -> None:
     run.recording.write_bytes(data)
 
 
-@pytest.mark.parametrize("status", ["finished", "interrupted"])
-@pytest.mark.parametrize("repaired", [True, False])
-def test_a_hole_is_filled_by_a_new_recording(whole, tmp_path, status, repaired):
+@pytest.mark.parametrize(
+    ("share", "repaired"),
+    [(1, True), (0.9, True), (0.9, False)],  # a hole in a whole one is found by repair only
+)
+def test_a_hole_is_filled_by_a_new_recording(whole, tmp_path, share, repaired):
     run = copy_of(whole, tmp_path, "interrupted", proof=None)
-    if status == "interrupted":
-        cut(run, int(0.9 * run.recording.stat().st_size))
+    cut(run, int(share * run.recording.stat().st_size))
     damage(run, 0.5)
     if repaired:
         assert repair(run.recording).lost
-    elif status == "finished":
-        return  # nobody knows yet: its index is whole
     before = run.recording.read_bytes()
     stopped = resume(run, stop=stopping_after(6))
     assert stopped.status == "interrupted"
