@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -116,6 +118,7 @@ def _show(path: Path, place: Spot, web: bool, port: int, screenshot: Path | None
     """Show an exported file, in the way that is asked for."""
     from runner.export.rerun import viewer
 
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so the viewer is ended too
     if screenshot is not None:
         viewer.screenshot(path, place.time, screenshot, picture_size)
         click.echo(screenshot)

@@ -5,6 +5,11 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -99,6 +104,18 @@ def test_a_screenshot_is_kept_whole_or_its_place_is_told(monkeypatch, tmp_path):
     assert picture.read_bytes() == b"drawn"
     with pytest.raises(StorageError, match="cannot be written"):
         viewer.screenshot(tmp_path / "a.rrd", 0, tmp_path / "missing" / "step.png")
+
+
+def test_the_web_viewer_ends_with_the_command(pictured):
+    words = [sys.executable, "-m", "runner", "view", pictured("taxis").folder, "--web"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        address = process.stdout.readline().strip()
+        with urllib.request.urlopen(address, timeout=20) as answer:
+            assert b"re_viewer" in answer.read()
+        process.terminate()
+        assert process.wait(30) == 128 + signal.SIGTERM
+    with pytest.raises(urllib.error.URLError, match="refused"):
+        urllib.request.urlopen(address, timeout=20)
 
 
 def test_a_live_view_takes_one_episode_in_so_many(pictured, monkeypatch):
