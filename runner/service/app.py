@@ -22,11 +22,10 @@ from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
 from runner.service.kept import Kept
 from runner.service.problems import answer_errors, answers
+from runner.service.receiving.model import Upload, UploadLimits
+from runner.service.receiving.uploads import Uploads
 from runner.service.security import Access, Tokens
 from runner.service.settings import Settings
-from runner.service.upload import Limits as UploadLimits
-from runner.service.upload import Upload
-from runner.service.uploads import Uploads
 from runner.service.work import Jobs
 
 API: Final = "/api/v1"

@@ -26,9 +26,9 @@ from runner.errors import (
     StorageError,
 )
 from runner.service.queue import NoSuchJob, NotPossibleNow, QueueFull
+from runner.service.receiving.model import Conflict, TooLarge, TooMany
 from runner.service.refused import Refused
 from runner.service.settings import Settings
-from runner.service.upload import Conflict, TooLarge, TooMany
 
 __all__ = ["Refused", "answer_errors", "answers", "content", "refusal", "status_of", "trouble_of"]
 

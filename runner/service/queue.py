@@ -20,15 +20,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Self, get_args
+from typing import Any, Final, Literal, Self, get_args
 
 from runner.config.document import write_yaml
 from runner.documents import read_object
 from runner.errors import RunnerError, StorageError
-from runner.locking import acquired
-
-if TYPE_CHECKING:
-    from filelock import FileLock
+from runner.service.sole import hold
 
 Kind = Literal["config", "sweep"]
 State = Literal["queued", "running", "interrupted", "finished", "failed", "cancelled"]
@@ -39,7 +36,7 @@ SUBMITTED_FILE: Final = "submitted.yaml"
 CONFIG_FILE: Final = "config.yaml"
 RUNS_FILE: Final = "runs.json"
 EVENTS_FILE: Final = "events.jsonl"
-LOCK_FILE: Final = "queue.lock"
+_LOCK: Final = f"{FOLDER}/queue.lock"
 OVER: Final = ("finished", "failed", "cancelled")
 """States in which nothing more happens unless somebody asks for it."""
 MAX_JOB_BYTES: Final = 1 << 20
@@ -120,7 +117,7 @@ class Queue:
         self.folder = recordings / FOLDER
         self._most_waiting, self._most_kept = most_waiting, most_kept
         self._lock = threading.RLock()
-        self._held = _hold(self.folder)
+        self._held = hold(recordings, _LOCK)
         self._jobs = dict(sorted((job.number, job) for job in _read_jobs(self.folder)))
 
     def __enter__(self) -> Self:
@@ -285,7 +282,7 @@ def require_free(recordings: Path) -> None:
         RunnerError: one does.
         StorageError: the folder cannot be written.
     """
-    _hold(recordings / FOLDER).release()
+    hold(recordings, _LOCK).release()
 
 
 def runs_in(folder: Path) -> dict[int, str]:
@@ -300,15 +297,6 @@ def runs_in(folder: Path) -> dict[int, str]:
 def now() -> str:
     """Return the time, as jobs have it."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
-
-
-def _hold(folder: Path) -> FileLock:
-    """Keep every other process from the queue, as long as this one lives."""
-    busy = RunnerError(
-        f"{folder.parent} is served by another process already; stop that one, or choose another "
-        "--recordings."
-    )
-    return acquired(folder / LOCK_FILE, busy)
 
 
 def _read_jobs(folder: Path) -> Iterator[Job]:

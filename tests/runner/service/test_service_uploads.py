@@ -21,17 +21,18 @@ from runner.labels import Labels, change_labels
 from runner.packing.packing import pack
 from runner.resume import resume
 from runner.runs import create_run, list_runs
-from runner.service.upload import (
+from runner.service.receiving.folder import FOLDER
+from runner.service.receiving.model import (
     Announcement,
     Completion,
     Conflict,
-    Limits,
     Told,
     ToldLabels,
     TooLarge,
     TooMany,
+    UploadLimits,
 )
-from runner.service.uploads import FOLDER, Uploads
+from runner.service.receiving.uploads import Uploads
 from tests.runner.recording.making import TAXIS, experiment, make_run, stopping_after, with_id
 from tests.waiting import until
 
@@ -40,7 +41,7 @@ ANNA, BEN = "anna", "ben"
 
 @pytest.fixture
 def uploads(tmp_path):
-    made = Uploads(tmp_path / "runs", Limits(spare_bytes=0))
+    made = Uploads(tmp_path / "runs", UploadLimits(spare_bytes=0))
     yield made
     made.close()
 
@@ -133,7 +134,7 @@ def test_what_was_received_outlives_the_server(lake, tmp_path):
     ):
         sink.write(data[:5_000])
         raise ConnectionError
-    with pytest.raises(RunnerError, match="another server"):
+    with pytest.raises(RunnerError, match="is served by another process already"):
         Uploads(tmp_path / "runs")
     first.close()
     second = Uploads(tmp_path / "runs")
@@ -308,7 +309,7 @@ def test_a_client_that_lies_or_errs_gets_no_further(uploads, lake):
 
 
 def test_what_is_too_much_is_not_taken(lake, tmp_path):
-    uploads = Uploads(tmp_path / "runs", Limits(most_bytes=1_000, most_open=2))
+    uploads = Uploads(tmp_path / "runs", UploadLimits(most_bytes=1_000, most_open=2))
     with pytest.raises(TooLarge, match="1,000"):
         uploads.begin(ANNA, Announcement(size=1_001))
     first, _ = uploads.begin(ANNA, Announcement())
@@ -320,7 +321,7 @@ def test_what_is_too_much_is_not_taken(lake, tmp_path):
     uploads.give_up(first.upload_id, ANNA)
     uploads.begin(BEN, Announcement())
     uploads.close()
-    full = Uploads(tmp_path / "full", Limits(spare_bytes=1 << 60))
+    full = Uploads(tmp_path / "full", UploadLimits(spare_bytes=1 << 60))
     with pytest.raises(StorageError, match="room for 0 bytes"):
         full.begin(ANNA, Announcement(size=10))
     full.close()
@@ -338,7 +339,7 @@ def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
         room[0] -= written
         return written
 
-    monkeypatch.setattr("runner.service.appending.os.write", full)
+    monkeypatch.setattr("runner.service.receiving.appending.os.write", full)
     with (
         pytest.raises(StorageError, match="No space left"),
         uploads.appending(upload.upload_id, ANNA, 0, None) as sink,
@@ -352,11 +353,13 @@ def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
 
 
 def test_what_is_left_free_stays_free_also_of_bytes_whose_number_is_not_said(tmp_path, monkeypatch):
-    uploads = Uploads(tmp_path / "runs", Limits(spare_bytes=5_000))
+    uploads = Uploads(tmp_path / "runs", UploadLimits(spare_bytes=5_000))
     upload, _ = uploads.begin(ANNA, Announcement())
     free = iter((7_000, 7_000, 6_000))
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr("runner.service.uploads.shutil.disk_usage", lambda _: usage._replace(free=next(free)))
+    monkeypatch.setattr(
+        "runner.service.receiving.folder.shutil.disk_usage", lambda _: usage._replace(free=next(free))
+    )
     with uploads.appending(upload.upload_id, ANNA, 0, None) as sink:
         sink.write(bytes(2_000))
         with pytest.raises(StorageError, match="room for 1,000 bytes"):
@@ -367,7 +370,7 @@ def test_what_is_left_free_stays_free_also_of_bytes_whose_number_is_not_said(tmp
 
 def test_of_what_is_over_only_so_much_is_remembered(lake, tmp_path):
     shutil.copytree(lake.folder, tmp_path / "runs" / lake.run_id)
-    uploads = Uploads(tmp_path / "runs", Limits(most_open=3))
+    uploads = Uploads(tmp_path / "runs", UploadLimits(most_open=3))
     for number in range(9):
         known = {"run_id": lake.run_id, "content_digest": lake.summary["content_digest"]}
         upload, _ = uploads.begin(ANNA, Announcement(digest=f"{number:064}", **known))

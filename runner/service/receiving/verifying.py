@@ -1,6 +1,6 @@
 """Verifying an upload, by a process of its own that has bounds and may die; what passes becomes a run.
 
-    python -m runner.service.verifying recordings/.uploads/4f0c… recordings
+    python -m runner.service.receiving.verifying recordings/.uploads/4f0c… recordings
 
 prints its verdict as JSON.
 """
@@ -25,7 +25,7 @@ from runner.documents import sync
 from runner.errors import RunnerError, StorageError
 from runner.hashing import hash_of
 from runner.labels import labels_from
-from runner.service.upload import BODY_FILE, Completion, read_upload
+from runner.service.receiving.model import BODY_FILE, Completion, read_upload
 
 PATIENCE_SECONDS: Final = 120.0
 """A verification may last so long,"""

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 
 from runner.errors import StorageError
-from runner.service.upload import TooLarge
+from runner.service.receiving.model import TooLarge
 
 
 @contextlib.contextmanager

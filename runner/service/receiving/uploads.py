@@ -1,49 +1,37 @@
-"""Uploads: recordings and packed runs on their way into a folder of runs; no HTTP in it.
-
-    recordings/.uploads/4f0c…/upload.json    what it is, and where it stands; replaced whole
-    recordings/.uploads/4f0c…/body           the bytes so far: its length is the offset to go on from
+"""Uploads: recordings and packed runs on their way into a folder of runs; what may be done with one when.
 
 An upload is received, piece by piece and in order; then verified, by a process of its own; and then stored,
-which is one renaming, or refused. The folder is the truth: a server that was killed goes on where it stands.
+which is one renaming, or refused.
 """
 
 from __future__ import annotations
 
 import contextlib
 import secrets
-import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Self
 
-from filelock import FileLock
-
-from runner.documents import sync, write_whole
-from runner.errors import RunnerError, RunNotFound, StorageError
-from runner.locking import acquired
+from runner.errors import RunNotFound, StorageError
 from runner.runs import run_of_id
-from runner.service.appending import Appending, on_disk
-from runner.service.upload import (
-    BODY_FILE,
-    STATE_FILE,
+from runner.service.receiving.appending import Appending
+from runner.service.receiving.folder import UploadFolder
+from runner.service.receiving.model import (
     Announcement,
     Completion,
     Conflict,
-    Limits,
     State,
     TooLarge,
     TooMany,
     Upload,
-    read_upload,
+    UploadLimits,
 )
-from runner.service.verifying import Verdict, Verifier
+from runner.service.receiving.verifying import Verdict, Verifier
 
-FOLDER: Final = ".uploads"
-LOCK_FILE: Final = "lock"
 FLUSHED_BYTES: Final = 8 << 20
 """A request that brought so much is put on disk while the next one comes, not only at the end."""
 SWEEP_SECONDS: Final = 600.0
@@ -66,21 +54,18 @@ class Uploads:
     def __init__(
         self,
         recordings: Path,
-        limits: Limits = Limits(),  # noqa: B008 - frozen
+        limits: UploadLimits = UploadLimits(),  # noqa: B008 - frozen
         settled: Callable[[Upload], object] = lambda _: None,
     ) -> None:
         self.limits = limits
         self._tell = settled
         self._recordings = recordings
-        self._folder = recordings / FOLDER
         self._guard = threading.RLock()
         self._swept = 0.0
         self._used: set[str] = set()
-        self._lock = _only_server(self._folder)
-        self._uploads = {upload.upload_id: upload for upload in _read_all(self._folder)}
+        self._folder = UploadFolder(recordings)
+        self._uploads = {upload.upload_id: upload for upload in self._folder.read()}
         self._verifier = Verifier()
-        self._flushing: dict[str, list[Future[None]]] = {}
-        self._flusher = ThreadPoolExecutor(1, "flushing")
         self._pool = ThreadPoolExecutor(limits.verifiers, "verifying")
         self._forget_old()
         for upload in self._uploads.values():
@@ -91,8 +76,7 @@ class Uploads:
         """Stop; what is being verified will be verified anew."""
         self._verifier.stop()
         self._pool.shutdown(wait=True, cancel_futures=True)
-        self._flusher.shutdown(wait=True, cancel_futures=True)
-        self._lock.release()
+        self._folder.close()
 
     def __enter__(self) -> Self:
         return self
@@ -122,8 +106,7 @@ class Uploads:
     def offset(self, upload: Upload) -> int:
         """Return how many bytes of it are there."""
         if upload.state == "receiving":
-            with on_disk():
-                return self._body(upload.upload_id).stat().st_size
+            return self._folder.length(upload.upload_id)
         return upload.size or 0
 
     # --- receiving ------------------------------------------------------------------------------------
@@ -157,7 +140,9 @@ class Uploads:
                 run_id=run_id,
                 already=bool(run_id),
             )
-            self._create(upload)
+            self._forget_some()
+            self._folder.add(upload)
+            self._uploads[upload.upload_id] = upload
             return upload, True
 
     @contextlib.contextmanager
@@ -183,15 +168,11 @@ class Uploads:
             if offset + (length or 0) > most:
                 raise TooLarge(f"found {offset + (length or 0):,} bytes, expected at most {most:,}.")
             self._check_free(length or 0)
-            with on_disk():
-                stream = self._body(upload_id).open("ab", buffering=0)
-            with stream:
+            with self._folder.open(upload_id) as stream:
                 sink = Appending(stream.fileno(), most - offset, self._check_free)
                 yield sink
             if sink.written >= FLUSHED_BYTES:
-                with self._guard:
-                    flushed = self._flusher.submit(sync, self._body(upload_id))
-                    self._flushing.setdefault(upload_id, []).append(flushed)
+                self._folder.begin_flush(upload_id)
 
     def complete(self, upload_id: str, owner: str, completion: Completion) -> Upload:
         """Say that all is there; it is put on disk, and verified. Returns the upload as it then is.
@@ -199,34 +180,21 @@ class Uploads:
         Raises:
             Conflict: it is not all there, or another digest was announced or completed.
         """
-        with self._in_use(upload_id, owner) as upload, on_disk():
+        with self._in_use(upload_id, owner) as upload:
             if upload.state != "receiving":
                 return _repeated(upload, completion)
             if (there := self.offset(upload)) != completion.size:
                 raise Conflict(f"found {there:,} bytes, expected the {completion.size:,} of the completion.")
             if upload.announced.digest not in (None, completion.digest):
                 raise Conflict("found another digest than the one announced; begin another upload.")
-            self._await_flushed(upload_id)
-            sync(self._body(upload_id))
+            self._folder.flush(upload_id)
             changes = {"state": "verifying", "completion": completion, "problem": ""}
             completed = upload.model_copy(update=changes)
-            self._write(completed)
+            self._folder.write(completed)
             with self._guard:
                 self._uploads[upload_id] = completed
         self._pool.submit(self._verify, upload_id)
         return completed
-
-    def _await_flushed(self, upload_id: str) -> None:
-        """Wait for what is being put on disk already.
-
-        Raises:
-            OSError: it could not be.
-        """
-        with self._guard:
-            begun = self._flushing.pop(upload_id, [])
-        for flushed in begun:
-            if not flushed.cancel():
-                flushed.result()
 
     def give_up(self, upload_id: str, owner: str) -> None:
         """Forget an upload, and remove what was received.
@@ -287,9 +255,7 @@ class Uploads:
         self._check_free(size or 0)
 
     def _check_free(self, size: int) -> None:
-        free = shutil.disk_usage(self._folder).free - self.limits.spare_bytes
-        if size > free:
-            raise StorageError(f"the server has room for {max(free, 0):,} bytes, expected {size:,}.")
+        self._folder.require_free(size, self.limits.spare_bytes)
 
     def _verify(self, upload_id: str) -> None:
         """Have an upload verified, and say what came of it; the bytes go once they are needed no more."""
@@ -297,39 +263,24 @@ class Uploads:
             upload = self._uploads.get(upload_id)
         if upload is None or upload.state != "verifying":
             return
-        verdict = self._verifier.verify(self._folder / upload_id, self._recordings)
+        verdict = self._verifier.verify(self._folder.of(upload_id), self._recordings)
         if verdict is None:
             return  # the server stops
         settled = upload.model_copy(update=_settled(verdict))
         with contextlib.suppress(StorageError):  # after a restart it is verified once more, to the same end
-            self._write(settled)
+            self._folder.write(settled)
         if settled.state != "receiving":
-            self._body(upload_id).unlink(missing_ok=True)
+            self._folder.remove_body(upload_id)
         self._tell(settled)
         with self._guard:
             self._uploads[upload_id] = settled
-
-    def _write(self, upload: Upload) -> None:
-        with on_disk():
-            write_whole(self._folder / upload.upload_id / STATE_FILE, upload.model_dump(mode="json"))
-
-    def _create(self, upload: Upload) -> None:
-        self._forget_some()
-        with on_disk():
-            (self._folder / upload.upload_id).mkdir(parents=True)
-            self._body(upload.upload_id).touch()
-        self._write(upload)
-        self._uploads[upload.upload_id] = upload
-
-    def _body(self, upload_id: str) -> Path:
-        return self._folder / upload_id / BODY_FILE
 
     def _forget_old(self) -> None:
         """Forget the uploads to which nothing comes any more, and those that are long over."""
         self._swept, now = time.monotonic(), time.time()
         with self._guard:
             for upload in list(self._uploads.values()):
-                days = (now - self._touched(upload)) / 86400
+                days = (now - self._folder.touched(upload)) / 86400
                 idle = upload.state == "receiving" and upload.upload_id not in self._used
                 most = self.limits.idle_days if idle else self.limits.kept_days
                 if (idle or upload.state in ("stored", "refused")) and days > most:
@@ -341,19 +292,9 @@ class Uploads:
         for upload in sorted(over, key=lambda upload: upload.created)[: -self.limits.most_open]:
             self._forget(upload)
 
-    def _touched(self, upload: Upload) -> float:
-        """Return when something of an upload last changed, in seconds."""
-        folder = self._folder / upload.upload_id
-        times = [datetime.fromisoformat(upload.created).timestamp()]
-        for path in (folder / STATE_FILE, folder / BODY_FILE):
-            with contextlib.suppress(OSError):
-                times.append(path.stat().st_mtime)
-        return max(times)
-
     def _forget(self, upload: Upload) -> None:
         del self._uploads[upload.upload_id]
-        self._flushing.pop(upload.upload_id, None)
-        shutil.rmtree(self._folder / upload.upload_id, ignore_errors=True)
+        self._folder.remove(upload.upload_id)
 
 
 def _settled(verdict: Verdict) -> dict[str, Any]:
@@ -374,20 +315,3 @@ def _repeated(upload: Upload, completion: Completion) -> Upload:
     if upload.completion is not None and upload.completion.digest != completion.digest:
         raise Conflict("the upload was completed with another digest; begin another one.")
     return upload
-
-
-def _only_server(folder: Path) -> FileLock:
-    """Return the lock of a folder of uploads, acquired; errors as for `runner.locking.acquired`."""
-    busy = RunnerError(f"{folder.parent}: another server has this folder; stop it first.")
-    return acquired(folder / LOCK_FILE, busy)
-
-
-def _read_all(folder: Path) -> Iterator[Upload]:
-    """Yield the uploads in a folder; of which it is not known what they are, they are removed."""
-    for entry in list(folder.iterdir()):
-        if not entry.is_dir():
-            continue
-        try:
-            yield read_upload(entry)
-        except (OSError, ValueError):
-            shutil.rmtree(entry, ignore_errors=True)

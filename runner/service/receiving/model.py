@@ -36,7 +36,7 @@ class TooMany(RunnerError):
 
 
 @dataclass(frozen=True)
-class Limits:
+class UploadLimits:
     """What a server takes."""
 
     most_bytes: int = 100 * 10**9
