@@ -11,7 +11,6 @@ What was sent before a connection broke is not sent again; the same run pushed t
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable, Iterator, Mapping
 from http import HTTPStatus
 from pathlib import Path
@@ -23,7 +22,8 @@ from runner.hashing import hash_of
 from runner.runs import Run
 from runner.service import watching
 from runner.service.address import checked_url
-from runner.service.parcel import Parcel, Sent, ServerAway, ServerError
+from runner.service.away import Patience, ServerAway, ServerError
+from runner.service.parcel import Parcel, Sent
 from runner.service.watching import Happened, JobThere
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ API: Final = "/api/v1"
 PIECE: Final = 32 << 20
 """So much is sent in one request; a proxy in front of the server must let it pass."""
 _READ: Final = 1 << 20
-_FIRST_PAUSE, _LONGEST_PAUSE = 0.2, 5.0
 _WAIT_SECONDS: Final = 20
 _PASSING: Final = (408, 429, 500, 502, 503, 504, 507)
 """What a server answers that may answer otherwise a little later."""
@@ -51,15 +50,22 @@ class Client:
         url: where it is, such as `http://localhost:8000`.
         token: what lets it in; `found_token()` looks for one where it is usually kept.
         patience: for so many seconds it is tried again when the server is away.
+        tell: told what is waited for meanwhile.
 
     Raises:
         RunnerError: it is no address of a server.
         MissingExtra: HTTPX is not installed.
     """
 
-    def __init__(self, url: str, token: str | None = None, patience: float = 60.0) -> None:
+    def __init__(
+        self,
+        url: str,
+        token: str | None = None,
+        patience: float = 60.0,
+        tell: Callable[[str], object] = lambda _: None,
+    ) -> None:
         self.url = checked_url(url)
-        self.patience = patience
+        self._patience, self._tell = patience, tell
         try:
             import httpx2
         except ImportError as error:
@@ -104,7 +110,7 @@ class Client:
 
     def watch(self, number: int) -> Iterator[Happened]:
         """Yield what happens to a job until it is over, as `watching.watch` does; it says what is raised."""
-        return watching.watch(self, number, self.patience)
+        return watching.watch(self, number)
 
     def cancel(self, number: int) -> JobThere:
         """Have a job not be done, or stopped; what it has recorded is kept. Errors as of `ask`."""
@@ -145,9 +151,9 @@ class Client:
         if isinstance(parcel, Run):
             parcel = Parcel.of(parcel)
         size, digest = _size_and_digest(parcel.path)
-        sent = _Delivery(self, parcel, size, digest, report, begun).done(self.patience)
+        sent = _Delivery(self, parcel, size, digest, report, begun).done()
         if sent.state == "refused" and begun is not None:  # the file has become another since it began
-            sent = _Delivery(self, parcel, size, digest, report, None).done(self.patience)
+            sent = _Delivery(self, parcel, size, digest, report, None).done()
         if sent.state == "refused":
             raise ServerError(f"{self.url}: refused the run {parcel.run_id}: {sent.problem}")
         return sent
@@ -230,7 +236,11 @@ class Client:
                 raise ServerError(f"{self.url}: the recording has become another meanwhile; pull it again.")
             yield from answer.iter_raw(_READ)
 
-    # --- both -----------------------------------------------------------------------------------------
+    # --- all ------------------------------------------------------------------------------------------
+
+    def patience(self) -> Patience:
+        """Return what waits while the server is away."""
+        return Patience(self._patience, self._tell)
 
     def ask(self, method: str, path: str, **request: Any) -> httpx2.Response:
         """Return the answer to a request, which is no error.
@@ -249,30 +259,9 @@ class Client:
         if answer.is_success:
             return
         kind = ServerAway if answer.status_code in _PASSING else ServerError
-        raise kind(f"{self.url}: {_message(answer)}", answer.status_code)
-
-
-class Patience:
-    """Waits ever longer while nothing moves, and has an end.
-
-    Args:
-        seconds: how long nothing may move.
-    """
-
-    def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
-        self.moved()
-
-    def moved(self) -> None:
-        """Say that something moved."""
-        self._moved, self._pause = time.monotonic(), _FIRST_PAUSE
-
-    def wait(self, error: ServerError) -> None:
-        """Wait a while after an error; raise it when there was enough of that."""
-        if time.monotonic() + self._pause > self._moved + self._seconds:
-            raise error
-        time.sleep(self._pause)
-        self._pause = min(2 * self._pause, _LONGEST_PAUSE)
+        retry = answer.headers.get("retry-after", "")
+        seconds = float(retry) if retry.isdecimal() else 0.0
+        raise kind(f"{self.url}: {_message(answer)}", answer.status_code, seconds)
 
 
 class _Delivery:
@@ -286,13 +275,13 @@ class _Delivery:
         self._sent = begun
         self._is_stale = begun is not None
 
-    def done(self, patience: float) -> Sent:
+    def done(self) -> Sent:
         """Return the upload when it is stored or refused.
 
         Raises:
             ServerError: the server refuses the request, or was away for longer than the patience.
         """
-        furthest, patient = -1, Patience(patience)
+        furthest, patience = -1, self._client.patience()
         while True:
             try:
                 sent = self._sent = self._step()
@@ -300,7 +289,7 @@ class _Delivery:
             except ServerError as error:
                 if not _may_pass(error):
                     raise
-                patient.wait(error)
+                patience.wait(error)
                 self._sent = None if error.status == HTTPStatus.NOT_FOUND else self._sent
                 self._is_stale = True
                 continue
@@ -308,7 +297,7 @@ class _Delivery:
                 return sent
             if sent.offset > furthest:
                 furthest = sent.offset
-                patient.moved()
+                patience.moved()
             self._report(sent.offset, self._size)
 
     def _step(self) -> Sent:

@@ -22,8 +22,9 @@ from runner.errors import RunnerError
 from runner.locking import locked
 from runner.runs import Run, list_runs
 from runner.service.address import found_token
+from runner.service.away import ServerAway
 from runner.service.client import Client, Report
-from runner.service.parcel import Sent, ServerAway
+from runner.service.parcel import Sent
 
 OUTBOX_VARIABLE: Final = "DUALTAXI_OUTBOX"
 STATE_VARIABLE: Final = "XDG_STATE_HOME"

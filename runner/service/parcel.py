@@ -1,4 +1,4 @@
-"""What goes to a server and how it stands there; what a server may answer instead."""
+"""What goes to a server, and how it stands there."""
 
 from __future__ import annotations
 
@@ -9,20 +9,6 @@ from typing import Any
 
 from runner.errors import RunnerError
 from runner.runs import Run
-
-
-class ServerError(RunnerError):
-    """A server refuses what was asked of it; its own words stand in the message."""
-
-    exit_code = 1
-
-    def __init__(self, message: str, status: int = 0) -> None:
-        super().__init__(message)
-        self.status = status
-
-
-class ServerAway(ServerError):
-    """A server does not answer, or cannot do what was asked at present."""
 
 
 @dataclass(frozen=True)

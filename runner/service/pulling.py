@@ -14,8 +14,8 @@ from filelock import FileLock, Timeout
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.labels import labels_from
 from runner.packing.admission import Admitted, admit
-from runner.service.client import Client, Patience, Report
-from runner.service.parcel import ServerAway, ServerError
+from runner.service.away import ServerAway, ServerError
+from runner.service.client import Client, Report
 
 if TYPE_CHECKING:
     import httpx2
@@ -105,7 +105,7 @@ def _fetch(client: Client, place: str, tag: str, size: int, part: Path, report: 
         StorageError: there is no room.
         OSError: it cannot be written.
     """
-    patience = Patience(client.patience)
+    patience = client.patience()
     with part.open("ab") as stream:
         lacking, free = size - stream.tell(), shutil.disk_usage(part.parent).free
         if lacking > free:

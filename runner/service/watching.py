@@ -7,17 +7,14 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from runner.errors import RunnerError
-from runner.service.parcel import ServerAway
+from runner.service.away import FIRST_PAUSE, ServerAway
 from runner.service.queue import OVER
 
 if TYPE_CHECKING:
     from runner.service.client import Client
-
-_FIRST_PAUSE: Final = 0.2
-_LONGEST_PAUSE: Final = 5.0
 
 
 @dataclass(frozen=True)
@@ -66,23 +63,22 @@ class Happened:
     """What to come back to; empty for progress."""
 
 
-def watch(client: Client, number: int, patience: float) -> Iterator[Happened]:
+def watch(client: Client, number: int) -> Iterator[Happened]:
     """Yield what happens to a job until it is over, whatever the connection does meanwhile.
 
     Args:
         client: of the server.
         number: which job.
-        patience: for so many seconds it is tried again when the server is away.
 
     Raises:
         ServerError: there is no such job, or the server refuses.
         ServerAway: the server did not answer for too long.
     """
-    place, pause, away = "", _FIRST_PAUSE, 0.0
+    place, patience = "", client.patience()
     while True:
         try:
             with client.stream(f"/jobs/{number}/events", {"Last-Event-ID": place}) as answer:
-                pause, away = _FIRST_PAUSE, 0.0
+                patience.moved()
                 if answer.status_code == HTTPStatus.NO_CONTENT:
                     return
                 for happened in events_in(answer.iter_lines()):
@@ -90,12 +86,9 @@ def watch(client: Client, number: int, patience: float) -> Iterator[Happened]:
                     yield happened
             if client.job(number).is_over:
                 return
-        except ServerAway:
-            away = away or time.monotonic()
-            if time.monotonic() - away > patience:
-                raise
-        time.sleep(pause)
-        pause = min(2 * pause, _LONGEST_PAUSE)
+            time.sleep(FIRST_PAUSE)
+        except ServerAway as error:
+            patience.wait(error)
 
 
 def events_in(lines: Iterable[str]) -> Iterator[Happened]:

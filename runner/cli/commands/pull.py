@@ -14,6 +14,7 @@ from runner.cli.options import (
     token_file_option,
     token_option,
 )
+from runner.cli.output import say
 
 
 @click.command("pull")
@@ -48,7 +49,7 @@ def command(
     from runner.service.client import Client
 
     with (
-        Client(required(server), found_token(token, token_file)) as client,
+        Client(required(server), found_token(token, token_file), tell=say) as client,
         bytes_line(f"pulling {run_name}") as report,
     ):
         pulled = client.pull(run_name, recordings_folder(recordings), report)

@@ -93,7 +93,7 @@ def _runs(
         sent = client.push(parcel, report)
         return sent, parcel.name, parcel.path.stat().st_size
 
-    with Client(server, token) as client:
+    with Client(server, token, tell=say) as client:
         for name in names:
             yield name, partial(push, name)
 
@@ -105,7 +105,7 @@ def _outbox(server: str | None, token: str | None) -> Iterator[tuple[str, Push]]
 
     def push(run: Run, url: str, report: Report) -> tuple[Sent, str, int]:
         size = run.recording.stat().st_size
-        with Client(url, token) as client:
+        with Client(url, token, tell=say) as client:
             return deliver(run, client, report), run.name, size
 
     found = waiting(outbox_folder())

@@ -47,7 +47,7 @@ def command(
     from runner.service.address import found_token
     from runner.service.client import Client
 
-    with Client(required(server), found_token(token, token_file)) as client:
+    with Client(required(server), found_token(token, token_file), tell=say) as client:
         job = client.submit(text_of(file), file.name)
         runs = "1 run" if job.runs == 1 else f"{job.runs:,} runs"
         say(f"Job {job.number}: {job.name}, {runs}; {client.url}/queue/{job.number}")

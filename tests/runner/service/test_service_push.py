@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
+import httpx2
 import pytest
 from blake3 import blake3
 from click.testing import CliRunner
@@ -30,9 +31,10 @@ from runner.packing.packing import pack
 from runner.runs import list_runs
 from runner.service import client as client_module
 from runner.service.address import checked_url, found_token
+from runner.service.away import Patience, ServerAway, ServerError
 from runner.service.client import Client
 from runner.service.outbox import outbox_folder
-from runner.service.parcel import Parcel, Sent, ServerAway, ServerError
+from runner.service.parcel import Parcel, Sent
 from tests.runner.recording.making import TAXIS, make_run, with_id
 from tests.waiting import until
 
@@ -158,6 +160,34 @@ def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recor
     ]
     states = own_server.recordings.glob(".uploads/*/upload.json")
     assert all(token not in path.read_text() for path in states)
+
+
+def test_what_is_waited_for_is_told_and_for_as_long_as_the_server_says(monkeypatch):
+    slept, told = [], []
+    monkeypatch.setattr("runner.service.away.time.sleep", slept.append)
+    locked = ServerAway("token: too many wrong ones; try again in 40 s.", 429, 40)
+    patience = Patience(60, told.append)
+    patience.wait(locked)
+    assert (slept, told) == ([40], [f"{locked} Trying again, for 60 s at most."])
+    with pytest.raises(ServerAway, match="too many"):
+        Patience(30, told.append).wait(locked)
+    slept.clear(), told.clear()
+    patience.moved()
+    for _ in range(3):
+        patience.wait(ServerAway("does not answer"))
+    assert (slept, told) == ([0.2, 0.4, 0.8], []), "what is over at once is not told"
+    for _ in range(2):
+        patience.wait(ServerAway("does not answer"))
+    assert (slept[3:], len(told)) == ([1.6, 3.2], 1)
+
+
+def test_how_long_a_server_has_one_wait_is_heard():
+    answer = httpx2.Response(429, headers={"retry-after": "40"}, json={"error": {"message": "too many"}})
+    with Client("http://localhost:8000") as client:
+        client._http = httpx2.Client(transport=httpx2.MockTransport(lambda _: answer), base_url=client.url)
+        with pytest.raises(ServerAway, match="too many") as raised:
+            client.ask("GET", "/runs")
+    assert (raised.value.status, raised.value.retry_seconds) == (429, 40)
 
 
 def test_tokens_and_addresses_are_checked(tmp_path, monkeypatch):

@@ -10,7 +10,8 @@ from served import Served
 
 from runner.errors import RunnerError
 from runner.runs import list_runs
-from runner.service.client import Client, ServerError
+from runner.service.away import ServerError
+from runner.service.client import Client
 from runner.service.watching import Happened, JobThere, events_in
 
 CONFIG = {"name": "quick", "episodes": 600, "mode": "cooperative", "evaluation": {"every": 50, "trials": 400}}
