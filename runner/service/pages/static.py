@@ -33,7 +33,7 @@ _TYPES: Final = {
 }
 _FOREVER: Final = "public, max-age=31536000, immutable"
 _OWN: Final = (
-    *("charts.js", "job.js", "live.js", "rerun.css", "rerun.js", "run.js"),
+    *("asked.js", "charts.js", "episode.js", "job.js", "live.js", "parts.js", "rerun.css", "rerun.js"),
     *("stepping.js", "submit.js", "table.js"),
 )
 _OTHERS: Final = ("icon.svg", f"{UPLOT}/uPlot.iife.min.js", f"{UPLOT}/LICENSE")

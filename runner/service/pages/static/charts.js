@@ -1,32 +1,31 @@
 // Metrics of one or several runs over training episodes. Of long curves the server gives the lowest and the
 // highest value of each stretch, and says so; what is zoomed into is asked for again, at full resolution.
+import { asked } from "./asked.js";
+
 const box = document.querySelector("[data-charts]");
 const runs = JSON.parse(box.dataset.charts);
 const plots = box.querySelector("[data-plots]"), said = box.querySelector("[data-said]"), form = box.querySelector("form");
-const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777"];
+const COLOURS = 7;  // of lines, in the style
 const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
 const SHARES = "training.reward";
 const shown = new Map();
-let range = asked(), asking = 0;
+let range = part(), asking = 0;
 
-function asked() {
+function part() {
   const query = new URLSearchParams(location.search);
-  const part = (name) => query.get(name) ? Number(query.get(name)) : null;
-  return { from: part("from"), to: part("to") };
+  const end = (name) => query.get(name) ? Number(query.get(name)) : null;
+  return { from: end("from"), to: end("to") };
 }
 
 const look = () => getComputedStyle(document.documentElement);
-const colour = (i) => look().getPropertyValue(`--line-${i % COLOURS.length}`).trim() || COLOURS[i % COLOURS.length];
+const colour = (i) => look().getPropertyValue(`--line-${i % COLOURS}`).trim();
 const spoken = (name) => name.replaceAll("_", " ");
 
 async function curvesOf(run) {
   const query = new URLSearchParams({ points: Math.max(400, Math.round(plots.clientWidth)) });
   if (range.from) query.set("start", Math.max(0, Math.floor(range.from)));
   if (range.to) query.set("stop", Math.ceil(range.to) + 1);
-  const answer = await fetch(`/api/v1/runs/${run.id}/metrics?${query}`);
-  const found = await answer.json();
-  if (!answer.ok) throw new Error(found.error.message);
-  return found.curves;
+  return (await asked(`/api/v1/runs/${run.id}/metrics?${query}`)).curves;
 }
 
 async function draw() {
@@ -151,12 +150,12 @@ function go(from, to, keep = true) {
 
 form.addEventListener("submit", (event) => {
   event.preventDefault();
-  const part = (name) => form.elements[name].value === "" ? null : Number(form.elements[name].value);
-  go(part("from"), part("to"));
+  const end = (name) => form.elements[name].value === "" ? null : Number(form.elements[name].value);
+  go(end("from"), end("to"));
 });
 box.querySelector("[data-reset]").addEventListener("click", () => go(null, null));
 plots.addEventListener("dblclick", () => go(null, null));
-addEventListener("popstate", () => { const { from, to } = asked(); go(from, to, false); });
+addEventListener("popstate", () => { const { from, to } = part(); go(from, to, false); });
 
 let width = plots.clientWidth;
 new ResizeObserver(() => {

@@ -1,4 +1,4 @@
-// A run that is running: how it stands is asked for again and again, until it runs no more.
+// A part of a page that changes: asked for again and again, until the page as a whole is another.
 const place = document.querySelector("[data-live]");
 
 async function look() {

@@ -1,20 +1,14 @@
 // Two replays in step: one slider moves both; where one has ended, it stands still.
+import { onKeys, partAt } from "./parts.js";
+
 const bar = document.querySelector("[data-together]");
 const [slider, button, count] = [".both", ".both-play", ".both-count"].map((name) => bar.querySelector(name));
-const BEFORE = 250;
 let timer = null, writing = null;
-
-async function partOf(source, k) {
-  const answer = await fetch(`${source}?start=${Math.max(0, k - BEFORE)}`);
-  const found = await answer.json();
-  if (!answer.ok) throw new Error(found.error.message);
-  return found;
-}
 
 async function begun(root) {
   const { source } = root.dataset;
-  const told = await partOf(source, 0);
-  const replay = new Replay(root, told, { load: async (k) => (await partOf(source, k)).episode });
+  const told = await partAt(source, 0);
+  const replay = new Replay(root, told, { load: async (k) => (await partAt(source, k)).episode });
   replay.begin(told.episode);
   return replay;
 }
@@ -55,13 +49,5 @@ function play() {
 slider.max = length;
 slider.addEventListener("input", () => { pause(); show(Number(slider.value)); });
 button.addEventListener("click", play);
-document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input:not([type=range]), textarea, select, button, a, summary")) return;
-  const jump = { ArrowLeft: -1, ArrowRight: 1, PageUp: -10, PageDown: 10, Home: -Infinity, End: Infinity }[event.key];
-  if (event.key === " ") { event.preventDefault(); play(); }
-  if (jump === undefined) return;
-  event.preventDefault();
-  pause();
-  show(Number(slider.value) + jump);
-});
+onKeys("input:not([type=range]), textarea, select, button, a, summary", play, (by) => { pause(); show(Number(slider.value) + by); });
 show(Number(bar.dataset.at));

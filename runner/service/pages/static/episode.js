@@ -1,0 +1,23 @@
+// The replay of an episode: its parts are asked for as they are needed, and the address is that of the step.
+import { onKeys, partAt } from "./parts.js";
+
+const root = document.querySelector("[data-part]"), source = root.dataset.part;
+const onward = root.querySelector("[data-to-rerun]");
+let writing = null;
+
+// Writing each step of a playing replay into the address at once would be too often for browsers.
+function moved(k) {
+  onward.href = `${root.dataset.rerun}:${Math.max(0, k - 1)}`;
+  clearTimeout(writing);
+  writing = setTimeout(() => history.replaceState(null, "", `?t=${k}`), 150);
+}
+
+const at = Number(root.dataset.at);
+const told = await partAt(source, at);
+const replay = new Replay(root, told, { load: async (k) => (await partAt(source, k)).episode, moved });
+replay.begin(told.episode, at);
+
+onKeys("input, textarea, select, button, a, summary", () => replay.play(), (by) => {
+  replay.pause();
+  replay.show(Math.min(replay.length, Math.max(0, replay.k + by)));
+});
