@@ -11,6 +11,7 @@ from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
 from runner.service.guard import address_of
+from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page
 from runner.service.problems import status_of
 from runner.service.security import COOKIE, Access
@@ -35,7 +36,7 @@ async def login(request: Request) -> Response:
     try:
         access.scopes_of(secret, address_of(request.scope))
     except RunnerError as error:
-        return page(request, "login.html", status_of(error), next=where, problem=str(error))
+        return page(request, "login.html", status_of(error), next=where, problem=message_of(error, request))
     answer = RedirectResponse(where if is_local(where) else "/", HTTPStatus.SEE_OTHER)
     answer.set_cookie(COOKIE, secret, max_age=SECONDS, **_cookie_of(request))
     return answer

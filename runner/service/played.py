@@ -6,9 +6,11 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.recording.reader import Recording, open_recording
+from runner.runs import Run
+from runner.service.settings import without_folders
 
 BEHIND: Final = 1
 """Steps before the first that is asked for, so that the one that led there can be told."""
@@ -96,7 +98,7 @@ def _typical_start(recording: Recording) -> int:
         return int(recording.mdp.start.argmax())
 
 
-def spot(run: Any, at: tuple[int, ...]) -> bytes:
+def spot(run: Run, at: tuple[int, ...]) -> bytes:
     """Return the step of the viewer's timeline at (episode, t) or (training episodes before, trial, t)."""
     from runner.export.rerun.selection import Request
     from runner.export.rerun.spots import with_spot
@@ -120,7 +122,10 @@ def sweep(name: str, recordings: Path) -> bytes:
     except RunnerError:  # no trial is finished yet, as the sections say
         pass
     told = {
-        "sections": [asdict(section) for section in sections(results, None)],
+        "sections": [
+            asdict(section) | {"sentences": [without_folders(text, recordings) for text in section.sentences]}
+            for section in sections(results, None)
+        ],
         "pictures": pictures,
         "note": note,
         "runs": {entry.number: list(entry.runs.values()) for entry in results.ranking},

@@ -20,10 +20,12 @@ from runner.runs import Run, relabel
 from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json
 from runner.service.dependencies import CatalogueOf, FoundRun, KeptOf, SettingsOf
-from runner.service.problems import Refused, answers
+from runner.service.problems import answers
+from runner.service.refused import Refused
 
 if TYPE_CHECKING:
     from runner.catalogue.index import Index
+    from runner.service.settings import Settings
 
 router = APIRouter(tags=["runs"])
 
@@ -119,14 +121,15 @@ class Described(BaseModel, extra="allow"):
     responses=answers(HTTPStatus.NOT_FOUND),
     summary="All about a run.",
 )
-def one_run(run: FoundRun) -> Response:
+def one_run(run: FoundRun, settings: SettingsOf) -> Response:
     """Return what `dualtaxi show --json` tells, with the last evaluation instead of all series."""
-    return Response(as_json(summary_of(run)), media_type="application/json")
+    return Response(as_json(summary_of(run, settings)), media_type="application/json")
 
 
-def summary_of(run: Run) -> dict[str, Any]:
+def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
     """Return all about a run but its series; what `run.json` says if its recording cannot be read."""
     problems: list[str] = []
+    error = run.summary.get("error")
     told = described(run, problems.append)
     series = {name: told.pop(name) for name in ("eval", "train", "optimality")}
     del told["path"]
@@ -135,8 +138,8 @@ def summary_of(run: Run) -> dict[str, Any]:
         "note": run.note,
         "last_evaluation": (series["eval"] or [None])[-1],
         "last_optimality": (series["optimality"] or [None])[-1],
-        "error": run.summary.get("error"),
-        "problems": problems,
+        "error": None if error is None else settings.without_folders(error),
+        "problems": [settings.without_folders(problem) for problem in problems],
     }
 
 

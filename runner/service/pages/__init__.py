@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from runner.service.pages import compare, episodes, operation, rerun, run, runs, static, submit
+from runner.service.pages import compare, episodes, operation, replay, rerun, run, runs, static, submit
 from runner.service.pages.problems import answer_errors
 
 __all__ = ["answer_errors", "router"]
 
 router = APIRouter(include_in_schema=False)
-for _part in (runs, rerun, run, episodes, compare, submit, operation, static):
+for _part in (runs, rerun, run, replay, episodes, compare, submit, operation, static):
     router.include_router(_part.router)

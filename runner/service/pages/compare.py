@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
@@ -16,8 +15,16 @@ from runner.service import played
 from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
 from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, state_of
+from runner.service.pages.frame import head_of
 from runner.service.pages.rendering import link, page, picture_address
-from runner.service.pages.run import head_of, parse_spot
+from runner.service.pages.spots import (
+    after_step,
+    episode_in_words,
+    episode_place,
+    episode_text,
+    parse_spot,
+    spot_text,
+)
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
 
@@ -61,7 +68,7 @@ async def divergence(
         "compare_divergence.html",
         **_head(found, "/divergence"),
         told=told,
-        spot=_spot_text,
+        spot=spot_text,
         after=after_step,
     )
 
@@ -94,21 +101,19 @@ async def replay(
     if not spot:
         partings = (await _difference(found, kept, apart))["partings"]
         spot = after_step(partings[0]["spot"]) if partings else (0, 0)
-    phase = "train" if len(spot) == 2 else "eval"
-    place = "/".join(map(str, spot[:-1]))
     around = [_replay_link(found, spot, by) for by in (-1, 1)]
     return page(
         request,
         "compare_replay.html",
         **_head(found, "/replay"),
-        sources=[f"/api/v1/runs/{each.run_id}/replay/{phase}/{place}" for each in found],
-        episode=_episode_in_words(spot),
+        sources=[f"/api/v1/runs/{each.run_id}/replay/{episode_place(spot)}" for each in found],
+        episode=episode_in_words(spot),
         spot=spot,
         before=around[0],
         after=around[1],
         scenes=[_still(each) for each in found],
         base=link("/compare/replay", {"run": [each.run_id for each in found]}),
-        prefix=":".join(["eval"] * (phase == "eval") + [str(part) for part in spot[:-1]]),
+        prefix=episode_text(spot),
     )
 
 
@@ -185,27 +190,12 @@ def _same_content(found: list[Run]) -> bool:
     return len(digests) == 1 and None not in digests
 
 
-def _spot_text(spot: Sequence[int]) -> str:
-    return ":".join(map(str, spot if len(spot) == 2 else ["eval", *spot]))
-
-
-def after_step(spot: list[int]) -> tuple[int, ...]:
-    """Return the place of the frame after a step: the first that shows what differs in it."""
-    return (*spot[:-1], spot[-1] + 1)
-
-
 def _replay_link(found: list[Run], spot: tuple[int, ...], by: int) -> str:
     """Return the address of the episode before or after one; nothing before the first."""
     if spot[-2] + by < 0:
         return ""
     other = [*spot[:-2], spot[-2] + by, 0]
-    return link("/compare/replay", {"run": [each.run_id for each in found], "at": _spot_text(other)})
-
-
-def _episode_in_words(spot: tuple[int, ...]) -> str:
-    if len(spot) == 2:
-        return f"Training episode {spot[0]:,}"
-    return f"Trial {spot[1]} of the evaluation after {spot[0]:,} episodes"
+    return link("/compare/replay", {"run": [each.run_id for each in found], "at": spot_text(other)})
 
 
 def _still(run: Run) -> str:

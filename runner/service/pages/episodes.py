@@ -11,8 +11,8 @@ from runner.frames import episode_columns
 from runner.recording.reader import Recording
 from runner.runs import Run
 from runner.service.dependencies import OpenRecording, RecordedRun
+from runner.service.pages.frame import framed
 from runner.service.pages.rendering import page
-from runner.service.pages.run import framed
 from runner.words import event_in_words
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -19,6 +20,7 @@ from runner.service import played
 from runner.service.api.jobs import Number, queue_told, told
 from runner.service.api.uploads import OwnerOf, UploadsOf, list_uploads
 from runner.service.dependencies import ApartOf, CatalogueOf, JobsOf, KeptOf, SettingsOf
+from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page, picture_address
 from runner.sweep.state import read_sweep, sweeps_in, tag_of
 
@@ -75,8 +77,8 @@ def queue_standing(
 @router.get("/queue/{number}")
 def job(request: Request, jobs: JobsOf, number: Number) -> Response:
     """Show a job: how far it is, what it said, its runs."""
-    found = jobs.queue.job(number)
     log, place = _log(jobs, number)
+    found = jobs.queue.job(number)  # not older than its log: what comes behind that, the page's script hears
     return page(
         request,
         "job.html",
@@ -111,7 +113,7 @@ def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
             try:
                 sweep = read_sweep(name, folder)
             except RunnerError as error:
-                found.append({"name": name, "problem": str(error)})
+                found.append({"name": name, "problem": message_of(error, request)})
                 continue
             found.append(
                 {
@@ -173,7 +175,7 @@ def _queue(jobs: Jobs, number: int) -> dict[str, Any]:
         "standing": queue_told(jobs.standing()),
         "active": any(job.state in ("queued", "running") for job in found),
         "page": number,
-        "pages": max(1, -(-len(found) // ROWS)),
+        "pages": max(1, math.ceil(len(found) / ROWS)),
     }
 
 

@@ -9,7 +9,9 @@ from typing import Any
 
 from fastapi import FastAPI, Request, Response
 
+from runner.errors import RunnerError
 from runner.service.pages.rendering import page
+from runner.service.problems import trouble_of
 
 Handler = Callable[[Request, Exception], Awaitable[Response]]
 
@@ -18,6 +20,11 @@ def answer_errors(app: FastAPI) -> None:
     """Have errors outside of the API answered by a page that says the same."""
     for kind, handler in list(app.exception_handlers.items()):
         app.add_exception_handler(kind, _as_page(handler))
+
+
+def message_of(error: RunnerError, request: Request) -> str:
+    """Return what a page says of an error: what the API would."""
+    return trouble_of(error, request.app.state.settings).message
 
 
 def _as_page(handler: Any) -> Handler:

@@ -22,8 +22,9 @@ from runner.service import played
 from runner.service.api.replay import LONG
 from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
 from runner.service.guard import POLICY
+from runner.service.pages.frame import framed
 from runner.service.pages.rendering import link, page
-from runner.service.pages.run import parse_spot
+from runner.service.pages.spots import episode_in_words, parse_spot, replay_address
 
 router = APIRouter(include_in_schema=False)
 
@@ -32,8 +33,24 @@ FRAME_POLICY: Final = POLICY.replace(
     "default-src 'self';", "default-src 'self'; script-src 'self' 'wasm-unsafe-eval';"
 )
 """WebAssembly is compiled in this one page, and nothing else is allowed in it that is not elsewhere."""
+OVERVIEW: Final = "Some training episodes and the last evaluation."
+"""What the viewer shows unless it is opened at a step."""
 _FOREVER: Final = "public, max-age=31536000, immutable"
 _SECONDS: Final = 60
+
+
+@router.get("/runs/{run}/rerun")
+def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
+    """Show the Rerun viewer, opened at a step."""
+    spot = parse_spot(at)
+    return page(
+        request,
+        "run_rerun.html",
+        **framed(run, "rerun"),
+        told=f"{episode_in_words(spot)}, step {spot[-1]}." if spot else OVERVIEW,
+        back=replay_address(run, spot) if spot else "",
+        frame=link(f"/runs/{run.run_id}/rerun/frame", {"at": at}),
+    )
 
 
 @router.get("/runs/{run}/rerun/frame")

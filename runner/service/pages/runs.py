@@ -16,6 +16,7 @@ from runner.catalogue.filters import Filter, parse
 from runner.catalogue.index import order_of
 from runner.errors import RunnerError
 from runner.service.dependencies import CatalogueOf, KeptOf
+from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import link, render
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ async def runs(
         body = await kept.answer(("runs page", catalogue.version(), request.url.query), make)
     except RunnerError as error:
         status = HTTPStatus.BAD_REQUEST
-        told = _frame(filter, "", USUAL) | {"problem": str(error), "rows": [], "total": None}
+        told = _frame(filter, "", USUAL) | {"problem": message_of(error, request), "rows": [], "total": None}
         body = render("/runs", "runs.html", **told)
     return Response(body, status, media_type="text/html")
 

@@ -226,3 +226,32 @@ def test_how_a_run_stands_is_told_while_it_runs_only(client, recordings):
     page = page_of(client, "/runs/first")
     assert 'data-live="/runs/' in page
     assert "so far" in client.get("/runs/first/standing").text
+
+
+def test_the_page_of_a_run_is_live_from_when_a_job_will_go_on_with_it(client, recordings, monkeypatch):
+    monkeypatch.setattr("runner.service.work.RESERVE_BYTES", 1 << 62)  # so that no job is begun
+    run = find_run("first", recordings).update(status="interrupted")
+    assert "data-live" not in page_of(client, "/runs/first")
+    assert client.get("/runs/first/standing?status=interrupted").status_code == 204
+    assert client.post("/api/v1/jobs", content="env: {id: FrozenLake-v1}\nepisodes: 60").status_code == 201
+    (recordings / ".jobs" / "1" / "runs.json").write_text(json.dumps({"0": run.run_id}))
+    page = page_of(client, "/runs/first")
+    assert f'data-live="/runs/{run.run_id}/standing?status=interrupted"' in page
+    assert "live.js" in page
+    assert client.get("/runs/first/standing?status=interrupted").status_code == 200
+    assert client.get("/runs/first/standing?status=running").status_code == 204, "the page says otherwise"
+    client.post("/queue/1/cancel")
+    assert client.get("/runs/first/standing?status=interrupted").status_code == 204
+
+
+def test_what_a_run_keeps_of_its_failure_does_not_say_where_the_folder_is(client, recordings):
+    run = find_run("first", recordings)
+    error = f"{run.recording.absolute()}: cannot be written"
+    run.update(status="failed", summary=run.summary | {"error": error})
+    run.recording.write_bytes(b"no recording")
+    told = client.get("/api/v1/runs/first")
+    assert told.json()["error"] == f"{run.run_id}/recording.mcap: cannot be written"
+    assert told.json()["problems"]
+    pages = [page_of(client, "/runs/first"), page_of(client, "/runs/first/config")]
+    assert told.json()["error"] in pages[0]
+    assert [text for text in (told.text, *pages) if str(recordings) in text] == []
