@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Final, ParamSpec, TypeVar
 
 from runner.errors import RunnerError
-from runner.service.problems import Refused
+from runner.service.refused import Refused
 
 Args = ParamSpec("Args")
 Answer = TypeVar("Answer")

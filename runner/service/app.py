@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 from collections.abc import AsyncIterator
 from http import HTTPStatus
 from typing import Any, Final
@@ -15,12 +14,13 @@ from fastapi import APIRouter, FastAPI
 
 from runner import __version__
 from runner.errors import RunnerError
-from runner.service import health, login, logs, pages
+from runner.service import health, login, pages
 from runner.service.apart import Apart
 from runner.service.api import comparing, files, jobs, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
 from runner.service.kept import Kept
+from runner.service.logs import LOG, AccessLog
 from runner.service.problems import answer_errors, answers
 from runner.service.receiving.model import Upload, UploadLimits
 from runner.service.receiving.uploads import Uploads
@@ -33,7 +33,6 @@ THREADS: Final = 8
 """Requests that are worked on at the same time; the others wait."""
 PROCESSES: Final = 2
 """Comparisons, pictures and exports that are made at the same time, each in a process of its own."""
-LOG: Final = logging.getLogger("dualtaxi.service")
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -66,7 +65,7 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.stopping = asyncio.Event()
     app.state.access = Access(settings.tokens, settings.limits)
     app.add_middleware(Guard, settings=settings, access=app.state.access)
-    app.add_middleware(logs.Access)
+    app.add_middleware(AccessLog)
     answer_errors(app)
     pages.answer_errors(app)
     app.include_router(_api(), prefix=API)

@@ -88,7 +88,10 @@ def recorded_run(run: FoundRun) -> Run:
     return found
 
 
-def opened_recording(run: Annotated[Run, Depends(recorded_run)]) -> Iterator[Recording]:
+RecordedRun = Annotated[Run, Depends(recorded_run)]
+
+
+def opened_recording(run: RecordedRun) -> Iterator[Recording]:
     """Give the recording of the run that the path names, opened.
 
     Raises:
@@ -98,7 +101,6 @@ def opened_recording(run: Annotated[Run, Depends(recorded_run)]) -> Iterator[Rec
         yield recording
 
 
-RecordedRun = Annotated[Run, Depends(recorded_run)]
 OpenRecording = Annotated[Recording, Depends(opened_recording)]
 
 

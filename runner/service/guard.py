@@ -14,7 +14,8 @@ from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 
 from runner.errors import RunnerError
-from runner.service.problems import Refused, refusal, status_of, trouble_of
+from runner.service.problems import refusal, status_of, trouble_of
+from runner.service.refused import Refused
 from runner.service.security import (
     COOKIE,
     SAFE_METHODS,

@@ -133,7 +133,7 @@ class _Lines(logging.Handler):
                 line = line[os.write(self._descriptor, line) :]
 
 
-class Access:
+class AccessLog:
     """Logs each request when its answer is over: who, what, how it went, how long it took."""
 
     def __init__(self, app: ASGIApp) -> None:

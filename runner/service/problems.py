@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import logging
 from http import HTTPStatus
 from typing import Any, Final
 
@@ -25,14 +24,11 @@ from runner.errors import (
     RunNotFound,
     StorageError,
 )
+from runner.service.logs import LOG
 from runner.service.queue import NoSuchJob, NotPossibleNow, QueueFull
 from runner.service.receiving.model import Conflict, TooLarge, TooMany
 from runner.service.refused import Refused
 from runner.service.settings import Settings
-
-__all__ = ["Refused", "answer_errors", "answers", "content", "refusal", "status_of", "trouble_of"]
-
-LOG: Final = logging.getLogger("dualtaxi.service")
 
 _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
     ConfigError: HTTPStatus.UNPROCESSABLE_ENTITY,

@@ -1,4 +1,4 @@
-"""Who may do what: tokens, the host that was asked for, same origin for writing, and what a page may load.
+"""Who may do what: tokens, the host that was asked for, same origin for writing.
 
 A *token* is 256 random bits. Its SHA-256 is kept, with its scopes, in a file of the user's; a slow hash is
 for secrets that people choose. On a loopback host, reading needs none, and writing needs the same origin or

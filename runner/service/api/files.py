@@ -13,7 +13,8 @@ from fastapi.responses import FileResponse
 from runner.runs import Run
 from runner.service import computed
 from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
-from runner.service.problems import Refused, answers
+from runner.service.problems import answers
+from runner.service.refused import Refused
 
 router = APIRouter(
     prefix="/runs/{run}",

@@ -15,8 +15,9 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 
 from runner.service.dependencies import JobsOf
-from runner.service.problems import Refused, answers, content
+from runner.service.problems import answers, content
 from runner.service.queue import Job, Kind, NoSuchJob, State
+from runner.service.refused import Refused
 from runner.service.work import SOURCE, Jobs, Standing
 
 LOOK_SECONDS: Final = 0.25

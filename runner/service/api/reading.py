@@ -14,7 +14,8 @@ from runner.service import computed
 from runner.service.computed import too_many
 from runner.service.dependencies import ApartOf, KeptOf, OpenRecording, RecordedRun, SettingsOf, state_of
 from runner.service.kept import ALWAYS
-from runner.service.problems import Refused, answers, content
+from runner.service.problems import answers, content
+from runner.service.refused import Refused
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -254,15 +255,21 @@ async def plot(
 
 
 async def _q_table(
-    run: Any, request: Request, kept: Any, apart: Any, step: Any, episode: Any, state: Any, form: str
+    run: Run,
+    request: Request,
+    kept: Kept,
+    apart: Apart,
+    step: int | None,
+    episode: int | None,
+    state: int | None,
+    form: Literal["json", "npy"],
 ) -> bytes:
     if step is not None and episode is not None:
         raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "query: found step and episode, expected one of them.")
     key = ("qtable", state_of(run), request.url.query, form)
-    found: bytes = await kept.awaited(
+    return await kept.awaited(
         key, lambda: apart(computed.q_table, run.recording, step, episode, state, form), ALWAYS
     )
-    return found
 
 
 def _bounded(start: int, stop: int | None, total: int, most: int) -> int:

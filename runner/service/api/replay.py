@@ -116,10 +116,7 @@ async def part_of(
         RecordingError: there is no such episode or step.
     """
     key = ("replay part", state_of(run), which, start, steps)
-    found: bytes = await kept.awaited(
-        key, lambda: apart(played.part, run.recording, which, start, steps), LONG
-    )
-    return found
+    return await kept.awaited(key, lambda: apart(played.part, run.recording, which, start, steps), LONG)
 
 
 def _json(body: bytes) -> Response:

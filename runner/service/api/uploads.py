@@ -15,10 +15,11 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from pydantic import BaseModel
 from starlette.requests import ClientDisconnect
 
-from runner.service.problems import Refused, answers
+from runner.service.problems import answers
 from runner.service.receiving.appending import Appending
 from runner.service.receiving.model import Announcement, Completion, State, Upload
 from runner.service.receiving.uploads import Uploads
+from runner.service.refused import Refused
 from runner.service.security import COOKIE
 
 router = APIRouter(tags=["uploads"])

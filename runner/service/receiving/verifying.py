@@ -26,6 +26,7 @@ from runner.errors import RunnerError, StorageError
 from runner.hashing import hash_of
 from runner.labels import labels_from
 from runner.service.receiving.model import BODY_FILE, Completion, read_upload
+from runner.service.settings import without_folders
 
 PATIENCE_SECONDS: Final = 120.0
 """A verification may last so long,"""
@@ -161,11 +162,7 @@ def _said(completion: Completion) -> dict[str, Any]:
 
 def _without_paths(error: RunnerError, body: Path, recordings: Path) -> str:
     """Return what is wrong without saying where the server keeps what."""
-    text = str(error)
-    for path, name in ((body, "the upload"), (recordings, "the server's runs")):
-        for form in (os.fspath(path.absolute()), os.fspath(path)):
-            text = text.replace(form, name)
-    return text
+    return without_folders(str(error).replace(os.fspath(body), "the upload"), recordings)
 
 
 def _size(path: Path) -> int:
