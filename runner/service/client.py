@@ -303,18 +303,22 @@ class _Delivery:
     def _step(self) -> Sent:
         client, sent, parcel = self._client, self._sent, self._parcel
         if sent is None:
-            known = {"name": parcel.name, "run_id": parcel.run_id, "content_digest": parcel.content_digest}
-            return client.begin(digest=self._digest, size=self._size, **known)
+            return self._begun()
         if self._is_stale:
             return client.standing(sent)
         if sent.state == "verifying":
             return self._verified(client.standing(sent, _WAIT_SECONDS))
         if sent.offset > self._size:  # the file became shorter, as one does whose disk was full
             client.give_up(sent)
-            return client.begin(digest=self._digest, size=self._size)
+            return self._begun()
         if sent.offset < self._size:
             return client.append(sent, parcel.path, self._size)
         return client.complete(sent, parcel, self._size, self._digest)
+
+    def _begun(self) -> Sent:
+        parcel = self._parcel
+        known = {"name": parcel.name, "run_id": parcel.run_id, "content_digest": parcel.content_digest}
+        return self._client.begin(digest=self._digest, size=self._size, **known)
 
     def _verified(self, sent: Sent) -> Sent:
         """Return an upload unless it could not be verified for now."""

@@ -93,6 +93,7 @@ class Follower:
         self._client, self._run, self._size = client, run, size
         self._over = threading.Event()
         self._sent: Sent | None = None
+        self._is_stale = False
         _note(run, client.url, None)
         self._thread = threading.Thread(target=self._follow, name="push", daemon=True)
         self._thread.start()
@@ -126,7 +127,7 @@ class Follower:
                 pause = FOLLOW_SECONDS
             except ServerAway:
                 pause = min(2 * pause, AWAY_SECONDS)
-                self._sent = self._sent and Sent(self._sent.id, "stale", 0)
+                self._is_stale = True
             except RunnerError:
                 return  # said at the end, when it is tried anew
 
@@ -135,8 +136,8 @@ class Follower:
         if self._sent is None:
             self._sent = self._client.begin(name=self._run.name, run_id=self._run.run_id)
             _note(self._run, self._client.url, self._sent.id)
-        if self._sent.state == "stale":
-            self._sent = self._client.standing(self._sent)
+        if self._is_stale:
+            self._sent, self._is_stale = self._client.standing(self._sent), False
         while self._sent.offset < (size := self._size()) and not self._over.is_set():
             self._sent = self._client.append(self._sent, self._run.recording, size)
 
