@@ -15,6 +15,7 @@ from runner.catalogue.columns import as_json as row_as_json
 from runner.catalogue.filters import parse
 from runner.catalogue.index import order_of
 from runner.description import described
+from runner.labels import MAX_NOTE, MAX_TAGS
 from runner.labels import Labels as Said
 from runner.runs import Run, relabel
 from runner.service.catalogue import Catalogue
@@ -86,9 +87,9 @@ class Labels(BaseModel):
     name: Annotated[
         str | None, Field(max_length=100, description="What it is called; empty: as at first.")
     ] = None
-    add_tags: Annotated[list[str], Field(max_length=100)] = []
-    remove_tags: Annotated[list[str], Field(max_length=100)] = []
-    note: Annotated[str | None, Field(max_length=10_000, description="Empty: none.")] = None
+    add_tags: Annotated[list[str], Field(max_length=MAX_TAGS)] = []
+    remove_tags: Annotated[list[str], Field(max_length=MAX_TAGS)] = []
+    note: Annotated[str | None, Field(max_length=MAX_NOTE, description="Empty: none.")] = None
 
 
 class Labelled(BaseModel):

@@ -12,7 +12,7 @@ from runner.recording.reader import Recording
 from runner.runs import Run
 from runner.service.dependencies import OpenRecording, RecordedRun
 from runner.service.pages.frame import framed
-from runner.service.pages.rendering import page
+from runner.service.pages.rendering import link, page
 from runner.words import event_in_words
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
@@ -41,6 +41,7 @@ def episodes(
         total=total,
         page=number,
         pages=max(1, math.ceil(total / ROWS)),
+        turned=lambda to: link(f"/runs/{run.run_id}/episodes", {"phase": phase, "page": to}),
         headings=["episode" if phase == "train" else "trial", "end", *titles],
         rows=_episode_rows(run, recording, phase, columns),
     )

@@ -21,7 +21,7 @@ from runner.service.api.jobs import Number, queue_told, told
 from runner.service.api.uploads import OwnerOf, UploadsOf, list_uploads
 from runner.service.dependencies import ApartOf, CatalogueOf, JobsOf, KeptOf, SettingsOf
 from runner.service.pages.problems import message_of
-from runner.service.pages.rendering import page, picture_address
+from runner.service.pages.rendering import link, page, picture_address
 from runner.sweep.state import read_sweep, sweeps_in, tag_of
 
 if TYPE_CHECKING:
@@ -176,6 +176,7 @@ def _queue(jobs: Jobs, number: int) -> dict[str, Any]:
         "active": any(job.state in ("queued", "running") for job in found),
         "page": number,
         "pages": max(1, math.ceil(len(found) / ROWS)),
+        "turned": lambda to: link("/queue", {"page": to}),
     }
 
 

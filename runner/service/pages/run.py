@@ -14,6 +14,7 @@ from fastapi.responses import RedirectResponse
 from runner import amounts
 from runner.errors import RecordingError, RunnerError
 from runner.frames import agents_of, evaluation_record
+from runner.labels import MAX_NOTE
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
@@ -54,8 +55,7 @@ _LEVELS: Final = {1: "debug", 2: "info", 3: "warning", 4: "error", 5: "fatal"}
 @router.get("")
 def overview(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) -> Response:
     """Show how a run stands, and its metrics."""
-    shown = framed(run, "") | {"standing": _standing(run, jobs, settings), "problem": ""}
-    return page(request, "run_overview.html", **shown)
+    return _overview(request, run, jobs, settings)
 
 
 @router.post("/labels")
@@ -73,8 +73,7 @@ def label(
     try:
         relabelled(run, changed, catalogue)
     except RunnerError as error:
-        told = {"standing": _standing(run, jobs, settings), "problem": message_of(error, request)}
-        return page(request, "run_overview.html", HTTPStatus.BAD_REQUEST, **framed(run, ""), **told)
+        return _overview(request, run, jobs, settings, message_of(error, request))
     return RedirectResponse(f"/runs/{run.run_id}#labels-title", HTTPStatus.SEE_OTHER)
 
 
@@ -140,6 +139,13 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
 
 
 # --- inside -------------------------------------------------------------------------------------------
+
+
+def _overview(request: Request, run: Run, jobs: Jobs, settings: Settings, problem: str = "") -> Response:
+    """Return the first page of a run, with what is wrong with labels that were sent."""
+    status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
+    shown = framed(run, "") | {"standing": _standing(run, jobs, settings)}
+    return page(request, "run_overview.html", status, **shown, problem=problem, most_note=MAX_NOTE)
 
 
 def _standing(run: Run, jobs: Jobs, settings: Settings) -> dict[str, Any]:

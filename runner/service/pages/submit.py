@@ -14,7 +14,7 @@ from fastapi.responses import RedirectResponse
 from runner.config.document import write_yaml
 from runner.config.schema import json_schema, without_references
 from runner.errors import RunnerError
-from runner.service.checking import SWEEP_KEYS
+from runner.service.checking import SWEEP_KEYS, Checked
 from runner.service.dependencies import CatalogueOf, JobsOf
 from runner.service.pages.forms import Form
 from runner.service.pages.rendering import page
@@ -90,7 +90,7 @@ def _form(
     request: Request,
     text: str,
     problems: list[dict[str, Any]] | None = None,
-    fine: Any = None,
+    fine: Checked | None = None,
     status: HTTPStatus = HTTPStatus.OK,
 ) -> Response:
     lines = text.splitlines()

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from runner.documents import read_object
 from runner.errors import RunnerError
+from runner.labels import MAX_NOTE, MAX_TAGS
 
 STATE_FILE: Final = "upload.json"
 BODY_FILE: Final = "body"
@@ -85,8 +86,8 @@ class ToldLabels(BaseModel):
     model_config = _FIRM
 
     name: Text = ""
-    tags: Annotated[list[Annotated[str, Field(max_length=64)]], Field(max_length=100)] = []
-    note: Annotated[str, Field(max_length=10_000)] = ""
+    tags: Annotated[list[Annotated[str, Field(max_length=64)]], Field(max_length=MAX_TAGS)] = []
+    note: Annotated[str, Field(max_length=MAX_NOTE)] = ""
 
 
 class Completion(BaseModel):
