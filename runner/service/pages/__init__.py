@@ -4,11 +4,23 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from runner.service.pages import compare, episodes, operation, replay, rerun, run, runs, static, submit
+from runner.service.pages import (
+    compare,
+    disk,
+    episodes,
+    jobs,
+    replay,
+    rerun,
+    run,
+    runs,
+    static,
+    submit,
+    sweeps,
+)
 from runner.service.pages.problems import answer_errors
 
 __all__ = ["answer_errors", "router"]
 
 router = APIRouter(include_in_schema=False)
-for _part in (runs, rerun, run, replay, episodes, compare, submit, operation, static):
+for _part in (runs, rerun, run, replay, episodes, compare, submit, jobs, sweeps, disk, static):
     router.include_router(_part.router)

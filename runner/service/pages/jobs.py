@@ -1,56 +1,31 @@
-"""What is done and where it goes: the queue of jobs, sweeps, the disk."""
+"""The queue of jobs, a job, and the uploads that are no runs yet."""
 
 from __future__ import annotations
 
-import json
 import math
 from http import HTTPStatus
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi import Path as InPath
 from fastapi.responses import RedirectResponse
 
-from runner.catalogue.columns import with_originals
-from runner.catalogue.filters import Filter, parse
-from runner.catalogue.usage import freeable_of, totals, usages
-from runner.errors import RunnerError, RunNotFound
-from runner.service import played
 from runner.service.api.jobs import Number, queue_told, told
 from runner.service.api.uploads import OwnerOf, UploadsOf, list_uploads
-from runner.service.dependencies import ApartOf, CatalogueOf, JobsOf, KeptOf, SettingsOf
-from runner.service.pages.problems import message_of
-from runner.service.pages.rendering import link, page, picture_address
-from runner.sweep.state import read_sweep, sweeps_in, tag_of
+from runner.service.dependencies import JobsOf
+from runner.service.pages.rendering import link, page
 
 if TYPE_CHECKING:
-    from runner.catalogue.index import Index
     from runner.service.queue import Job
     from runner.service.work import Jobs
 
-router = APIRouter(include_in_schema=False)
+router = APIRouter(prefix="/queue", include_in_schema=False)
 
 ROWS: Final = 50
 MOST_LINES: Final = 1000
 """Lines of a job's log that its page shows."""
-SWEEP_SECONDS: Final = 20.0
-"""So old may what is told of a sweep be."""
-Name = Annotated[str, InPath(max_length=100)]
-
-FREED_BY: Final = {
-    "same_content": ("Recorded before", "The same content is there already: `dualtaxi rm` removes runs."),
-    "unfinished": (
-        "Unfinished",
-        "`dualtaxi prune --status interrupted --status failed`, if not to be resumed.",
-    ),
-    "left_over": ("Left over", "Damaged originals that a repair kept, and what interrupted commands left."),
-    "cached": ("Cached", "Made again when needed."),
-    "half_removed": ("Half removed", "The next `dualtaxi rm` or `prune` removes the rest."),
-}
 
 
-@router.get("/queue")
+@router.get("")
 def queue(
     request: Request,
     jobs: JobsOf,
@@ -63,7 +38,7 @@ def queue(
     return page(request, "queue.html", uploads=coming[:ROWS], **_queue(jobs, number))
 
 
-@router.get("/queue/standing")
+@router.get("/standing")
 def queue_standing(
     request: Request, jobs: JobsOf, number: Annotated[int, Query(alias="page", ge=1, lt=10**6)] = 1
 ) -> Response:
@@ -74,7 +49,7 @@ def queue_standing(
     return page(request, "queue_rows.html", **shown)
 
 
-@router.get("/queue/{number}")
+@router.get("/{number}")
 def job(request: Request, jobs: JobsOf, number: Number) -> Response:
     """Show a job: how far it is, what it said, its runs."""
     log, place = _log(jobs, number)
@@ -90,78 +65,18 @@ def job(request: Request, jobs: JobsOf, number: Number) -> Response:
     )
 
 
-@router.post("/queue/{number}/cancel")
+@router.post("/{number}/cancel")
 def cancel(jobs: JobsOf, number: Number) -> Response:
     """Cancel a job."""
     jobs.cancel(number)
     return RedirectResponse(f"/queue/{number}", HTTPStatus.SEE_OTHER)
 
 
-@router.post("/queue/{number}/resume")
+@router.post("/{number}/resume")
 def resume(jobs: JobsOf, number: Number) -> Response:
     """Go on with a job."""
     jobs.resume(number)
     return RedirectResponse(f"/queue/{number}", HTTPStatus.SEE_OTHER)
-
-
-@router.get("/sweeps")
-def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Response:
-    """Show the sweeps."""
-    found: list[dict[str, Any]] = []
-    for folder in settings.recordings:
-        for name in sweeps_in(folder):
-            try:
-                sweep = read_sweep(name, folder)
-            except RunnerError as error:
-                found.append({"name": name, "problem": message_of(error, request)})
-                continue
-            found.append(
-                {
-                    "name": name,
-                    "problem": "",
-                    "strategy": sweep.file.strategy,
-                    "parameters": ", ".join(sweep.file.parameters),
-                    "objective": sweep.objective.described,
-                    "runs": _runs_tagged(catalogue, name),
-                }
-            )
-    return page(request, "sweeps.html", sweeps=found)
-
-
-@router.get("/sweeps/{name}")
-async def sweep(
-    request: Request, name: Name, settings: SettingsOf, kept: KeptOf, apart: ApartOf, jobs: JobsOf
-) -> Response:
-    """Show what came of a sweep."""
-    folder = _folder_of(name, settings.recordings)
-    key = ("sweep", name, folder)
-    body = await kept.awaited(key, lambda: apart(played.sweep, name, folder), SWEEP_SECONDS)
-    made_by = [job.number for job in jobs.queue.jobs() if job.kind == "sweep" and job.name == name]
-    found = json.loads(body)
-    pictures = [picture_address(picture) for picture in found["pictures"]]
-    shown = {"told": found, "pictures": pictures, "jobs": made_by[-1:], "tag": tag_of(name)}
-    return page(request, "sweep.html", name=name, **shown)
-
-
-@router.get("/disk")
-def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: JobsOf) -> Response:
-    """Show what uses the disk, and what could be freed."""
-
-    def work(index: Index) -> list[dict[str, Any]]:
-        return with_originals(index.select(Filter(None)), index)
-
-    found = usages(catalogue.read(work))
-    freeable = freeable_of(found, settings.recordings)
-    return page(
-        request,
-        "disk.html",
-        total=totals(found),
-        free=jobs.standing().free_bytes,
-        freeable=[(*FREED_BY[kind], size) for kind, size in freeable.items() if size],
-        rows=[{"row": usage.row, "sizes": totals([usage])} for usage in found[:ROWS]],
-        left=len(found) - ROWS,
-        folders=[str(folder) for folder in settings.recordings],
-    )
 
 
 # --- inside -------------------------------------------------------------------------------------------
@@ -220,15 +135,3 @@ def _log(jobs: Jobs, number: int) -> tuple[list[dict[str, Any]], int]:
 
 def _runs(job: Job, jobs: Jobs) -> list[dict[str, Any]]:
     return [{"seed": seed, "id": run_id} for seed, run_id in jobs.queue.runs_of(job.number).items()]
-
-
-def _runs_tagged(catalogue: CatalogueOf, name: str) -> int:
-    chosen = parse(f'tag:"{tag_of(name)}"')
-    return catalogue.read(lambda index: index.count(chosen))
-
-
-def _folder_of(name: str, folders: tuple[Path, ...]) -> Path:
-    for folder in folders:
-        if name in sweeps_in(folder):
-            return folder
-    raise RunNotFound(f"no sweep {name!r}: the page of sweeps lists those there are.")

@@ -1,0 +1,51 @@
+"""What uses the disk, and what could be freed."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final
+
+from fastapi import APIRouter, Request, Response
+
+from runner.catalogue.columns import with_originals
+from runner.catalogue.filters import Filter
+from runner.catalogue.usage import freeable_of, totals, usages
+from runner.service.dependencies import CatalogueOf, JobsOf, SettingsOf
+from runner.service.pages.rendering import page
+
+if TYPE_CHECKING:
+    from runner.catalogue.index import Index
+
+router = APIRouter(include_in_schema=False)
+
+ROWS: Final = 50
+FREED_BY: Final = {
+    "same_content": ("Recorded before", "The same content is there already: `dualtaxi rm` removes runs."),
+    "unfinished": (
+        "Unfinished",
+        "`dualtaxi prune --status interrupted --status failed`, if not to be resumed.",
+    ),
+    "left_over": ("Left over", "Damaged originals that a repair kept, and what interrupted commands left."),
+    "cached": ("Cached", "Made again when needed."),
+    "half_removed": ("Half removed", "The next `dualtaxi rm` or `prune` removes the rest."),
+}
+
+
+@router.get("/disk")
+def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: JobsOf) -> Response:
+    """Show what uses the disk, and what could be freed."""
+
+    def work(index: Index) -> list[dict[str, Any]]:
+        return with_originals(index.select(Filter(None)), index)
+
+    found = usages(catalogue.read(work))
+    freeable = freeable_of(found, settings.recordings)
+    return page(
+        request,
+        "disk.html",
+        total=totals(found),
+        free=jobs.standing().free_bytes,
+        freeable=[(*FREED_BY[kind], size) for kind, size in freeable.items() if size],
+        rows=[{"row": usage.row, "sizes": totals([usage])} for usage in found[:ROWS]],
+        left=len(found) - ROWS,
+        folders=[str(folder) for folder in settings.recordings],
+    )
