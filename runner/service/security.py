@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
+import math
 import re
 import secrets
 import time
@@ -163,7 +164,7 @@ class Failures:
         recent = [then for then in times if then > time.monotonic() - self._seconds]
         if len(recent) < self._most:
             return 0
-        return max(1, round(recent[-self._most] + self._seconds - time.monotonic()))
+        return math.ceil(recent[-self._most] + self._seconds - time.monotonic())
 
     def add(self, address: str) -> None:
         """Take note of a failure."""
