@@ -58,10 +58,15 @@ def changes_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Change]:
     """Return the differences of two nested mappings, by dotted path."""
     left, right = dict(_flat("", a)), dict(_flat("", b))
     paths = dict.fromkeys([*left, *right])
+
+    def filled(path: str) -> bool:
+        """Whether a mapping is empty in one, and what the other has in it is told anyway."""
+        return {} in (left.get(path), right.get(path)) and any(p.startswith(f"{path}.") for p in paths)
+
     return [
         Change(path, left.get(path), right.get(path))
         for path in paths
-        if (path in left) != (path in right) or left.get(path) != right.get(path)
+        if ((path in left) != (path in right) or left.get(path) != right.get(path)) and not filled(path)
     ]
 
 

@@ -13,8 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from runner import runs
-from runner.analysis.diff import RunDiff, diff
+from runner.analysis.diff import Change, RunDiff, diff
 from runner.analysis.diff.sections import sections
+from runner.analysis.diff.settings import changes_in
 from runner.analysis.diff.trajectory import FIELDS, first_difference
 from runner.analysis.sections import markdown
 from runner.analysis.tables import tables_at
@@ -160,6 +161,16 @@ def test_visits_to_states_are_those_of_the_steps(compare, record):
     first = int(np.abs(shares[0] - shares[1]).argmax())
     most = visits.most_apart[0]
     assert (most.state, most.a, most.b) == (words[first], counts[0][first], counts[1][first])
+
+
+def test_a_mapping_that_one_leaves_empty_is_told_by_what_is_in_the_other():
+    a, b = {"kwargs": {}, "epsilon": 0.2}, {"kwargs": {"rewards": {"step": -3}}, "epsilon": {"start": 1.0}}
+    assert changes_in(a, b) == [
+        Change("epsilon", 0.2, None),
+        Change("kwargs.rewards.step", None, -3),
+        Change("epsilon.start", None, 1.0),
+    ]
+    assert changes_in({"a": 1, "kwargs": {}}, {"a": 1}) == [Change("kwargs", {}, None)]
 
 
 def test_what_is_left_out_as_asked_is_named(record, folder):
