@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunnerError, StorageError
-from runner.runs import RECORDING_FILE, Run, run_at
+from runner.runs import Run, run_at
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -31,7 +31,7 @@ def locked(run: Run, archived: bool = False) -> Iterator[Run]:
     busy = RunnerError(f"run {run.run_id} is being worked on by another process; let it.")
     lock = acquired(run.folder / RUN_LOCK, busy)
     try:
-        if run.facts.get("recording", RECORDING_FILE) == RECORDING_FILE:
+        if not run.stands_alone:
             run = run_at(run.folder)
         if run.status == "running":
             owner = run.facts.get("owner", {})

@@ -81,7 +81,7 @@ def resume(
         RunnerError: the run is running; something decisive differs; or its folder cannot be used.
         Diverged: what is recorded is not what the job gives.
     """
-    if run.recording.name != RECORDING_FILE:
+    if run.stands_alone:
         raise RunnerError(
             f"{run.recording}: found a recording that stands alone, expected a run. To go on with it, put it "
             f"into a folder of its own as {RECORDING_FILE}."

@@ -155,7 +155,7 @@ def _sources(run: Run, path: Path, anonymous: bool) -> Iterator[dict[str, Path]]
                 facts["summary"]["error"] = LEFT_OUT
             sources[RUN_FILE].write_bytes(facts_bytes(facts))
             labels = run.folder / LABELS_FILE
-            if run.recording.name == RECORDING_FILE and labels.is_file():
+            if not run.stands_alone and labels.is_file():
                 sources[LABELS_FILE] = labels
             yield sources
     except OSError as error:

@@ -10,6 +10,7 @@ import shlex
 import shutil
 import socket
 import tarfile
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,15 @@ def test_what_is_there_already_is_left_as_it_is(lake, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in [folder, *folder.iterdir()]}
     assert unpack(packed.path, tmp_path / "theirs").already
     assert {path: path.stat().st_mtime_ns for path in [folder, *folder.iterdir()]} == before
+
+
+def test_a_run_that_is_read_from_its_archive_is_packed_with_its_labels(lake, tmp_path):
+    there = copy_of(lake, tmp_path / "mine", archive={"target": "elsewhere"})
+    change_labels(there.folder, lambda _: Labels("mine", ("keep",), "why"))
+    restored = there.recording.rename(tmp_path / f"{lake.run_id}-restored.mcap")
+    packed = pack(replace(there, restored=restored), tmp_path / "a.dualtaxi")
+    unpacked = unpack(packed.path, tmp_path / "theirs").run
+    assert read_labels(unpacked.folder) == Labels("mine", ("keep",), "why")
 
 
 def test_another_file_is_replaced_only_by_force(lake, tmp_path):
