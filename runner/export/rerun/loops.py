@@ -21,7 +21,7 @@ from runner.export.rerun.columns import Batch, Sender, no_thoughts, scalars
 from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
 from runner.export.rerun.layout import Shown, draw_background
-from runner.export.rerun.metrics import EVAL_COLOUR, TRAIN_COLOUR
+from runner.export.rerun.metrics import line_colours
 from runner.export.rerun.scene import TRAIL_STEPS, marks_of, rgb, scene_of
 from runner.export.rerun.selection import (
     SPREAD_STEPS,
@@ -39,7 +39,6 @@ BATCH: Final = 8_192
 MOST_LINES: Final = 16
 """Numbers of an observation or action that are drawn as lines."""
 PHASES: Final = ("train", "eval")
-_COLOURS: Final = {"train": [rgb(TRAIN_COLOUR)], "eval": [rgb(EVAL_COLOUR)]}
 
 
 def select_loop(recording: Recording, request: Request) -> Selection:
@@ -155,9 +154,8 @@ class LoopExporter:
         names = self._names(phase)
         for k, block in enumerate(self._recording.blocks(topic)):
             if not k:
-                colours = None if len(names) > 1 else _COLOURS[phase]
-                sender.static("return", rr.SeriesLines(names=names, colors=colours))
-                sender.static("length", rr.SeriesLines(names=phase, colors=_COLOURS[phase]))
+                sender.static("return", _dress(phase, names))
+                sender.static("length", _dress(phase, [phase]))
             times = _times(block["log_time"], block["episode"])
             sender.send("return", times, scalars(block["returns"]))
             sender.send("length", times, scalars(block["length"].astype(np.float64)[:, np.newaxis]))
@@ -214,12 +212,10 @@ class LoopExporter:
         """Send steps of the first environment, in all their views."""
         recording, sender = self._recording, Sender(self._stream, f"{self._root}/{phase}")
         lines, grid = self._lines(), self._grid(phase)
-        names = self._names(phase)
-        colours = None if len(names) > 1 else _COLOURS[phase]
         dressed = False
         for steps in self._batches(recording.topic(f"/{phase}/step"), spans):
             if not dressed:
-                sender.static("reward", rr.SeriesLines(names=names, colors=colours))
+                sender.static("reward", _dress(phase, self._names(phase)))
                 for part, columns in lines.items():
                     told = [
                         f"{name}[{i}]" if count > 1 else name
@@ -227,7 +223,7 @@ class LoopExporter:
                         for count in [_column(steps[:1], path).shape[1]]
                         for i in range(count)
                     ]
-                    sender.static(part, rr.SeriesLines(names=told))
+                    sender.static(part, _dress(phase, told))
                 dressed = True
             times = _times(steps["log_time"], steps["episode"])
             times.append(rr.TimeColumn("t", sequence=steps["t"].astype(np.int64)))
@@ -373,3 +369,8 @@ def _series(root: str, name: str, parts: Sequence[str]) -> Any:
     return rrb.TimeSeriesView(
         origin=f"{root}/", contents=[f"{root}/{part}" for part in parts], name=name.replace("_", " ")
     )
+
+
+def _dress(phase: str, names: Sequence[str]) -> rr.SeriesLines:
+    """Return how lines look."""
+    return rr.SeriesLines(names=names, colors=[rgb(colour) for colour in line_colours(phase, len(names))])

@@ -22,6 +22,13 @@ COLOURS: Final = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E0
 Rows = list[dict[str, Any]]
 
 
+def line_colours(phase: str, count: int) -> list[str]:
+    """Return the colours of the lines of a plot: one has its phase's, of several no two are alike."""
+    if count == 1:
+        return [TRAIN_COLOUR if phase == "train" else EVAL_COLOUR]
+    return [COLOURS[i % len(COLOURS)] for i in range(count)]
+
+
 class MetricWriter:
     """Sends the metrics of a run.
 
@@ -169,9 +176,7 @@ class MetricWriter:
 
     def _style(self, path: str, names: Sequence[str]) -> Any:
         trained = path.startswith("train/")
-        colours = [COLOURS[i % len(COLOURS)] for i in range(len(names))]
-        if len(names) == 1:
-            colours = [TRAIN_COLOUR if trained else EVAL_COLOUR]
+        colours = line_colours("train" if trained else "eval", len(names))
         if self._tint:
             colours = [self._tint] * len(names)
         width = 1.2 if trained else 2.2

@@ -369,6 +369,11 @@ def test_rerun_gets_what_a_loop_recorded(folder, name, tmp_path):
     assert {"/train/return", "/eval/return", "/train/reward", "/logged/loss", "/log"} <= paths
     assert ("/train/grid/things" in paths) == (name == "lake")
     assert ("/train/observation" in paths) == (name == "pole")
+    if name == "pole":
+        chunks = store.stream().filter(content="/train/observation").to_chunks()
+        (static,) = [chunk.to_record_batch() for chunk in chunks if chunk.is_static]
+        colours = static.column("SeriesLines:colors")[0].as_py()
+        assert len(set(colours)) == len(colours) == 4, "no two lines look alike"
 
 
 def test_rerun_gets_a_loop_of_a_single_step_and_episode(tmp_path):
