@@ -7,6 +7,7 @@ import threading
 
 import pytest
 from served import Served
+from submitted import ENDLESS, ICY
 
 from runner.errors import RunnerError
 from runner.runs import list_runs
@@ -15,8 +16,6 @@ from runner.service.client import Client
 from runner.service.watching import Happened, JobThere, events_in
 
 CONFIG = {"name": "quick", "episodes": 600, "mode": "cooperative", "evaluation": {"every": 50, "trials": 400}}
-ENDLESS = {"episodes": 10**7, "evaluation": None, "recording": {"steps": "none"}}
-TINY = {"name": "icy", "env": {"id": "FrozenLake-v1"}, "episodes": 20, "seeds": [0, 1]}
 
 
 def test_a_watcher_sees_everything_once_though_the_server_is_killed_meanwhile(tmp_path):
@@ -50,8 +49,8 @@ def test_a_watcher_sees_everything_once_though_the_server_is_killed_meanwhile(tm
 
 def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
     with Served(tmp_path, "--workers", "1") as server, Client(server.url) as client:
-        first = client.submit(json.dumps(CONFIG | ENDLESS))
-        second = client.submit(json.dumps(TINY), "tiny.yaml")
+        first = client.submit(json.dumps(ENDLESS))
+        second = client.submit(json.dumps(ICY), "icy.yaml")
         assert (second.name, second.state, second.runs) == ("icy", "queued", 2)
         assert [job.number for job in client.jobs()] == [second.number, first.number]
         assert client.cancel(first.number).is_over
