@@ -186,7 +186,7 @@ def plot(paths: Sequence[Path], form: str) -> bytes:
         return path.read_bytes()
 
 
-def difference(a: Path, b: Path, ignore: Sequence[str], first: bool, targets: Sequence[str]) -> bytes:
+def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequence[str]) -> bytes:
     """Return in what two runs differ, as `dualtaxi diff --json` tells it.
 
     Raises:
@@ -195,11 +195,12 @@ def difference(a: Path, b: Path, ignore: Sequence[str], first: bool, targets: Se
     """
     from runner.analysis.diff import diff
     from runner.analysis.diff.asked import as_json as told
-    from runner.analysis.diff.asked import level_of, without
+    from runner.analysis.diff.asked import level_of, with_seconds, without
 
     levels = dict(level_of(target) for target in targets)
-    with open_recording(a) as ours, open_recording(b) as theirs:
-        return as_json(told(without(diff(ours, theirs, levels, first), ignore)))
+    with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
+        found = diff(ours, theirs, levels, first)
+    return as_json(told(without(found if first else with_seconds(found, a, b), ignore)))
 
 
 def comparison(

@@ -42,8 +42,9 @@ async def diff(
 ) -> dict[str, Any]:
     """Return what `dualtaxi diff --json` prints."""
     left, right = await found_runs(catalogue, [a, b])
-    key = ("diff", state_of(left), state_of(right), request.url.query)
-    asked = (left.recording, right.recording, ignore or [], first, target or [])
+    took = [run.summary.get("seconds") for run in (left, right)]  # which the recordings do not say
+    key = ("diff", state_of(left), state_of(right), *took, request.url.query)
+    asked = (left, right, ignore or [], first, target or [])
     body = await kept.awaited(key, lambda: apart(computed.difference, *asked), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 
