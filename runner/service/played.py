@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Final
@@ -79,13 +78,15 @@ def learned(path: Path) -> bytes:
         return json.dumps([asdict(row) for row in rows]).encode()
 
 
-def difference(paths: Sequence[Path]) -> bytes:
+def difference(a: Run, b: Run) -> bytes:
     """Return in what two runs differ, as JSON: what the page of `dualtaxi diff` tells and shows."""
     from runner.analysis.diff import diff
+    from runner.analysis.diff.asked import with_seconds
     from runner.export.diff_page import told_of
 
-    with open_recording(paths[0]) as a, open_recording(paths[1]) as b:
-        return json.dumps(told_of(diff(a, b), a, b), default=asdict).encode()
+    with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
+        told = told_of(with_seconds(diff(ours, theirs), a, b), ours, theirs)
+    return json.dumps(told, default=asdict).encode()
 
 
 def _typical_start(recording: Recording) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 from runner.analysis.diff import NOT_CONTENT, Cause, Change, Parting, RunDiff
@@ -28,7 +29,7 @@ def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
         _evaluations(difference),
         _tables(difference),
         _metrics(difference, everything),
-        _changes("Costs", difference.costs),
+        _changes("Costs", difference.costs, _amount),
         _changes("Provenance", difference.provenance),
     ]
     if everything:
@@ -80,8 +81,16 @@ def in_short(difference: RunDiff) -> str:
     return " ".join(said)
 
 
-def _changes(title: str, changes: list[Change]) -> Section:
-    rows = [(change.path, _text(change.a), _text(change.b)) for change in changes]
+def _text(value: Any) -> str:
+    return "–" if value is None else str(value)
+
+
+def _amount(value: Any) -> str:
+    return f"{value:,}" if isinstance(value, int | float) else _text(value)
+
+
+def _changes(title: str, changes: list[Change], told: Callable[[Any], str] = _text) -> Section:
+    rows = [(change.path, told(change.a), told(change.b)) for change in changes]
     return Section(title, grids=[Grid(("", "A", "B"), rows)] if rows else [])
 
 
@@ -273,7 +282,3 @@ def _metrics(difference: RunDiff, everything: bool) -> Section:
 
 def _set(value: Any) -> str:
     return "not set" if value is None else str(value)
-
-
-def _text(value: Any) -> str:
-    return "–" if value is None else str(value)

@@ -141,8 +141,7 @@ def _two(found: list[Run]) -> list[Run]:
 async def _difference(found: list[Run], kept: KeptOf, apart: ApartOf) -> dict[str, Any]:
     """Return in what two runs differ, as `played.difference` has it."""
     key = ("difference", *map(state_of, found))
-    paths = [each.recording for each in found]
-    told: dict[str, Any] = json.loads(await kept.awaited(key, lambda: apart(played.difference, paths), LONG))
+    told: dict[str, Any] = json.loads(await kept.awaited(key, lambda: apart(played.difference, *found), LONG))
     return told
 
 
