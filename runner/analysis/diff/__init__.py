@@ -7,7 +7,7 @@ print(difference.parting, difference.cause)
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ from runner.analysis.diff.settings import (
     Change,
     EnvironmentDiff,
     TransitionChange,
+    alike_in,
     changes_in,
     environment_diff,
 )
@@ -63,6 +64,10 @@ NOT_CONTENT = ("name", "recording")
 """Keys of the configuration whose difference alone leaves the content the same."""
 
 
+PARTS = ("config", "provenance", "costs")
+"""What of a `RunDiff` is a list of values by path."""
+
+
 @dataclass(frozen=True)
 class RunDiff:
     """Everything in which two runs differ; `a` and `b` say who they are."""
@@ -86,6 +91,8 @@ class RunDiff:
     metrics: list[MetricDiff] = field(default_factory=list)
     costs: list[Change] = field(default_factory=list)
     """Steps, seconds and size."""
+    alike: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """What is the same in both, by path, of config, provenance and costs."""
     ignored: list[str] = field(default_factory=list)
     """Paths of what differs, and was left out as asked."""
     notes: list[str] = field(default_factory=list)
@@ -113,14 +120,10 @@ def diff(
         "a": _who(a),
         "b": _who(b),
         "same_content": same,
-        "config": changes_in(_settings(a), _settings(b)),
-        "provenance": changes_in(a.provenance, b.provenance),
         "environment": environment_diff(a.mdp, b.mdp),
-        "costs": changes_in(_costs(a), _costs(b)),
         "notes": notes,
+        **_values(a, b, ("config",) if first else PARTS),
     }
-    if first:
-        facts |= {"provenance": [], "costs": []}
     if same:
         return RunDiff(**facts)
     seen = None
@@ -157,14 +160,24 @@ def _diff_of_loops(a: Recording, b: Recording) -> RunDiff:
         a=_who(a),
         b=_who(b),
         same_content=same,
-        config=changes_in(_settings(a), _settings(b)),
-        provenance=changes_in(a.provenance, b.provenance),
         environment=loop_environment_diff(a, b),
         parting=partings[0],
         loop_evaluation=partings[1],
-        costs=changes_in(_costs(a) | loop_means(a), _costs(b) | loop_means(b)),
         notes=notes,
+        **_values(a, b, PARTS),
     )
+
+
+def _values(a: Recording, b: Recording, parts: Sequence[str]) -> dict[str, Any]:
+    """Return what differs in these parts of a `RunDiff`, nothing for the others; and what is alike."""
+    jobs = a.kind == b.kind == "job"
+    told = {
+        "config": (_settings(a), _settings(b)),
+        "provenance": (a.provenance, b.provenance),
+        "costs": [_costs(one) | ({} if jobs else loop_means(one)) for one in (a, b)],
+    }
+    changes = {part: changes_in(*told[part]) if part in parts else [] for part in PARTS}
+    return changes | {"alike": {part: alike_in(*told[part]) for part in parts}}
 
 
 def _same_sizes(a: Recording, b: Recording) -> bool:

@@ -7,7 +7,7 @@ import fnmatch
 from collections.abc import Sequence
 from typing import Any
 
-from runner.analysis.diff import Change, RunDiff
+from runner.analysis.diff import PARTS, Change, RunDiff
 from runner.analysis.diff.settings import changes_in
 from runner.errors import RunnerError
 from runner.runs import Run
@@ -19,18 +19,29 @@ def with_seconds(difference: RunDiff, a: Run, b: Run) -> RunDiff:
     return dataclasses.replace(difference, costs=[*difference.costs, *changes_in(*took)])
 
 
-def without(difference: RunDiff, ignore: Sequence[str]) -> RunDiff:
-    """Return the difference without what has a path that fits a pattern; it is named as ignored."""
-    parts = {"config": difference.config, "provenance": difference.provenance, "costs": difference.costs}
+def without(difference: RunDiff, ignore: Sequence[str], everything: bool = False) -> RunDiff:
+    """Return the difference without what has a path that fits a pattern; it is named as ignored.
+
+    Args:
+        difference: of two runs.
+        ignore: patterns.
+        everything: keep also what is alike.
+    """
+    changes: dict[str, list[Change]] = {part: getattr(difference, part) for part in PARTS}
     kept: dict[str, Any] = {
-        part: [change for change in changes if not _fits(change, ignore)] for part, changes in parts.items()
+        part: [change for change in some if not _fits(change.path, ignore)] for part, some in changes.items()
     }
-    ignored = [change.path for changes in parts.values() for change in changes if _fits(change, ignore)]
+    kept["alike"] = {
+        part: {path: value for path, value in values.items() if not _fits(path, ignore)}
+        for part, values in difference.alike.items()
+        if everything
+    }
+    ignored = [change.path for some in changes.values() for change in some if _fits(change.path, ignore)]
     return dataclasses.replace(difference, **kept, ignored=ignored)
 
 
-def _fits(change: Change, globs: Sequence[str]) -> bool:
-    return any(fnmatch.fnmatchcase(change.path, glob) for glob in globs)
+def _fits(path: str, globs: Sequence[str]) -> bool:
+    return any(fnmatch.fnmatchcase(path, glob) for glob in globs)
 
 
 def as_json(difference: RunDiff) -> dict[str, Any]:

@@ -19,18 +19,18 @@ def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
 
     Args:
         difference: of two runs.
-        everything: also the sections in which nothing differs.
+        everything: also the sections in which nothing differs, and metrics that do not.
     """
     made = [
         _runs(difference),
-        _changes("Configuration", difference.config),
+        _values("Configuration", difference, "config"),
         _environment(difference),
         _trajectory(difference),
         _evaluations(difference),
         _tables(difference),
         _metrics(difference, everything),
-        _changes("Costs", difference.costs, _amount),
-        _changes("Provenance", difference.provenance),
+        _values("Costs", difference, "costs", _amount),
+        _values("Provenance", difference, "provenance"),
     ]
     if everything:
         return [section if _says(section) else Section(section.title, ["the same"]) for section in made]
@@ -89,9 +89,13 @@ def _amount(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int | float) else _text(value)
 
 
-def _changes(title: str, changes: list[Change], told: Callable[[Any], str] = _text) -> Section:
-    rows = [(change.path, told(change.a), told(change.b)) for change in changes]
-    return Section(title, grids=[Grid(("", "A", "B"), rows)] if rows else [])
+def _values(title: str, difference: RunDiff, part: str, told: Callable[[Any], str] = _text) -> Section:
+    """Return the values by path of a part: those that differ, and behind them those that are alike."""
+    changes: list[Change] = getattr(difference, part)
+    differ = [(change.path, told(change.a), told(change.b)) for change in changes]
+    alike = [(path, told(value)) for path, value in difference.alike.get(part, {}).items()]
+    grids = [Grid(("", "A", "B"), differ)] if differ else []
+    return Section(title, grids=[*grids, *([Grid(("", "A and B"), alike)] if alike else [])])
 
 
 def _environment(difference: RunDiff) -> Section:

@@ -70,6 +70,12 @@ def changes_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Change]:
     ]
 
 
+def alike_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what two nested mappings have alike, by dotted path."""
+    other = dict(_flat("", b))
+    return {path: value for path, value in _flat("", a) if path in other and other[path] == value}
+
+
 def environment_diff(a: Mdp, b: Mdp) -> EnvironmentDiff:
     """Return how two environments differ, down to single transitions."""
     description = changes_in(a.description(), b.description())

@@ -77,7 +77,8 @@ def command(
     left, right = find_recorded(a, recordings), find_recorded(b, recordings)
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
         difference = diff(recording_a, recording_b, levels, first)
-        difference = without(difference if first else with_seconds(difference, left, right), ignore)
+        difference = difference if first else with_seconds(difference, left, right)
+        difference = without(difference, ignore, everything)
         if html is not None:
             page = _write_page(html, force, difference, recording_a, recording_b)
             (say if as_json or as_markdown else click.echo)(page)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import platform
 from itertools import pairwise
 from pathlib import Path
 
@@ -298,6 +299,14 @@ def test_the_command_says_what_differs_and_ends_with_1(record, folder):
     as_json = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--json", "--ignore", "disc*"])
     assert json.loads(as_json.stdout)["config"] == []
     assert json.loads(as_json.stdout)["cause"]["kind"] == "greedy_action"
+    assert json.loads(as_json.stdout)["alike"] == {}
+    words = ["diff", *ids[:2], "--recordings", str(folder), "--all"]
+    alike = json.loads(run(cli, [*words, "--json", "--ignore", "e*"]).stdout)["alike"]
+    assert "discount" not in alike["config"], "it differs"
+    assert "env.id" not in alike["config"], "it is to be ignored"
+    assert (alike["config"]["step_size"], alike["provenance"]["python"]) == (0.1, platform.python_version())
+    assert "step_size" in run(cli, words).stdout
+    assert "step_size" not in told.stdout
     same = run(cli, ["diff", ids[0], ids[2], "--recordings", str(folder)])
     assert same.exit_code == 0, same.output
     unknown = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--target", "finish=80"])
