@@ -17,7 +17,10 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
+
+MAX_MESSAGE: Final = 10_000
+"""Characters of an error that are kept with a run."""
 
 
 class RunnerError(Exception):
@@ -99,3 +102,9 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """Return ` Did you mean 'x'?` for the known name nearest to `name`, or an empty string."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
     return f" Did you mean {close[0]!r}?" if close else ""
+
+
+def kept_message(error: BaseException | str) -> str:
+    """Return what is kept with a run of what ended it; of a message that goes on for ever its beginning."""
+    text = str(error)
+    return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE - 1]}…"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner import runs
-from runner.errors import Diverged, RunnerError, StorageError
+from runner.errors import Diverged, RunnerError, StorageError, kept_message
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.mdp import Mdp, load_mdp
@@ -109,9 +109,9 @@ def execute(session: Session, file: RecordingFile, run: Run, started: float) -> 
         session.recorder.abandon()
         status = "interrupted" if isinstance(error, KeyboardInterrupt | Diverged) else "failed"
         with contextlib.suppress(StorageError):  # a full disk may still have room for the index
-            write_result(file, status, {"error": str(error)})
+            write_result(file, status, {"error": kept_message(error)})
         with contextlib.suppress(StorageError):  # nor need there be room for this
-            run.update(status=status, summary={"error": str(error), "bytes": file.size})
+            run.update(status=status, summary={"error": kept_message(error), "bytes": file.size})
         _tell_what_next(run, error)
         raise
     summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": file.size}
@@ -125,7 +125,7 @@ def _failing(run: Run) -> Iterator[None]:
         yield
     except RunnerError as error:
         with contextlib.suppress(StorageError):
-            run.update(status="failed", summary={"error": str(error)})
+            run.update(status="failed", summary={"error": kept_message(error)})
         _tell_what_next(run, error)
         raise
 

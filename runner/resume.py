@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from runner.config import from_mapping
 from runner.config.sections import RunTable
-from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, StorageError
+from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, StorageError, kept_message
 from runner.execution import (
     Report,
     Session,
@@ -146,7 +146,7 @@ def _mark_failed(run: Run, error: BaseException) -> None:
     with contextlib.suppress(RunnerError):
         now = run_at(run.folder)
         if now.facts["status"] == "running":
-            now.update(status="failed", summary={"error": str(error)})
+            now.update(status="failed", summary={"error": kept_message(error)})
 
 
 def _place(run: Run, described: bool) -> tuple[Path, Contents]:

@@ -14,7 +14,7 @@ import numpy as np
 from blake3 import blake3
 
 from runner import runs
-from runner.errors import ConfigError, RecordingError, RunnerError, StorageError
+from runner.errors import ConfigError, RecordingError, RunnerError, StorageError, kept_message
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
@@ -294,7 +294,7 @@ class Loop(Generic[R]):
             except BaseException as failure:
                 self._recorder.abandon()
                 with contextlib.suppress(StorageError):
-                    write_result(self._file, "failed", {"error": str(failure)})
+                    write_result(self._file, "failed", {"error": kept_message(failure)})
                 self._mark_failed(failure)
                 if self._follower:
                     self._follower.stop()
@@ -309,7 +309,7 @@ class Loop(Generic[R]):
 
     def _mark_failed(self, error: BaseException) -> None:
         with contextlib.suppress(StorageError):
-            self.run = self.run.update(status="failed", summary={"error": str(error)})
+            self.run = self.run.update(status="failed", summary={"error": kept_message(error)})
 
     def _finish(self, status: str, error: str) -> dict[str, Any]:
         for rows in self._rows.values():
@@ -322,7 +322,7 @@ class Loop(Generic[R]):
                 "steps_recorded": True,
                 "last_evaluation": None,
             }
-            | ({"error": error} if error else {})
+            | ({"error": kept_message(error)} if error else {})
         )
         write_result(self._file, status, result)
         seconds = round(time.monotonic() - self._started, 3)

@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from runner.documents import read_object
-from runner.errors import RunnerError
+from runner.errors import MAX_MESSAGE, RunnerError
 from runner.labels import MAX_NOTE, MAX_TAGS
 
 STATE_FILE: Final = "upload.json"
@@ -77,7 +77,7 @@ class Told(BaseModel):
     status: Literal["finished", "interrupted", "failed"] | None = None
     proof: Digest | None = None
     seconds: Annotated[float, Field(ge=0, lt=1e12, strict=False)] | None = None
-    error: Annotated[str, Field(max_length=10_000)] | None = None
+    error: Annotated[str, Field(max_length=MAX_MESSAGE)] | None = None
 
 
 class ToldLabels(BaseModel):

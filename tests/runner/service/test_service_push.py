@@ -341,6 +341,20 @@ def test_a_loop_recorded_for_a_server_is_there_at_its_end(server, outbox):
     assert list(outbox.iterdir()) == []
 
 
+def fail_at_length(env):
+    drive(env, 50)
+    raise KeyError("x" * 100_000)
+
+
+def test_a_loop_that_failed_at_length_is_pushed_with_the_beginning_of_its_error(server, outbox):
+    rec = runner.record(gymnasium.make("FrozenLake-v1"), server.url, name="long")
+    with pytest.raises(KeyError, match="xxx"), rec:
+        fail_at_length(rec)
+    stored = find_run(rec.run.run_id, server.recordings)
+    assert (stored.status, stored.summary["error"]) == ("failed", f"KeyError: '{'x' * 9_988}…")
+    assert list(outbox.iterdir()) == []
+
+
 def test_a_loop_whose_server_is_away_waits_in_the_outbox(own_server, outbox, monkeypatch):
     monkeypatch.setattr("runner.service.outbox.LAST_SECONDS", 0.5)
     with pytest.warns(UserWarning, match="dualtaxi push --outbox"):  # noqa: SIM117
