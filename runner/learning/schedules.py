@@ -19,7 +19,7 @@ from runner.config.schedules import Exponential, Linear, Piecewise, Schedule
 CONSTANT, LINEAR, EXPONENTIAL, PIECEWISE = 0.0, 1.0, 2.0, 3.0
 
 
-@numba.njit(inline="always", cache=True)
+@numba.njit(cache=True)
 def schedule_value(schedule: NDArray[np.float64], episode: int, step: int) -> float:
     """Return the schedule's value at an episode and a training step, both counted from 0."""
     if schedule[0] == CONSTANT:
