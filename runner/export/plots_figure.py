@@ -147,8 +147,10 @@ def panel_svg(panel: Panel, groups: int) -> str:
 
 
 def panel_svgs(panels: Sequence[Panel], groups: int) -> list[dict[str, Any]]:
-    """Return panels as pages take them: each as SVG, and whether it is wide."""
-    return [{"svg": panel_svg(panel, groups), "wide": is_wide(panel)} for panel in panels]
+    """Return panels as pages take them: title, SVG, and whether it is wide."""
+    return [
+        {"title": panel.title, "svg": panel_svg(panel, groups), "wide": is_wide(panel)} for panel in panels
+    ]
 
 
 def draw_panel(axes: Axes, panel: Panel, groups: int) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
 from runner.service.settings import without_folders
+
+if TYPE_CHECKING:
+    from runner.sweep.results import Results
 
 BEHIND: Final = 1
 """Steps before the first that is asked for, so that the one that led there can be told."""
@@ -129,8 +132,23 @@ def sweep(name: str, recordings: Path) -> bytes:
         ],
         "pictures": pictures,
         "note": note,
+        "learning": _learning(results, recordings),
         "runs": {entry.number: list(entry.runs.values()) for entry in results.ranking},
         "best": results.best_yaml,
         "parameters": list(results.sweep.file.parameters),
     }
     return json.dumps(told, default=str).encode()
+
+
+def _learning(results: Results, recordings: Path) -> dict[str, Any]:
+    """Return how the best and the median trial of a sweep learned, or why that cannot be shown."""
+    from runner.errors import RunnerError
+    from runner.export.plots_figure import COLOURS, footnote, panel_svgs
+    from runner.sweep.plots import learning
+
+    try:
+        groups, panels = learning(results, recordings)
+    except RunnerError as error:
+        return {"note": without_folders(str(error), recordings), "legend": [], "panels": []}
+    legend = [(number % len(COLOURS), group.described) for number, group in enumerate(groups)]
+    return {"note": footnote(groups), "legend": legend, "panels": panel_svgs(panels, len(groups))}

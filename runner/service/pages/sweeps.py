@@ -59,6 +59,8 @@ async def sweep(
     made_by = [job.number for job in jobs.queue.jobs() if job.kind == "sweep" and job.name == name]
     found = json.loads(body)
     pictures = [picture_address(picture) for picture in found["pictures"]]
+    for panel in found["learning"]["panels"]:
+        panel["address"] = picture_address(panel["svg"])
     shown = {"told": found, "pictures": pictures, "jobs": made_by[-1:], "tag": tag_of(name)}
     return page(request, "sweep.html", name=name, **shown)
 

@@ -154,6 +154,8 @@ def test_a_sweep_is_done_and_may_use_the_workers_that_nobody_waits_for(client, s
     assert len(runs) == 6
     best = progress[-1]["best"]
     assert any(f"trial {best['trial']} is the best so far" in data.get("text", "") for _, _, data in seen)
+    page = client.get("/sweeps/small").text
+    assert 'alt="Length of evaluation trials over training episodes"' in page
 
 
 def test_a_job_whose_worker_dies_is_tried_again_and_then_fails(client, submit):

@@ -56,6 +56,7 @@ def test_the_keys_of_what_is_submitted_are_told(client):
     config, sweep = page_of(client, "/submit"), page_of(client, "/submit?sweep=true")
     assert "<code>epsilon</code>" in config
     assert "<code>strategy</code>" not in config
+    assert re.search("<dd>[^<]*`", config) is None, "code is set as code"
     assert (
         sweep.index("<code>strategy</code>")
         < sweep.index("Keys of its base")
