@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from benchmarks.processes import ROOT
 from runner.config import load
+from runner.environments import load_mdp
 from runner.learning.learner import Learner
-from runner.mdp import load_mdp
 from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts
 

@@ -11,12 +11,12 @@ import numpy as np
 from runner import runs
 from runner.analysis.tables import last_step, tables_at
 from runner.config import ExperimentConfig, from_mapping
+from runner.environments import load_mdp
 from runner.errors import Diverged, RunnerError, StorageError
 from runner.execution import Report, Session, Stop, describe, recorder_for, run_job
 from runner.job import Job
 from runner.learning.learner import Learner
 from runner.locking import locked
-from runner.mdp import load_mdp
 from runner.origin import address
 from runner.provenance import provenance
 from runner.recording.contents import survey

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner import runs
+from runner.environments import load_mdp
 from runner.errors import Diverged, RunnerError, StorageError, kept_message
 from runner.job import Job
 from runner.learning.learner import Learner
-from runner.mdp import Mdp, load_mdp
+from runner.mdp import Mdp
 from runner.observer import Observer
 from runner.origin import configured_tables, settle
 from runner.planning import Yardstick

@@ -125,7 +125,7 @@ def transition_table(
         MissingExtra: pandas is not installed.
         EnvironmentNotUsable: the environment is unknown, or has no transition table.
     """
-    from runner.mdp import load_mdp
+    from runner.environments import load_mdp
 
     return _frame(transition_columns(load_mdp(env_id, kwargs or {}, rewards)))
 

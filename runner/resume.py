@@ -19,6 +19,7 @@ from typing import Any, Final
 
 from runner.config import from_mapping
 from runner.config.sections import RunTable
+from runner.environments import load_mdp
 from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, StorageError, kept_message
 from runner.execution import (
     Report,
@@ -32,7 +33,7 @@ from runner.execution import (
 from runner.job import Job
 from runner.learning.learner import Held, Learner
 from runner.locking import locked
-from runner.mdp import Mdp, load_mdp
+from runner.mdp import Mdp
 from runner.origin import configured_tables, settle
 from runner.owner import owner
 from runner.provenance import provenance

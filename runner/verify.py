@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 from runner.analysis.tables import initially_held
 from runner.config import from_mapping
 from runner.config.sections import RunTable
+from runner.environments import load_mdp
 from runner.errors import ConfigError, Diverged, RecordingError
 from runner.execution import Report, Session, recorder_for
 from runner.job import Job
 from runner.learning.learner import Held, Learner
-from runner.mdp import Mdp, load_mdp
+from runner.mdp import Mdp
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.blocks import message_record

@@ -17,7 +17,7 @@ ORDER = """
     config owner labels
     job toy_text scene estimate
     mdp
-    words learning planning recording observer
+    environments words learning planning recording observer
     provenance runs
     finding locking
     catalogue

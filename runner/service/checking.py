@@ -61,8 +61,8 @@ def check(text: str, source: str, recordings: Path) -> Checked:
 
 
 def _config(text: str, source: str, document: Document, recordings: Path) -> Checked:
+    from runner.environments import load_mdp
     from runner.estimate import estimate, step_limit
-    from runner.mdp import load_mdp
     from runner.origin import settled
 
     config = from_text(text, source)

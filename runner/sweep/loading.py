@@ -182,7 +182,7 @@ def _placed(base: ExperimentConfig, values: Mapping[str, Any], document: Documen
 
 
 def _check_environment(experiment: ExperimentConfig, path: str, document: Document) -> None:
-    from runner.mdp import load_mdp
+    from runner.environments import load_mdp
 
     try:
         load_mdp(experiment.env.id, experiment.env.kwargs, experiment.rewards)

@@ -9,11 +9,12 @@ from typing import Final
 
 from runner.amounts import size
 from runner.config import ConfigError, ExperimentConfig, from_mapping
+from runner.environments import load_mdp
 from runner.errors import StorageError
 from runner.estimate import bytes_a_step, free_bytes
 from runner.execution import run_job
 from runner.job import Job
-from runner.mdp import Mdp, load_mdp
+from runner.mdp import Mdp
 from runner.recording.reader import open_recording
 from runner.runs import create_run
 from runner.sweep.model import Limits, Sweep

@@ -14,12 +14,13 @@ from typing import Any, Literal
 
 from runner.archive.places import at_hand
 from runner.config import from_mapping
+from runner.environments import load_mdp
 from runner.errors import RunnerError
 from runner.execution import Progress, run_job
 from runner.finding import find_run
 from runner.job import Job
 from runner.labels import Labels, change_labels
-from runner.mdp import Mdp, load_mdp
+from runner.mdp import Mdp
 from runner.recording.reader import open_recording
 from runner.resume import resume
 from runner.runs import Run, create_run, list_runs, unless_empty

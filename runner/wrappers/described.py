@@ -10,8 +10,9 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
+from runner.environments import mdp_of
 from runner.errors import EnvironmentNotUsable
-from runner.mdp import Mdp, mdp_of
+from runner.mdp import Mdp
 from runner.recording.spaces import MAX_VALUE_BYTES
 from runner.scene import is_text
 

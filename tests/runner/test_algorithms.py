@@ -9,8 +9,8 @@ import pytest
 
 from runner.again import evaluate
 from runner.analysis.tables import TableReplay, held_at, tables_at
+from runner.environments import load_mdp
 from runner.learning.learner import Learner
-from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts

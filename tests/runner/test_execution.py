@@ -13,11 +13,11 @@ from mcap.reader import make_reader
 
 import runner
 from runner.config import ConfigError
+from runner.environments import load_mdp
 from runner.errors import EnvironmentNotUsable, RunnerError, RunNotFound
 from runner.execution import run_job
 from runner.finding import find_run
 from runner.job import Job, jobs_of
-from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity

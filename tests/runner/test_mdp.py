@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runner.config.values import frozen
+from runner.environments import load_mdp
 from runner.errors import EnvironmentNotUsable
-from runner.mdp import Mdp, from_parts, load_mdp
+from runner.mdp import Mdp, from_parts
 
 DUALTAXI = "dualtaxi:DualTaxi-v1"
 TABULAR = {

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 import runner
 from runner.analysis.tables import TableReplay, history_of, last_step, step_of_episode, tables_at
+from runner.environments import load_mdp
 from runner.errors import RecordingError
 from runner.learning.learner import Learner
-from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import runner
+from runner.environments import load_mdp
 from runner.errors import EnvironmentNotUsable
-from runner.mdp import load_mdp
 from runner.verify import verify
 from runner.words import states_in_words
 

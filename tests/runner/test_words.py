@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from runner.mdp import load_mdp
+from runner.environments import load_mdp
 from runner.words import (
     action_names,
     actions_in_words,

@@ -126,7 +126,7 @@ def _run_abreast(
     """Run an experiment's seeds side by side, and tell of each run."""
     from runner.api import abreast, interruptible, jobs_in
     from runner.cli.progress import counting
-    from runner.mdp import load_mdp
+    from runner.environments import load_mdp
 
     load_mdp(config.env.id, config.env.kwargs, config.rewards)  # refused before all else
     _announce(config, folder)
@@ -169,7 +169,7 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch
     from runner.runs import create_run, unless_empty
 
     run = create_run(folder, job.config, job.seed, name)
-    from runner.mdp import load_mdp
+    from runner.environments import load_mdp
 
     label = f"seed {run.seed}" if len(job.config.seeds) > 1 else ""
     with unless_empty(run):

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from runner.environments import load_mdp
 from runner.errors import EnvironmentNotUsable
-from runner.mdp import Mdp, load_mdp
+from runner.mdp import Mdp
 from runner.planning import best_response, evaluate_policy, greedy_policy, optimal_values
 
 DISCOUNT = 0.9

@@ -10,10 +10,10 @@ import pytest
 from blake3 import blake3
 from mcap.reader import make_reader
 
+from runner.environments import load_mdp
 from runner.execution import Session, recorder_for
 from runner.job import Job
 from runner.learning.learner import Learner
-from runner.mdp import load_mdp
 from runner.recording import open as open_recording
 from runner.recording import pipeline, recorder, schema
 from runner.recording.digest import combine
