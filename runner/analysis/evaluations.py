@@ -46,9 +46,9 @@ def evaluations_of(recording: Recording) -> list[Evaluation]:
         return _of_loop(recording)
     found: list[Evaluation] = []
     for metrics in recording.metrics("eval"):
-        start = found[-1].stop if found else 0
-        stop = start + int(metrics["trials"])
-        found.append(Evaluation(int(metrics["episode"]), int(metrics["step"]), start, stop))
+        trials = int(metrics["trials"])
+        start = int(metrics["evaluation"]) * trials  # a repair may have lost the metrics of others
+        found.append(Evaluation(int(metrics["episode"]), int(metrics["step"]), start, start + trials))
     return found
 
 

@@ -108,3 +108,8 @@ def state_of(run: Run) -> tuple[str, int, int]:
     """Return what tells one state of a run's recording from another: its path, size and time."""
     facts = run.recording.stat()
     return str(run.recording), facts.st_size, facts.st_mtime_ns
+
+
+def timed_state_of(run: Run) -> tuple[str, int, int, str]:
+    """Return the same with how long the run took, which only `run.json` says, at times later."""
+    return *state_of(run), str(run.summary.get("seconds"))

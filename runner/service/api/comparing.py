@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 from runner.runs import Run
 from runner.service import computed
 from runner.service.catalogue import Catalogue
-from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, recorded_run, state_of
+from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, recorded_run, state_of, timed_state_of
 from runner.service.kept import ALWAYS
 from runner.service.problems import answers
 
@@ -42,8 +42,7 @@ async def diff(
 ) -> dict[str, Any]:
     """Return what `dualtaxi diff --json` prints."""
     left, right = await found_runs(catalogue, [a, b])
-    took = [run.summary.get("seconds") for run in (left, right)]  # which the recordings do not say
-    key = ("diff", state_of(left), state_of(right), *took, request.url.query)
+    key = ("diff", *map(timed_state_of, (left, right)), request.url.query)
     asked = (left, right, ignore or [], first, target or [])
     body = await kept.awaited(key, lambda: apart(computed.difference, *asked), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]

@@ -139,7 +139,7 @@ def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
         "note": run.note,
         "last_evaluation": (series["eval"] or [None])[-1],
         "last_optimality": (series["optimality"] or [None])[-1],
-        "error": None if error is None else settings.without_folders(error),
+        "error": settings.without_folders(str(error)) if error else None,
         "problems": [settings.without_folders(problem) for problem in problems],
     }
 

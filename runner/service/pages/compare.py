@@ -14,7 +14,7 @@ from runner.runs import Run
 from runner.service import played
 from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
-from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, state_of
+from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, timed_state_of
 from runner.service.pages.frame import head_of
 from runner.service.pages.rendering import link, page, picture_address
 from runner.service.pages.spots import (
@@ -140,7 +140,7 @@ def _two(found: list[Run]) -> list[Run]:
 
 async def _difference(found: list[Run], kept: KeptOf, apart: ApartOf) -> dict[str, Any]:
     """Return in what two runs differ, as `played.difference` has it."""
-    key = ("difference", *map(state_of, found))
+    key = ("difference", *map(timed_state_of, found))
     told: dict[str, Any] = json.loads(await kept.awaited(key, lambda: apart(played.difference, *found), LONG))
     return told
 

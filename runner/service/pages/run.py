@@ -170,7 +170,7 @@ def _standing(run: Run, jobs: Jobs, settings: Settings) -> dict[str, Any]:
         "facts": list(facts.items()),
         "share": min(1.0, done / to_do) if running else None,
         "said": f"{done:,} of {to_do:,} training episodes" if running else "",
-        "error": settings.without_folders(run.summary.get("error", "")),
+        "error": settings.without_folders(str(run.summary.get("error") or "")),
         "job": number,
         "is_live": run.status == "running" or (number is not None and run.status != "finished"),
     }

@@ -109,10 +109,12 @@ def test_a_screenshot_is_kept_whole_or_its_place_is_told(monkeypatch, tmp_path):
 def test_the_web_viewer_ends_with_the_command(pictured):
     words = [sys.executable, "-m", "runner", "view", pictured("taxis").folder, "--web"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
-        address = process.stdout.readline().strip()
-        with urllib.request.urlopen(address, timeout=20) as answer:
-            assert b"re_viewer" in answer.read()
-        process.terminate()
+        try:
+            address = process.stdout.readline().strip()
+            with urllib.request.urlopen(address, timeout=20) as answer:
+                assert b"re_viewer" in answer.read()
+        finally:
+            process.terminate()
         assert process.wait(30) == 128 + signal.SIGTERM
     with pytest.raises(urllib.error.URLError, match="refused"):
         urllib.request.urlopen(address, timeout=20)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import random
 import socket
 import subprocess
 import sys
@@ -15,6 +16,14 @@ import psutil
 from tests.waiting import until
 
 
+def free_port() -> int:
+    """Return a port at which nothing listens; none of those that Linux gives to clients, as it may now."""
+    while True:
+        port = random.randrange(10_000, 32_768)
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            return port
+
+
 class Served:
     """`dualtaxi serve` over a folder, always at the same port and with one log; a `with` starts and stops it.
 
@@ -24,8 +33,7 @@ class Served:
     def __init__(self, recordings: Path, *options: str) -> None:
         self.recordings, self.options = recordings, options
         self.log = recordings.with_name(f"{recordings.name}.log")
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
+        self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self.origin = {"Origin": self.url}
         self.process: subprocess.Popen[str] | None = None
@@ -44,8 +52,10 @@ class Served:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "runner", *words], stdout=subprocess.PIPE, stderr=log, text=True
             )
-        assert self.process.stdout.readline() == f"{self.url}/\n", self.log.read_text()
         self.client = httpx2.Client(base_url=f"{self.url}/api/v1", headers=self.origin, timeout=60)
+        if self.process.stdout.readline() != f"{self.url}/\n":
+            self.kill()
+            raise AssertionError(self.log.read_text())
 
     def stop(self) -> int | None:
         """Have it end properly, if it runs; return its exit code."""
@@ -65,11 +75,13 @@ class Served:
         return workers
 
     def _ended(self) -> int:
-        code = self.process.wait(60)
-        self.process.stdout.close()
-        self.process = None
+        process, self.process = self.process, None
         self.client.close()
-        return code
+        with process.stdout:
+            try:
+                return process.wait(60)
+            finally:
+                process.kill()  # which does nothing to one that has ended
 
     def workers(self) -> list[psutil.Process]:
         """Return the processes that it has started, and theirs."""

@@ -229,6 +229,15 @@ def test_how_a_run_stands_is_told_while_it_runs_only(client, recordings):
     assert "so far" in client.get("/runs/first/standing").text
 
 
+@pytest.mark.parametrize("error", [None, 5, ["no", "text"]])
+def test_an_error_that_is_no_text_is_no_fault(client, recordings, error):
+    run = find_run("first", recordings)
+    run.update(status="failed", summary=run.summary | {"error": error})
+    page_of(client, "/runs/first")
+    told = client.get("/api/v1/runs/first")
+    assert (told.status_code, told.json()["error"]) == (200, None if error is None else str(error))
+
+
 def test_the_page_of_a_run_is_live_from_when_a_job_will_go_on_with_it(client, recordings, monkeypatch):
     monkeypatch.setattr("runner.service.work.RESERVE_BYTES", 1 << 62)  # so that no job is begun
     run = find_run("first", recordings).update(status="interrupted")
