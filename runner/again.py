@@ -48,7 +48,7 @@ def rerecord(run: Run, report: Report = lambda _: None, stop: Stop = lambda: Fal
     """
     with locked(run) as current:
         if current.status != "finished":
-            from_mapping(current.facts["config"])  # refuses a loop's run, which nobody can resume
+            from_mapping(current.facts.get("config", {}))  # refuses a loop's run, which nobody can resume
             raise RunnerError(
                 f"run {run.run_id} is {current.status}; `dualtaxi resume {run.run_id}` finishes it first."
             )

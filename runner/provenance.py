@@ -23,7 +23,7 @@ def provenance() -> dict[str, str]:
         "host": socket.gethostname(),
         "user": _user(),
         "command": " ".join(sys.argv),
-        "directory": str(Path.cwd()),
+        "directory": _directory(),
     }
 
 
@@ -45,6 +45,13 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
+
+
+def _directory() -> str:
+    try:
+        return str(Path.cwd())
+    except OSError:  # it was removed
+        return ""
 
 
 def _user() -> str:

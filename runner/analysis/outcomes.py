@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.mdp import Mdp
+
+_COMPARED: Final = 1 << 20
+"""Outcomes that are compared at a time, so that memory grows with neither steps nor outcomes."""
 
 
 def events_of(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
@@ -14,8 +19,16 @@ def events_of(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
     That is one with its next state; of several, one that ends as it did, and that pays what it did. There
     are none where the environment has no such outcome, as a loop of one's own may have it.
     """
-    if not mdp.event_names:
-        return np.zeros(len(steps), np.uint32)
+    found = np.zeros(len(steps), np.uint32)
+    if mdp.event_names:
+        slice_steps = max(1, _COMPARED // mdp.next_state.shape[2])
+        for start in range(0, len(steps), slice_steps):
+            some = slice(start, start + slice_steps)
+            found[some] = _events(mdp, steps[some])
+    return found
+
+
+def _events(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
     state, action = steps["state"].astype(np.int64), steps["action"].astype(np.int64)
     fits = mdp.next_state[state, action] == steps["next_state"][:, np.newaxis]
     outcome = np.zeros(len(steps), np.int64)

@@ -9,6 +9,7 @@ from typing import Any, Final
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.scene import is_whole
 
 _PHASES: Final = {"train": "training", "eval": "evaluation"}
 
@@ -19,8 +20,9 @@ def shortcomings(recording: Recording) -> list[str]:
     if status != "finished":
         done = "there is what its loop had done"
         if recording.kind == "job":
-            episodes, planned = recording.count(schema.TRAIN_EPISODE), recording.config["episodes"]
-            done = f"there are {episodes:,} of {planned:,} training episodes"
+            planned = recording.config.get("episodes")
+            of = f" of {planned:,}" if is_whole(planned, 0, 2**63) else ""
+            done = f"there are {recording.count(schema.TRAIN_EPISODE):,}{of} training episodes"
         said.append(f"Run {recording.run['run_id']} did not finish ({status}): {done}.")
     said += [f"Of {topic} some messages were lost in a repair; they are missing." for topic in recording.lost]
     return said
@@ -43,7 +45,8 @@ def require_steps(recording: Recording, purpose: str) -> None:
 
 def why_no_steps(recording: Recording) -> str:
     """Return why a recording has no steps, and what gives it some."""
-    if recording.config["recording"]["steps"] == "none":
+    plan = recording.config.get("recording")
+    if isinstance(plan, Mapping) and plan.get("steps") == "none":
         run_id = recording.run["run_id"]
         return f"they were left out (recording.steps: none); `dualtaxi rerecord {run_id}` records them"
     return "it ended before one was recorded"

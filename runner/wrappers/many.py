@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -217,6 +218,9 @@ def _game(env: Any) -> Described:
     agents = tuple(env.possible_agents)
     if not 1 <= len(agents) <= MAX_AGENTS:
         raise EnvironmentNotUsable(f"found {len(agents)} possible agents, expected 1 to {MAX_AGENTS}.")
+    for agent in agents:
+        if not isinstance(agent, str | Integral):
+            raise EnvironmentNotUsable(f"found the agent {agent!r}, expected a name or a number for each.")
     observation = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
     action = spaces.Dict({agent: env.action_space(agent) for agent in agents})
     name = env.metadata.get("name") if isinstance(getattr(env, "metadata", None), Mapping) else None

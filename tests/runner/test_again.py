@@ -8,13 +8,14 @@ import pytest
 from runner import again
 from runner.again import evaluate, rerecord
 from runner.analysis.tables import tables_at
+from runner.documents import write_whole
 from runner.errors import Diverged, RecordingError, RunnerError
 from runner.execution import run_job
 from runner.finding import find_run
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording import schema
-from runner.runs import create_run, list_runs
+from runner.runs import RUN_FILE, create_run, list_runs
 from runner.verify import verify
 from tests.runner.recording.making import TAXIS, experiment, make_run
 
@@ -75,6 +76,10 @@ def test_what_is_not_finished_is_finished_first(tmp_path):
     run = run_job(Job(config, 0), create_run(tmp_path, config, 0), stop=lambda: True)
     with pytest.raises(RunnerError, match="`dualtaxi resume"):
         rerecord(run)
+    facts = {key: value for key, value in run.facts.items() if key != "config"}
+    write_whole(run.folder / RUN_FILE, facts | {"status": "interrupted"})
+    with pytest.raises(RunnerError):
+        rerecord(find_run(run.run_id, tmp_path))
 
 
 def test_the_last_table_plays_as_the_last_evaluation_did(whole, tmp_path):

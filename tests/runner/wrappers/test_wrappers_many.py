@@ -143,6 +143,26 @@ def test_agents_that_leave_are_told(tmp_path):
     assert infos[1]["json"] == '{"info": {"left": {"b": "b", "c": "b"}}}'
 
 
+def test_agents_without_names_are_refused_before_there_is_a_run(tmp_path):
+    game = Leaving()
+    game.possible_agents = [("a", 1), ("b", 2)]
+    with pytest.raises(EnvironmentNotUsable, match="expected a name or a number"):
+        runner.record_parallel(game, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_loop_is_recorded_though_its_folder_was_removed(tmp_path, monkeypatch):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with runner.record(make("FrozenLake-v1"), tmp_path / "runs") as env:
+        list(play(env, 20))
+    with open_recording(env.run.recording) as recording:
+        assert recording.provenance["directory"] == ""
+    monkeypatch.chdir(tmp_path)
+
+
 def test_a_vector_of_one_is_as_the_environment_alone(tmp_path):
     with runner.record(make("FrozenLake-v1"), tmp_path) as env:
         list(play(env, 200))
