@@ -184,6 +184,7 @@ def test_the_same_job_twice_is_the_same_content_and_every_seed_another(tmp_path)
 
 @pytest.mark.parametrize("parts", [{}, {"recording": {"steps": "none"}}])
 def test_recorded_without_threads_a_run_is_the_same_to_the_byte(parts, tmp_path):
+    before = set(threading.enumerate())
     config = experiment(TAXIS, parts)
     beside, alone = (
         run_job(Job(config, 0), create_run(tmp_path, config, 0), threads=threads) for threads in (True, False)
@@ -192,7 +193,7 @@ def test_recorded_without_threads_a_run_is_the_same_to_the_byte(parts, tmp_path)
     with open_recording(alone.recording) as one, open_recording(beside.recording) as other:
         for topic in schema.ALL_TOPICS:
             assert list(one.messages(topic)) == list(other.messages(topic))
-    assert {thread.name for thread in threading.enumerate()}.isdisjoint({"recording-writer"})
+    assert set(threading.enumerate()) <= before, "no thread is left"
 
 
 def test_progress_is_told_with_every_evaluation(tmp_path):

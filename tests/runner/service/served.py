@@ -56,6 +56,7 @@ class Served:
         if self.process.stdout.readline() != f"{self.url}/\n":
             self.kill()
             raise AssertionError(self.log.read_text())
+        httpx2.get(f"{self.url}/healthz", timeout=60)  # answered when the folder is its own
 
     def stop(self) -> int | None:
         """Have it end properly, if it runs; return its exit code."""
