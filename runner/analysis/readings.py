@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.series import LOGGED, SHARES, Readings, RunSeries
+from runner.analysis.series import LARGEST, LOGGED, SHARES, Readings, RunSeries
 from runner.errors import RecordingError
 from runner.frames import agents_of, evaluation_records, event_names_of, training_records
 from runner.recording import schema
@@ -48,12 +48,14 @@ def loop_series(recording: Recording) -> RunSeries:
     """Return returns and lengths of the episodes of somebody's own loop, and what it logged, over episodes.
 
     Of many training episodes it is the means of at most 200 stretches, of 1, 2, 5, 10, ... episodes, so that
-    those of several runs agree; the evaluation's are by the training episodes that were done before.
+    those of several runs agree; the evaluation's are by the training episodes that were done before. Values
+    that are not finite are left out of the means, and counted in `not_finite`.
     """
     total = recording.count(schema.TRAIN_EPISODE)
     edges = np.arange(0, max(total, 1) + (width := _stretch(total)), width)
-    training = _binned_episodes(recording, edges)
-    for name, values in _binned_scalars(recording, edges).items():
+    not_finite: Counter[str] = Counter()
+    training = _binned_episodes(recording, edges, not_finite)
+    for name, values in _binned_scalars(recording, edges, not_finite).items():
         for k in np.flatnonzero(~np.isnan(values)).tolist():
             training.setdefault(int(edges[k + 1]), {})[f"{LOGGED}{name}"] = {"": float(values[k])}
     return RunSeries(
@@ -62,9 +64,10 @@ def loop_series(recording: Recording) -> RunSeries:
         seed=int(recording.run["seed"]),
         status=recording.status,
         config=_without_seed(recording.config, int(recording.run["seed"])),
-        evaluation=_loop_evaluations(recording),
+        evaluation=_loop_evaluations(recording, not_finite),
         training=sorted(training.items()),
         content_digest=recording.result.get("content_digest", ""),
+        not_finite=dict(not_finite),
     )
 
 
@@ -138,32 +141,51 @@ def _stretch(episodes: int) -> int:
     return next(width for width in widths if episodes <= width * _POINTS)
 
 
-def _binned_episodes(recording: Recording, edges: NDArray[np.int64]) -> dict[int, Readings]:
+def is_usable(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which values are finite and small enough to be summed and drawn."""
+    return np.abs(values) <= LARGEST  # false for NaN
+
+
+def _binned_episodes(
+    recording: Recording, edges: NDArray[np.int64], not_finite: Counter[str]
+) -> dict[int, Readings]:
     """Return mean length and return of the training episodes between the edges."""
     agents, bins = agents_of(recording), len(edges) - 1
     count, length = np.zeros(bins), np.zeros(bins)
-    returns = np.zeros((bins, len(agents)))
+    returns, usable_returns = np.zeros((bins, len(agents))), np.zeros((bins, len(agents)))
     for block in recording.blocks(schema.TRAIN_EPISODE):
         at = (np.searchsorted(edges, block["episode"], side="right") - 1).clip(0, bins - 1)
         count += np.bincount(at, minlength=bins)
         length += np.bincount(at, block["length"], minlength=bins)
+        usable = is_usable(block["returns"])
+        if not usable.all():
+            not_finite["training.mean_return"] += int((~usable).sum())
         for i in range(len(agents)):
-            returns[:, i] += np.bincount(at, block["returns"][:, i], minlength=bins)
+            own = usable[:, i]
+            usable_returns[:, i] += np.bincount(at[own], minlength=bins)
+            returns[:, i] += np.bincount(at[own], block["returns"][own, i], minlength=bins)
     found: dict[int, Readings] = {}
     for k in np.flatnonzero(count).tolist():
-        mean = (returns[k] / count[k]).tolist()
-        found[int(edges[k + 1])] = {
-            "training.mean_length": {"": float(length[k] / count[k])},
-            "training.mean_return": _by_agent(agents, mean),
-        }
+        readings = found.setdefault(int(edges[k + 1]), {})
+        readings["training.mean_length"] = {"": float(length[k] / count[k])}
+        means = _means(agents, returns[k], usable_returns[k])
+        if means:
+            readings["training.mean_return"] = means
     return found
 
 
-def _by_agent(agents: Sequence[str], values: Sequence[float]) -> dict[str, float]:
-    return {agent if len(agents) > 1 else "": value for agent, value in zip(agents, values, strict=True)}
+def _means(agents: Sequence[str], sums: NDArray[np.float64], counts: NDArray[np.float64]) -> dict[str, float]:
+    """Return the mean by agent, of those agents that have any usable value; one agent alone is ""."""
+    return {
+        agent if len(agents) > 1 else "": float(total / count)
+        for agent, total, count in zip(agents, sums, counts, strict=True)
+        if count
+    }
 
 
-def _binned_scalars(recording: Recording, edges: NDArray[np.int64]) -> dict[str, NDArray[np.float64]]:
+def _binned_scalars(
+    recording: Recording, edges: NDArray[np.int64], not_finite: Counter[str]
+) -> dict[str, NDArray[np.float64]]:
     """Return the means of what was logged under each name between the edges; NaN where there was nothing."""
     bins = len(edges) - 1
     sums: dict[str, NDArray[np.float64]] = {}
@@ -174,8 +196,9 @@ def _binned_scalars(recording: Recording, edges: NDArray[np.int64]) -> dict[str,
             if len(sums) == _MOST_NAMES:
                 raise RecordingError(f"{recording.path}: has scalars of more than {_MOST_NAMES} names.")
             sums[name], counts[name] = np.zeros(bins), np.zeros(bins)
-        if not math.isfinite(scalar["value"]):
-            continue  # a figure has no place for it
+        if not abs(scalar["value"]) <= LARGEST:
+            not_finite[f"{LOGGED}{name}"] += 1
+            continue
         k = min(max(int(np.searchsorted(edges, scalar["episode"], side="right")) - 1, 0), bins - 1)
         sums[name][k] += scalar["value"]
         counts[name][k] += 1
@@ -183,7 +206,7 @@ def _binned_scalars(recording: Recording, edges: NDArray[np.int64]) -> dict[str,
         return {name: sums[name] / counts[name] for name in sums}
 
 
-def _loop_evaluations(recording: Recording) -> list[tuple[int, Readings]]:
+def _loop_evaluations(recording: Recording, not_finite: Counter[str]) -> list[tuple[int, Readings]]:
     """Return the means of the evaluation episodes, by the training episodes that were done before."""
     before, first = trained_before(recording), 0
     agents, events = agents_of(recording), event_names_of(recording)
@@ -196,13 +219,17 @@ def _loop_evaluations(recording: Recording) -> list[tuple[int, Readings]]:
     evaluations = []
     for episodes, parts in found.items():
         trials = np.concatenate(parts)
-        means = trials["returns"].mean(axis=0).tolist()
-        readings: Readings = {
-            "mean_length": {"": float(trials["length"].mean())},
-            "mean_return": _by_agent(agents, means),
-        }
+        usable = is_usable(trials["returns"])
+        if not usable.all():
+            not_finite["mean_return"] += int((~usable).sum())
+        readings: Readings = {"mean_length": {"": float(trials["length"].mean())}}
+        sums = np.where(usable, trials["returns"], 0.0).sum(axis=0)
+        if means := _means(agents, sums, usable.sum(axis=0)):
+            readings["mean_return"] = means
         if known:
             readings["finish_percent"] = {"": 100 * float(trials["success"].mean())}
+        if recording.environment["penalty_below"] is not None:
+            readings["mean_penalties"] = {"": float(trials["penalties"].mean())}
         for i, name in enumerate(events):
             agent, _, kind = name.rpartition(".")
             readings.setdefault(f"event.{kind}", {})[agent] = float(trials["events"][:, i].mean())

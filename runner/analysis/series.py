@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -30,6 +30,9 @@ class RunSeries:
     """(episode, readings) of every report of training, those at evaluations among them."""
     content_digest: str = ""
     """Of its recording; empty if that did not come to its end."""
+    not_finite: Mapping[str, int] = field(default_factory=dict)
+    """Metric -> number of recorded values that are infinite, NaN or too large to be averaged; the
+    readings leave them out."""
 
     @property
     def finished(self) -> bool:
@@ -37,6 +40,8 @@ class RunSeries:
         return self.status == "finished"
 
 
+LARGEST: Final = 1e300
+"""Larger values are left out of the readings: their sums, and the margins of an axis, would overflow."""
 SHARES: Final = "training.reward"
 """The metric whose lines are shares of a whole."""
 LOGGED: Final = "training.logged."
@@ -67,6 +72,20 @@ TITLES: Final = {
 def is_loop(run: RunSeries) -> bool:
     """Return whether a run is somebody's own loop, whose training is told at even numbers of episodes."""
     return "made_by" in run.config
+
+
+def values_left_out(runs: Iterable[RunSeries]) -> list[str]:
+    """Return a sentence for each run that says which values its readings leave out; none for most runs."""
+    return [
+        f"Run {run.run_id}: left out, as they are infinite, not a number or beyond {LARGEST:g}: "
+        + ", ".join(
+            f"{count:,} value{'s' if count > 1 else ''} of “{title_of(metric)[0]}”"
+            for metric, count in run.not_finite.items()
+        )
+        + "."
+        for run in runs
+        if run.not_finite
+    ]
 
 
 def has_goal(run: RunSeries) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import math
 import re
+import textwrap
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from runner.analysis.groups import Group
-from runner.analysis.series import SHARES, is_loop
+from runner.analysis.series import SHARES, is_loop, values_left_out
 from runner.errors import MissingExtra, RunnerError
 from runner.export.plots import Curve, Panel
 from runner.words import spoken
@@ -32,6 +33,8 @@ SUFFIXES: Final = (".png", ".svg", ".pdf")
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
 DASHES: Final = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
+_LETTERS_AN_INCH: Final = 17
+"""Letters of a footnote that fit on an inch."""
 _BAND_OPACITY: Final = 0.2
 INK: Final = "#1b1f24"
 STYLE: Final = {
@@ -110,12 +113,14 @@ def draw_figure(groups: Sequence[Group], panels: Sequence[Panel]) -> Figure:
     narrow = [panel for panel in panels if not is_wide(panel)]
     wide = [panel for panel in panels if is_wide(panel)]
     rows = math.ceil(len(narrow) / columns) + len(wide)
-    head, foot = 0.55 + 0.19 * len(groups), 0.22
+    width = max(3.4 * columns, 6.8)
+    notes = textwrap.wrap(footnote(groups), round(width * _LETTERS_AN_INCH))
+    head, foot = 0.55 + 0.19 * len(groups), 0.08 + 0.14 * len(notes)
     height = head + 2.2 * rows + foot
     with mpl.rc_context(STYLE):
         room = (0, foot / height, 1, 1 - (head + foot) / height)
         figure: Figure = mpl.figure.Figure(
-            figsize=(max(3.4 * columns, 6.8), height),
+            figsize=(width, height),
             layout=mpl.layout_engine.ConstrainedLayoutEngine(rect=room, h_pad=0.08, w_pad=0.08),
         )
         grid = figure.add_gridspec(rows, columns)
@@ -125,7 +130,7 @@ def draw_figure(groups: Sequence[Group], panels: Sequence[Panel]) -> Figure:
             place = grid[rows - len(wide) + number, : max(columns - 1, 1)]
             draw_panel(figure.add_subplot(place), panel, len(groups))
         _heading(figure, groups, height)
-        figure.text(0.01, 0.06 / height, footnote(groups), fontsize=7.5, va="bottom")
+        figure.text(0.01, 0.06 / height, "\n".join(notes), fontsize=7.5, va="bottom")
     return figure
 
 
@@ -170,15 +175,17 @@ def draw_panel(axes: Axes, panel: Panel, groups: int) -> None:
 
 
 def footnote(groups: Sequence[Group]) -> str:
-    """Return what lines and bands mean."""
-    loops = any(is_loop(run) for group in groups for run in group.runs)
+    """Return what lines and bands mean, and which values are not drawn."""
+    runs = [run for group in groups for run in group.runs]
+    left_out = "".join(f" {sentence}" for sentence in values_left_out(runs))
+    loops = any(is_loop(run) for run in runs)
     greedy = "" if loops else " Evaluation trials follow the greedy policy: no exploring."
     if max(len(group.runs) for group in groups) == 1:
-        return f"Each line is one run, as reported.{greedy}"
+        return f"Each line is one run, as reported.{greedy}{left_out}"
     between = " Between its points a run is interpolated." if loops else ""
     return (
         "Lines: median over the runs of a configuration that have come as far; bands: from the lowest run to "
-        f"the highest.{between}{greedy}"
+        f"the highest.{between}{greedy}{left_out}"
     )
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runner.analysis.groups import Group, groups_of
 from runner.analysis.readings import read_series
-from runner.analysis.series import RunSeries
+from runner.analysis.series import RunSeries, values_left_out
 from runner.errors import MissingExtra, RecordingError, RunnerError
 from runner.export import svg, svg_maps
 from runner.export.contents import flat_text, has_steps, shortcomings, why_no_steps
@@ -96,7 +96,7 @@ def render_report(recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> 
             script=(TEMPLATES / "replay.js").read_text("utf-8"),
         )
     )
-    return page, [sentence for run in runs for sentence in run["notes"]]
+    return page, [*(sentence for run in runs for sentence in run["notes"]), *values_left_out(series)]
 
 
 # --- one run ------------------------------------------------------------------------------------------

@@ -42,6 +42,7 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.groups import groups_of, left_out
     from runner.analysis.readings import read_series
+    from runner.analysis.series import values_left_out
     from runner.export.contents import shortcomings
     from runner.export.places import write_new
     from runner.export.plots import panels_of
@@ -65,6 +66,8 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     groups = groups_of(series)
     for note in left_out(groups):
         say(f"{note[0].upper()}{note[1:]}.")
+    for sentence in values_left_out(series):
+        say(sentence)
     panels = panels_of(groups)
     write_new(output, force, lambda path: save_figure(path, groups, panels))
     drawn = sum(len(group.runs) for group in groups)

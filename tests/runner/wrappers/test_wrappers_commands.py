@@ -16,6 +16,7 @@ import pytest
 from click.testing import CliRunner
 
 import runner
+from runner.analysis.readings import read_series
 from runner.cli import cli
 from runner.recording import schema
 from runner.recording.reader import open_recording
@@ -385,3 +386,32 @@ def test_rerun_gets_a_loop_of_a_single_step_and_episode(tmp_path):
     exported = subprocess.run(words, check=False, capture_output=True, text=True)
     assert exported.returncode == 0, exported.stderr
     assert "1 of 1 training steps" in exported.stderr
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan"), 1e308])
+def test_values_that_are_not_finite_are_left_out_of_curves_and_counted(value, tmp_path):
+    """One infinite reward used to end `plot` and `report` in a traceback."""
+    env = gymnasium.wrappers.TransformReward(make("FrozenLake-v1"), lambda reward: value or reward)
+    with runner.record(env, tmp_path, name="bad") as recorded:
+        list(play(recorded, 40, 0))
+        recorded.log("loss", value)
+        value = 0.0
+        list(play(recorded, 200, 1))
+        recorded.log("loss", 0.25)
+    said = "“Return of training episodes”, 1 value of “Logged: loss”."
+    for command, file in (("plot", "plot.svg"), ("report", "report.html")):
+        done = dualtaxi(tmp_path, command, "bad", "-o", str(tmp_path / file))
+        assert done.exit_code == 0
+        assert said in done.stderr
+        assert "Return of training episodes" in (tmp_path / file).read_text()
+    with open_recording(runner.find_run("bad", tmp_path).recording) as recording:
+        series = read_series(recording)
+    drawn = [
+        reading
+        for _, readings in series.training
+        for lines in readings.values()
+        for reading in lines.values()
+    ]
+    assert np.isfinite(drawn).all()
+    assert 0.25 in drawn
+    assert series.not_finite["training.mean_return"] >= 1
