@@ -15,13 +15,13 @@ from fastapi import APIRouter, FastAPI
 from runner import __version__
 from runner.errors import RunnerError
 from runner.service import health, login, pages
-from runner.service.apart import Apart
 from runner.service.api import comparing, files, jobs, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
 from runner.service.kept import Kept
 from runner.service.logs import LOG, AccessLog
 from runner.service.problems import answer_errors, answers
+from runner.service.processes import ProcessPool
 from runner.service.receiving.model import Upload, UploadLimits
 from runner.service.receiving.uploads import Uploads
 from runner.service.security import Access, Tokens
@@ -61,7 +61,6 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.settings = settings
     app.state.catalogue = Catalogue(settings.recordings, LOG.warning)
     app.state.kept = Kept(settings.limits.cache_bytes)
-    app.state.apart = Apart(PROCESSES, settings.limits.work_seconds)
     app.state.stopping = asyncio.Event()
     app.state.access = Access(settings.tokens, settings.limits)
     app.add_middleware(Guard, settings=settings, access=app.state.access)
@@ -117,7 +116,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
                 lambda upload: _uploaded(app, upload),
             )
         )
-        app.state.apart.prepare()
+        app.state.apart = stack.enter_context(
+            ProcessPool(PROCESSES, settings.limits.work_seconds, settings.limits.work_bytes)
+        )
         LOG.info("started", extra=settings.told())
         yield {}
         app.state.stopping.set()

@@ -1,14 +1,14 @@
-"""What is submitted, checked before it is queued: by a process of its own, which may be ended.
+"""What is submitted, checked before it is queued: by child processes with limits on time and memory.
 
 A check imports the environment, whose code and memory have no place in the server.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import multiprocessing
-import threading
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
@@ -18,11 +18,18 @@ from runner.config.document import Document, Problem, read_yaml
 from runner.config.loading import MAX_BYTES
 from runner.config.problems import refuse
 from runner.errors import ConfigError, RunnerError
+from runner.service.processes import OutOfMemory, ProcessDied, ProcessPool, TimedOut, busy
 from runner.service.queue import Kind
 
+PROCESSES: Final = 2
+"""Texts that are checked at the same time."""
 CHECK_SECONDS: Final = 30.0
+MEMORY_BYTES: Final = 1 << 30
+"""Of the check of an environment, whose arrays may have 128 MiB."""
+PATIENCE_SECONDS: Final = 30.0
+"""Time until a check that had no turn is refused."""
 IDLE_SECONDS: Final = 60.0
-"""After which the process ends: what it has loaded takes memory."""
+"""After which an idle process is ended: what it has loaded takes memory."""
 MAX_RUNS: Final = 10_000
 SWEEP_KEYS: Final = ("base", "parameters", "strategy")
 """A file that has one of them is a sweep."""
@@ -126,7 +133,7 @@ def _refuse_paths(starts: Mapping[tuple[str | int, ...], Any], document: Documen
 
 
 class Checker:
-    """A process that checks one text at a time, started when it is needed; it may be called by any thread.
+    """Checks texts in a few child processes; may be used by any thread.
 
     Args:
         recordings: the folder that runs would go to.
@@ -134,10 +141,7 @@ class Checker:
 
     def __init__(self, recordings: Path) -> None:
         self._recordings = recordings
-        self._context = multiprocessing.get_context("spawn")
-        self._lock = threading.Lock()
-        self._process: Any = None
-        self._pipe: Any = None
+        self._pool = ProcessPool(PROCESSES, CHECK_SECONDS, MEMORY_BYTES, IDLE_SECONDS)
 
     def __enter__(self) -> Self:
         return self
@@ -146,68 +150,56 @@ class Checker:
         self.close()
 
     def close(self) -> None:
-        """End the process, if there is one."""
-        if self._process is not None:
-            self._pipe.close()
-            self._process.kill()
-            self._process.join()
-            self._process = None
+        """End the processes."""
+        self._pool.close()
 
-    def check(self, text: str, source: str) -> Checked:
-        """Return what a text means; arguments and errors as for the function `check`.
+    async def check(self, text: str, source: str) -> Checked:
+        """Return what a text means, without holding a thread of the server; see the function `check`.
 
         Raises:
-            ConfigError: besides, it is too large, or checking it takes too long.
+            ConfigError: besides, it is too large, or its check took too long or too much memory.
+            Busy: others were being checked all the time.
         """
+        future = self._submitted(text, source)
+        waiting = asyncio.wrap_future(future)
+        done, _ = await asyncio.wait({waiting}, timeout=PATIENCE_SECONDS)
+        if not done and future.cancel():
+            raise busy()
+        with _blamed(source):
+            return await waiting
+
+    def check_now(self, text: str, source: str) -> Checked:
+        """Return what a text means, for a thread that may wait; errors as for `check`."""
+        with _blamed(source):
+            return self._submitted(text, source).result()
+
+    def _submitted(self, text: str, source: str) -> Future[Checked]:
         if len(text) > MAX_BYTES or len(text.encode()) > MAX_BYTES:
             raise ConfigError(f"{source}: larger than 1 MiB, expected a configuration of a few kilobytes")
-        with self._lock:
-            answer = self._ask(text, source)
-        if isinstance(answer, RunnerError):
-            raise answer
-        return answer
-
-    def _ask(self, text: str, source: str) -> Checked | RunnerError:
-        """Return what the process answers; one that does not is ended."""
-        with contextlib.suppress(OSError, EOFError):
-            if self._process is None or not self._process.is_alive():
-                self._start()
-            self._pipe.send((text, source))
-            if self._pipe.poll(CHECK_SECONDS):
-                answer: Checked | RunnerError = self._pipe.recv()
-                return answer
-            self.close()
-            return ConfigError(
-                f"{source}: took longer than {CHECK_SECONDS:g} s to check; is env.kwargs sound?"
-            )
-        self.close()
-        return ConfigError(f"{source}: its environment ended the process that was checking it.")
-
-    def _start(self) -> None:
-        self.close()
-        self._pipe, theirs = self._context.Pipe()
-        self._process = self._context.Process(
-            target=_serve, args=(theirs, self._recordings), name="checker", daemon=True
-        )
-        self._process.start()
-        theirs.close()
+        return self._pool.submit(_check, text, source, self._recordings)
 
 
-def _serve(pipe: Any, recordings: Path) -> None:
-    """Check what comes through a pipe, until it is closed; the process's main function."""
-    from runner.service.doing.process import leave_signals
+@contextlib.contextmanager
+def _blamed(source: str) -> Iterator[None]:
+    """Raise as a mistake of the text that its check exceeded a limit, or ended its process."""
+    try:
+        yield
+    except TimedOut:
+        message = f"took longer than {CHECK_SECONDS:g} s to check; is env.kwargs sound?"
+    except OutOfMemory:
+        message = f"its environment needs more than {MEMORY_BYTES / (1 << 30):g} GiB of memory to be made."
+    except ProcessDied:
+        message = "its environment ended the process that was checking it."
+    else:
+        return
+    raise ConfigError(f"{source}: {message}")
 
-    leave_signals()
-    with contextlib.suppress(EOFError, OSError):
-        for text, source in _coming(pipe):
-            try:
-                pipe.send(check(text, source, recordings))
-            except ConfigError as error:
-                pipe.send(ConfigError(str(error), error.problems))
-            except RunnerError as error:
-                pipe.send(ConfigError(f"{source}: {error}"))
 
-
-def _coming(pipe: Any) -> Iterator[tuple[str, str]]:
-    while pipe.poll(IDLE_SECONDS):
-        yield pipe.recv()
+def _check(text: str, source: str, recordings: Path) -> Checked:
+    """Return what a text means; every other error becomes a `ConfigError`, which can be pickled."""
+    try:
+        return check(text, source, recordings)
+    except ConfigError as error:
+        raise ConfigError(str(error), error.problems) from error
+    except RunnerError as error:
+        raise ConfigError(f"{source}: {error}") from error

@@ -1,4 +1,4 @@
-"""What is computed for an answer; by `Apart`, in a process of its own, so all that is heavy stays there."""
+"""What is computed for an answer, by a child process, so that all that is heavy stays there."""
 
 from __future__ import annotations
 

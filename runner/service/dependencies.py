@@ -10,9 +10,9 @@ from fastapi import Depends, Path, Request
 from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
-from runner.service.apart import Apart
 from runner.service.catalogue import Catalogue
 from runner.service.kept import Kept
+from runner.service.processes import ProcessPool
 from runner.service.settings import Settings
 from runner.service.work import Jobs
 
@@ -41,15 +41,15 @@ def jobs_of(request: Request) -> Jobs:
     return found
 
 
-def apart_of(request: Request) -> Apart:
+def apart_of(request: Request) -> ProcessPool:
     """Return what does work in processes of its own."""
-    found: Apart = request.app.state.apart
+    found: ProcessPool = request.app.state.apart
     return found
 
 
 SettingsOf = Annotated[Settings, Depends(settings_of)]
 CatalogueOf = Annotated[Catalogue, Depends(catalogue_of)]
-ApartOf = Annotated[Apart, Depends(apart_of)]
+ApartOf = Annotated[ProcessPool, Depends(apart_of)]
 KeptOf = Annotated[Kept, Depends(kept_of)]
 JobsOf = Annotated[Jobs, Depends(jobs_of)]
 RunName = Annotated[

@@ -49,6 +49,7 @@ def readyz(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
         "recordings_can_be_written": _can_be_written(folder),
         "disk_has_room": _has_room(folder),
         "runs_can_be_listed": _answers(catalogue),
+        "jobs_can_be_started": request.app.state.jobs.is_working,
     }
     ready = all(checks.values())
     status = HTTPStatus.OK if ready else HTTPStatus.SERVICE_UNAVAILABLE

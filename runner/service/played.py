@@ -1,4 +1,4 @@
-"""What pages show of a run that takes long to find; by `Apart`, in a process of its own."""
+"""What pages show of a run that takes long to find, computed by a child process."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -150,7 +150,15 @@ class Queue:
                 raise NoSuchJob(f"no job {number}; `GET /jobs` lists those there are.")
             return self._jobs[number]
 
-    def add(self, kind: Kind, name: str, runs: int, submitted: str, config: Mapping[str, Any]) -> Job:
+    def add(
+        self,
+        kind: Kind,
+        name: str,
+        runs: int,
+        submitted: str,
+        config: Mapping[str, Any],
+        keep: Container[int] = (),
+    ) -> Job:
         """Put a job at the end of the queue, on disk, and return it.
 
         Args:
@@ -159,6 +167,7 @@ class Queue:
             runs: how many it makes.
             submitted: the text as it came.
             config: the configuration or the sweep that it means, as plain values.
+            keep: numbers of jobs that are not forgotten, though over: a worker is still closing them.
 
         Raises:
             QueueFull: there are too many already.
@@ -183,7 +192,7 @@ class Queue:
                 self._jobs.pop(job.number, None)
                 shutil.rmtree(folder, ignore_errors=True)
                 raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
-            self._forget()
+            self._forget(keep)
             return job
 
     def change(self, number: int, **facts: Any) -> Job:
@@ -267,9 +276,9 @@ class Queue:
         data = {"state": job.state, "time": now()} | ({"error": job.error} if job.error else {})
         _append(self.folder_of(job.number) / EVENTS_FILE, kind, data)
 
-    def _forget(self) -> None:
+    def _forget(self, keep: Container[int]) -> None:
         """Remove the oldest jobs that are over, but for so many."""
-        over = [number for number, job in self._jobs.items() if job.is_over]
+        over = [number for number, job in self._jobs.items() if job.is_over and number not in keep]
         for number in over[: max(0, len(over) - self._most_kept)]:
             del self._jobs[number]
             _remove(self.folder_of(number))

@@ -61,6 +61,8 @@ class Limits:
     """And in one of Arrow."""
     work_seconds: float = 600.0
     """Of a comparison, a picture or an export, which are made in processes of their own."""
+    work_bytes: int = 4 << 30
+    """Of memory that one of them may allocate."""
     cache_bytes: int = 20 * MB
     """Of answers that are kept for who asks the same next."""
 

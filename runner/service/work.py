@@ -13,6 +13,7 @@ import contextlib
 import multiprocessing
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing import connection
 from pathlib import Path
@@ -23,6 +24,7 @@ from runner.estimate import free_bytes
 from runner.service.checking import Checked, Checker
 from runner.service.doing.order import Order, Outcome
 from runner.service.doing.process import work
+from runner.service.logs import LOG
 from runner.service.queue import Job, NotPossibleNow, Queue, now
 
 GOODBYE_SECONDS: Final = 15.0
@@ -34,6 +36,8 @@ SOURCE: Final = "job.yaml"
 """What a text is called that came without a name."""
 RESERVE_BYTES: Final = 256 << 20
 """No job is begun while the disk has less."""
+RETRY_SECONDS: Final = 5.0
+"""Time between attempts to start a worker when the system has no process to give."""
 
 
 @dataclass
@@ -102,6 +106,8 @@ class Jobs:
         self._progress: dict[int, dict[str, Any]] = {}
         """What the worker of each job said last, also after its end."""
         self._lock = threading.RLock()
+        self._start_problem, self._retry_at = "", 0.0
+        """Why the last attempt to start a worker failed, and when to try again (monotonic seconds)."""
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="jobs", daemon=True)
 
@@ -128,16 +134,21 @@ class Jobs:
         self.queue.close()
 
     @property
+    def is_working(self) -> bool:
+        """Whether queued jobs will be started: the thread that does so is alive and can start workers."""
+        return self._thread.is_alive() and not self._start_problem
+
+    @property
     def stopping(self) -> bool:
         """Whether the server is about to end."""
         return self._stopping.is_set()
 
-    def check(self, text: str, source: str = SOURCE) -> Checked:
+    async def check(self, text: str, source: str = SOURCE) -> Checked:
         """Return what a text means, without queueing it; arguments and errors as for `submit`."""
-        return self._checker.check(text, source)
+        return await self._checker.check(text, source)
 
     def submit(self, text: str, source: str = SOURCE) -> Job:
-        """Check the text of a configuration or a sweep, and queue it.
+        """Check the text of a configuration or a sweep, and queue it; waits for the check.
 
         Args:
             text: YAML, as a file has it.
@@ -145,11 +156,18 @@ class Jobs:
 
         Raises:
             ConfigError: it cannot be used; a line for each problem, with line, column and key.
+            Busy: others were being checked all the time.
+        """
+        return self.add(text, self._checker.check_now(text, source))
+
+    def add(self, text: str, checked: Checked) -> Job:
+        """Queue a text that was checked.
+
+        Raises:
             QueueFull: there are too many jobs already.
             StorageError: the disk would not hold its recordings.
             NotPossibleNow: a sweep of this name is being done.
         """
-        checked = self.check(text, source)
         free = free_bytes(self.recordings)
         if checked.bytes > free:
             raise StorageError(
@@ -159,7 +177,9 @@ class Jobs:
         with self._lock:
             if checked.kind == "sweep":
                 self._sweep_is_free(checked.name)
-            return self.queue.add(checked.kind, checked.name, checked.runs, text, checked.values)
+            return self.queue.add(
+                checked.kind, checked.name, checked.runs, text, checked.values, keep=self._busy
+            )
 
     def cancel(self, number: int) -> Job:
         """Have a job not be done, or its worker close its recording; what is recorded is kept.
@@ -212,7 +232,7 @@ class Jobs:
                 states.count("running"),
                 states.count("queued"),
                 free_bytes(self.recordings),
-                self._short_of_disk(),
+                self._start_problem or self._short_of_disk(),
             )
 
     def _change(self, number: int, **facts: Any) -> Job:
@@ -229,41 +249,72 @@ class Jobs:
     def _run(self) -> None:
         """Start workers and hear them, until the server stops."""
         while not self._stopping.is_set():
-            with self._lock:
+            with _logged(), self._lock:
                 self._begin()
                 self._share()
-            self._hear()
+            with _logged():
+                self._hear()
         with self._lock:
             for worker in self._busy.values():
                 self._tell_to_stop(worker)
         while self._busy:
-            self._hear()
+            with _logged():
+                self._hear()
 
     def _begin(self) -> None:
         """Start a worker for the first job that waits, if there is a slot."""
         waiting = next((job for job in self.queue.jobs() if job.state == "queued"), None)
-        taken = sum(max(worker.slots, worker.taken) for worker in self._busy.values())
-        if waiting is None or taken >= self.workers or waiting.number in self._busy or self._short_of_disk():
+        if waiting is None:
+            self._start_problem = ""
             return
+        taken = sum(max(worker.slots, worker.taken) for worker in self._busy.values())
+        if taken >= self.workers or waiting.number in self._busy or self._short_of_disk():
+            return
+        if time.monotonic() < self._retry_at:
+            return
+        try:
+            self._busy[waiting.number] = self._worker(waiting)
+        except OSError as error:  # no process, memory or file descriptor is left: the job waits for one
+            self._start_problem = f"no worker process can be started ({error.strerror or error})"
+            self._retry_at = time.monotonic() + RETRY_SECONDS
+            LOG.warning("worker", extra={"job": waiting.number, "problem": self._start_problem})
+            return
+        except Exception as error:
+            self._change(
+                waiting.number, state="failed", error=f"its worker cannot be started: {error}", ended=now()
+            )
+            raise
+        self._start_problem = ""
+        kept = {job.number for job in self.queue.jobs()} - {waiting.number}
+        self._progress = {number: said for number, said in self._progress.items() if number in kept}
+        self._change(waiting.number, state="running", started=waiting.started or now())
+
+    def _worker(self, job: Job) -> _Worker:
+        """Return a new worker process for a job, started.
+
+        Raises:
+            OSError: the system has no process, pipe or memory for it.
+        """
         order = Order(
-            waiting.number,
-            waiting.kind,
-            waiting.name,
-            self.queue.folder_of(waiting.number),
+            job.number,
+            job.kind,
+            job.name,
+            self.queue.folder_of(job.number),
             self.recordings,
-            waiting.accept_changes,
-            waiting.retry,
+            job.accept_changes,
+            job.retry,
             self._ray,
         )
         ours, theirs = self._context.Pipe()
-        # No daemon, as those of a sweep have workers of their own.
-        process = self._context.Process(target=work, args=(theirs, order), name=f"job-{order.number}")
-        process.start()
-        theirs.close()
-        self._busy[order.number] = _Worker(order.number, process, ours)
-        kept = {job.number for job in self.queue.jobs()} - {order.number}
-        self._progress = {number: said for number, said in self._progress.items() if number in kept}
-        self._change(order.number, state="running", started=waiting.started or now())
+        with contextlib.closing(theirs):
+            # Not a daemon: a sweep's worker has child processes of its own.
+            process = self._context.Process(target=work, args=(theirs, order), name=f"job-{job.number}")
+            try:
+                process.start()
+            except BaseException:
+                ours.close()
+                raise
+        return _Worker(job.number, process, ours)
 
     def _share(self) -> None:
         """Give the slots that nobody waits for to the first sweep, and take them back when somebody does."""
@@ -296,28 +347,32 @@ class Jobs:
             self._stopping.wait(HEAR_SECONDS)
             return
         for pipe in connection.wait(list(by_pipe), HEAR_SECONDS):
-            worker = by_pipe[pipe]
-            try:
-                word, value = worker.pipe.recv()
-            except (EOFError, OSError):
-                self._part(worker)
-            else:
-                with self._lock:
-                    self._take(worker, word, value)
+            with _logged():
+                self._receive(by_pipe[pipe])
         for worker in by_pipe.values():
             if worker.stopped is not None and time.monotonic() - worker.stopped > GOODBYE_SECONDS:
                 worker.process.kill()
 
-    def _take(self, worker: _Worker, word: str, value: Any) -> None:
-        if word == "over":
-            worker.outcome = value
-            self._settle(self.queue.job(worker.number), worker)
-        elif word == "progress":
-            self._progress[worker.number] = value
-        elif word == "slots":
-            worker.taken = value
-        else:
-            self.queue.note(worker.number, word, value | {"time": now()})
+    def _receive(self, worker: _Worker) -> None:
+        """Take in one message of a worker, or its end."""
+        try:
+            word, value = worker.pipe.recv()
+        except Exception as error:  # also what cannot be unpickled: the pipe is of no use any more
+            if not isinstance(error, EOFError | OSError):
+                LOG.exception("jobs")
+                worker.process.kill()
+            self._part(worker)
+            return
+        with self._lock:
+            if word == "over":
+                worker.outcome = value
+                self._settle(self.queue.job(worker.number), worker)
+            elif word == "progress":
+                self._progress[worker.number] = value
+            elif word == "slots":
+                worker.taken = value
+            else:
+                self.queue.note(worker.number, word, value | {"time": now()})
 
     def _part(self, worker: _Worker) -> None:
         """Take leave of a worker whose process has ended, or is about to."""
@@ -356,3 +411,13 @@ class Jobs:
     def _tell_to_stop(self, worker: _Worker) -> None:
         worker.stopped = worker.stopped or time.monotonic()
         worker.tell("stop")
+
+
+@contextlib.contextmanager
+def _logged() -> Iterator[None]:
+    """Log an exception and carry on: whatever goes wrong with one job must not stop the others."""
+    try:
+        yield
+    except Exception:
+        LOG.exception("jobs")
+        time.sleep(HEAR_SECONDS)  # it may come again at once

@@ -129,21 +129,26 @@ Text = Annotated[str, Depends(text_of)]
     openapi_extra=_YAML,
     summary="Submit a configuration or a sweep.",
 )
-def submit(
+async def submit(
     jobs: JobsOf, text: Text, response: Response, request: Request, source: Source = SOURCE
 ) -> JobTold:
     """Check the text, and queue it; a mistake is told with its line and key."""
-    job = jobs.submit(text, source)
-    response.headers["location"] = f"{request.url.path}/{job.number}"
-    return told(job, jobs)
+    checked = await jobs.check(text, source)  # may take long, so no thread of the server waits for it
+
+    def add() -> JobTold:
+        return told(jobs.add(text, checked), jobs)
+
+    answer = await run_sync(add)
+    response.headers["location"] = f"{request.url.path}/{answer.number}"
+    return answer
 
 
 @router.post(
     "/jobs/check", response_model=CheckTold, openapi_extra=_YAML, summary="Check a configuration or a sweep."
 )
-def check(jobs: JobsOf, text: Text, source: Source = SOURCE) -> CheckTold:
+async def check(jobs: JobsOf, text: Text, source: Source = SOURCE) -> CheckTold:
     """Check the text as submitting it does, without queueing it."""
-    found = jobs.check(text, source)
+    found = await jobs.check(text, source)
     return CheckTold(kind=found.kind, name=found.name, runs=found.runs, bytes=found.bytes)
 
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from runner.runs import Run
-    from runner.service.apart import Apart
     from runner.service.kept import Kept
+    from runner.service.processes import ProcessPool
     from runner.service.settings import Settings
 
 router = APIRouter(
@@ -124,7 +124,12 @@ async def metrics(
     summary="The evaluations, with every event counted.",
 )
 async def evaluations(
-    run: RecordedRun, kept: KeptOf, apart: ApartOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
+    run: RecordedRun,
+    kept: KeptOf,
+    apart: ApartOf,
+    settings: SettingsOf,
+    start: Start = 0,
+    stop: Stop = None,
 ) -> Response:
     """Return evaluations as `dualtaxi show --json` has them under `eval`."""
     return await _records(run, kept, apart, settings, "evaluations", start, stop)
@@ -132,7 +137,12 @@ async def evaluations(
 
 @router.get("/training", response_model=Records, responses=BUSY, summary="The reports of training.")
 async def training(
-    run: RecordedRun, kept: KeptOf, apart: ApartOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
+    run: RecordedRun,
+    kept: KeptOf,
+    apart: ApartOf,
+    settings: SettingsOf,
+    start: Start = 0,
+    stop: Stop = None,
 ) -> Response:
     """Return reports of training as `dualtaxi show --json` has them under `train`."""
     return await _records(run, kept, apart, settings, "training", start, stop)
@@ -142,7 +152,12 @@ async def training(
     "/optimality", response_model=Records, responses=BUSY, summary="The exact measures of evaluations."
 )
 async def optimality(
-    run: RecordedRun, kept: KeptOf, apart: ApartOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
+    run: RecordedRun,
+    kept: KeptOf,
+    apart: ApartOf,
+    settings: SettingsOf,
+    start: Start = 0,
+    stop: Stop = None,
 ) -> Response:
     """Return what evaluations know exactly; nothing unless `evaluation.exact` was set."""
     return await _records(run, kept, apart, settings, "optimality", start, stop)
@@ -258,7 +273,7 @@ async def _q_table(
     run: Run,
     request: Request,
     kept: Kept,
-    apart: Apart,
+    apart: ProcessPool,
     step: int | None,
     episode: int | None,
     state: int | None,
@@ -287,7 +302,7 @@ def _bounded(start: int, stop: int | None, total: int, most: int) -> int:
 async def _records(
     run: Run,
     kept: Kept,
-    apart: Apart,
+    apart: ProcessPool,
     settings: Settings,
     which: computed.Which,
     start: int,

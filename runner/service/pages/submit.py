@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
+from starlette.concurrency import run_in_threadpool
 
 from runner.config.document import write_yaml
 from runner.config.schema import json_schema, without_references
@@ -65,25 +66,28 @@ def form(
 
 
 @router.post("")
-def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
+async def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
     """Queue what was sent, or say what is wrong with it."""
     text = sent.get("text", "")
     try:
+        checked = await jobs.check(text)
         if sent.get("action") == "check":
-            found = jobs.check(text)
-            return _form(request, text, fine=found)
-        job = jobs.submit(text)
+            return await run_in_threadpool(_form, request, text, fine=checked)
+        job = await run_in_threadpool(jobs.add, text, checked)
     except RunnerError as error:
-        trouble = trouble_of(error, request.app.state.settings)
-        lines = text.splitlines()
-        problems = [
-            {"line": p.line, "path": p.path, "message": p.message, "text": _line(lines, p.line)}
-            for p in trouble.problems
-        ]
-        return _form(
-            request, text, problems or [_whole(trouble.message)], status=HTTPStatus.UNPROCESSABLE_ENTITY
-        )
+        return await run_in_threadpool(_refused, request, text, error)
     return RedirectResponse(f"/queue/{job.number}", HTTPStatus.SEE_OTHER)
+
+
+def _refused(request: Request, text: str, error: RunnerError) -> Response:
+    """Return the form with what is wrong, each mistake with its line."""
+    trouble = trouble_of(error, request.app.state.settings)
+    lines = text.splitlines()
+    problems = [
+        {"line": p.line, "path": p.path, "message": p.message, "text": _line(lines, p.line)}
+        for p in trouble.problems
+    ]
+    return _form(request, text, problems or [_whole(trouble.message)], status=HTTPStatus.UNPROCESSABLE_ENTITY)
 
 
 def _form(

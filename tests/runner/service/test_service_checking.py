@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import psutil
 import pytest
 
 from runner.config import load
@@ -88,24 +92,63 @@ def test_more_runs_than_a_job_may_make_are_refused(tmp_path):
 
 def test_the_process_answers_as_the_function_does(tmp_path):
     with Checker(tmp_path) as checker:
-        assert checker.check(TINY, "tiny.yaml") == check(TINY, "tiny.yaml", tmp_path)
+        assert checker.check_now(TINY, "tiny.yaml") == check(TINY, "tiny.yaml", tmp_path)
         with pytest.raises(ConfigError) as caught:
-            checker.check("episodes: many", "job.yaml")
+            checker.check_now("episodes: many", "job.yaml")
         assert caught.value.problems == refused("episodes: many", tmp_path).problems
         with pytest.raises(ConfigError, match="larger than 1 MiB"):
-            checker.check("x" * (1 << 20) + "x", "job.yaml")
+            checker.check_now("x" * (1 << 20) + "x", "job.yaml")
 
 
-def test_an_environment_that_hangs_or_kills_costs_only_its_own_process(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "hanging.py").write_text("import time\ntime.sleep(600)\n")
-    (tmp_path / "killing.py").write_text("import os\nos._exit(3)\n")
+def test_an_environment_that_hangs_or_kills_costs_only_its_own_process(tmp_path, environments, monkeypatch):
     with Checker(tmp_path) as checker:
         with pytest.raises(ConfigError, match="ended the process that was checking it"):
-            checker.check("episodes: 1\nenv: {id: 'killing:X-v0'}\n", "job.yaml")
-        assert checker.check(TINY, "tiny.yaml").runs == 2
-        monkeypatch.setattr(checking, "CHECK_SECONDS", 0.5)
-        with pytest.raises(ConfigError, match="took longer than"):
-            checker.check("episodes: 1\nenv: {id: 'hanging:X-v0'}\n", "job.yaml")
-        monkeypatch.setattr(checking, "CHECK_SECONDS", 30.0)
-        assert checker.check(TINY, "tiny.yaml").runs == 2
+            checker.check_now(environments["killing"], "job.yaml")
+        assert checker.check_now(TINY, "tiny.yaml").runs == 2
+    monkeypatch.setattr(checking, "CHECK_SECONDS", 1.0)
+    with Checker(tmp_path) as checker, pytest.raises(ConfigError, match="took longer than 1 s to check"):
+        checker.check_now(environments["hanging"], "job.yaml")
+
+
+def test_an_environment_that_takes_too_much_memory_is_refused(tmp_path, environments, monkeypatch):
+    monkeypatch.setattr(checking, "MEMORY_BYTES", 256 << 20)
+    with Checker(tmp_path) as checker:
+        with pytest.raises(ConfigError, match=r"needs more than 0\.25 GiB of memory"):
+            checker.check_now(environments["greedy"], "job.yaml")
+        assert checker.check_now(TINY, "tiny.yaml").runs == 2
+
+
+def test_an_idle_process_that_was_ended_is_not_blamed_on_the_next_text(tmp_path):
+    with Checker(tmp_path) as checker:
+        for _ in range(3):
+            assert checker.check_now(TINY, "tiny.yaml").runs == 2
+            for process in psutil.Process().children(recursive=True):
+                if process.name() != "forkserver" and process.ppid() != os.getpid():
+                    process.kill()
+
+
+def test_checks_that_hang_keep_no_other_request_waiting(client, environments):
+    with ThreadPoolExecutor(10) as threads:
+        hanging = [
+            threads.submit(client.post, "/api/v1/jobs/check", content=environments["hanging"])
+            for _ in range(10)
+        ]
+        for path in ("/runs", "/api/v1/runs", "/queue", "/submit"):
+            assert client.get(path).status_code == 200
+        assert not any(check.done() for check in hanging), "all of them hung meanwhile"
+        client.app.state.jobs._checker.close()
+        assert {check.result().status_code for check in hanging} <= {422, 503}
+
+
+@pytest.fixture
+def environments(tmp_path, monkeypatch):
+    """Return configurations whose environment, when it is imported, does what its name says."""
+    monkeypatch.syspath_prepend(tmp_path)
+    codes = {
+        "hanging": "import time\ntime.sleep(600)\n",
+        "killing": "import os\nos._exit(3)\n",
+        "greedy": "kept = bytearray(1 << 30)\n",
+    }
+    for name, code in codes.items():
+        (tmp_path / f"{name}.py").write_text(code)
+    return {name: f"episodes: 1\nenv: {{id: '{name}:X-v0'}}\n" for name in codes}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import time
+from multiprocessing.context import SpawnProcess
 
 import pytest
 from submitted import ENDLESS, ICY
@@ -241,3 +243,72 @@ def test_a_run_that_was_promised_but_never_made_is_made(tmp_path, folder):
         assert over.state == "finished"
         runs = list_runs(jobs.recordings)
         assert [run.run_id for run in runs] == [jobs.queue.runs_of(queued.number)[3]]
+
+
+def test_a_worker_that_cannot_be_started_is_waited_for_and_readiness_says_so(
+    client, submit, settings, monkeypatch
+):
+    """The system has no process to give for a while: the queue must not stand still for ever."""
+
+    def refused(_):
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(work, "RETRY_SECONDS", 0.05)
+    with monkeypatch.context() as full:
+        full.setattr(SpawnProcess, "start", refused)
+        number = jobs_of(client).queue.add("config", "icy", 1, "", one_seed()).number
+        waiting = "no worker process can be started (Resource temporarily unavailable)"
+        until(
+            lambda queue: queue["waiting_for"] == waiting, lambda: client.get("/api/v1/jobs").json()["queue"]
+        )
+        assert job(client, number)["state"] == "queued"
+        ready = client.get("/readyz")
+        assert (ready.status_code, ready.json()["checks"]["jobs_can_be_started"]) == (503, False)
+    job_until(client, number, lambda job: job["state"] == "finished")
+    assert client.get("/readyz").status_code == 200
+
+
+def test_what_goes_wrong_with_one_job_does_not_stop_the_others(client, submit, monkeypatch):
+    jobs = jobs_of(client)
+    note = jobs.queue.note
+
+    def failing(number, *facts):
+        if number == 1:
+            raise RuntimeError("a fault of our own")
+        note(number, *facts)
+
+    monkeypatch.setattr(jobs.queue, "note", failing)
+    numbers = [submit(CONFIG | {"seeds": [0]}) for _ in range(2)]
+    for number in numbers:
+        job_until(client, number, lambda job: job["state"] == "finished")
+    assert client.get("/readyz").status_code == 200
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_readiness_tells_when_the_thread_of_the_jobs_is_dead(client, monkeypatch):
+    def fatal(*_):
+        raise SystemExit
+
+    jobs = jobs_of(client)
+    monkeypatch.setattr(jobs, "_hear", fatal)
+    until(lambda ready: ready.status_code == 503, lambda: client.get("/readyz"))
+    assert client.get("/readyz").json()["checks"]["jobs_can_be_started"] is False
+
+
+def test_a_cancelled_job_is_not_forgotten_while_its_worker_closes(client, submit):
+    jobs = jobs_of(client)
+    jobs.queue._most_kept = 0
+    number = submit(ENDLESS)
+    job_until(client, number, lambda job: job["progress"] is not None)
+    with jobs._lock:  # the worker's end is not taken in before the next job is there
+        client.post(f"/api/v1/jobs/{number}/cancel")
+        other = jobs.submit(json.dumps(CONFIG | {"seeds": [0]})).number
+    job_until(client, other, lambda job: job["state"] == "finished")
+
+
+def jobs_of(client):
+    return client.app.state.jobs
+
+
+def one_seed():
+    return from_mapping(CONFIG | {"seeds": [0]}).to_mapping()
