@@ -10,7 +10,7 @@ from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from runner.config.model import Mode, Name, Rewards, Seed, Seeds, Settings, Tables
+from runner.config.model import Exploration, Mode, Name, Rewards, Seed, Seeds, Settings, Tables
 from runner.config.sections import Hysteretic, WolfPhc
 from runner.config.values import Section, refusal
 
@@ -68,6 +68,12 @@ class ExperimentFile(Settings):
     rewards: Annotated[Rewards | None, _given(Rewards)] = Field(
         default=None,
         description="The team's summed reward for all, or each agent's own. Follows `tables`.",
+    )
+    exploration: Annotated[Exploration | None, _given(Exploration)] = Field(
+        default=None,
+        description="independent (the default with `tables: per_agent`): each agent decides by a draw of its "
+        "own whether to explore. shared: one draw decides for all agents, so that they explore at the same "
+        "steps, as in the published tutorial. A joint table is one learner: both are the same.",
     )
     hysteretic: Annotated[Hysteretic | None, _given(Hysteretic)] = Field(
         default=None, description="Only with algorithm: hysteretic_q_learning."

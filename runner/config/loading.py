@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from runner.config.document import Document, Place, Problem, read_yaml
 from runner.config.file import ExperimentFile, SeedRange
 from runner.config.model import (
+    EXPLORATION,
     LEARNERS,
     NAME_EXPECTED,
     NAME_PATTERN,
@@ -170,6 +171,7 @@ def _resolved(file: ExperimentFile, name: str) -> dict[str, Any]:
     values = {key: getattr(file, key) for key in ExperimentConfig.model_fields}
     values["name"] = file.name or name
     values["tables"], values["rewards"] = _learners(file)
+    values["exploration"] = file.exploration or EXPLORATION[values["tables"]]
     for key, (algorithm, usual) in OWN_SECTIONS.items():
         if file.algorithm == algorithm and values[key] is None:
             values[key] = usual

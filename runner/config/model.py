@@ -35,12 +35,16 @@ Algorithm = Literal[
 ]
 Tables = Literal["joint", "per_agent"]
 Rewards = Literal["team", "individual"]
+Exploration = Literal["shared", "independent"]
 
 LEARNERS: dict[Mode, tuple[Tables, Rewards]] = {
     "cooperative": ("joint", "team"),
     "competitive": ("per_agent", "individual"),
 }
 """What each mode is short for."""
+
+EXPLORATION: dict[Tables, Exploration] = {"joint": "shared", "per_agent": "independent"}
+"""The exploration of a file that does not name one: separate learners explore independently of each other."""
 
 NAME_PATTERN = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$"
 NAME_EXPECTED = "1 to 100 letters, digits, '_', '.' or '-', not starting with '.' or '-'"
@@ -90,10 +94,6 @@ class Settings(Section):
     epsilon: Probability = Field(
         default=0.1, description="The probability of exploring: of acting at random instead of greedily."
     )
-    exploration: Literal["shared", "independent"] = Field(
-        default="shared",
-        description="Whether one draw decides for all agents if they explore, or each agent has its own.",
-    )
     initial_q: InitialTable = Field(
         default=0.0,
         description="The Q-tables' first values: a number, random (uniform in [0, 1) or in a range given), "
@@ -122,6 +122,8 @@ class ExperimentConfig(Settings):
     name: Name
     tables: Tables
     rewards: Rewards
+    exploration: Exploration
+    """Whether one draw decides for all agents if they explore, or each agent has its own."""
     seeds: Seeds
     hysteretic: Hysteretic | None = None
     """Present if, and only if, the algorithm is Hysteretic Q-learning."""

@@ -7,6 +7,7 @@ from typing import Any
 
 from runner.config.document import Document, Place, Problem, read_yaml
 from runner.config.file import ExperimentFile
+from runner.config.model import OWN_SECTIONS
 from runner.config.values import MAX_DEPTH, Path, Section
 from runner.errors import ConfigError
 
@@ -28,7 +29,7 @@ def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) 
     assigned: set[str] = set()
     for path, read in values:
         assigned.add(path[0])
-        for rival in _RIVALS.get(path[0], ()):
+        for rival in _rivals(path, read.value):
             if rival not in assigned:
                 _forget(document, rival)
         for length in range(1, len(path)):
@@ -37,6 +38,13 @@ def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) 
                 place = {here: place for here, place in read.places.items() if not here}
                 _assign(document, path[:length], Document(start, place))
         _assign(document, path, read)
+
+
+def _rivals(path: tuple[str, ...], value: object) -> tuple[str, ...]:
+    """Return the keys that an override makes void: with another algorithm, the sections of all others."""
+    if path == ("algorithm",):
+        return tuple(key for key, (algorithm, _) in OWN_SECTIONS.items() if algorithm != value)
+    return _RIVALS.get(path[0], ())
 
 
 _LONGEST = 80

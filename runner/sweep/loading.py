@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from runner.config import ConfigError, ExperimentConfig, load
 from runner.config.document import Document, Problem, read_yaml
 from runner.config.loading import experiment_in, read_text
+from runner.config.model import OWN_SECTIONS
 from runner.config.overrides import put
 from runner.config.problems import found, problems_in, refuse
 from runner.config.schema import Schema, without_references
@@ -22,6 +23,7 @@ from runner.sweep.model import Range, Sweep, SweepFile
 
 MAX_NAME = 50
 """Of a sweep's name, which stands in a tag of its runs."""
+_LEARNERS: Final = {"mode", "tables", "rewards"}
 _COMBINATIONS: Final = 64
 """So many are tried to find values that go together."""
 
@@ -87,20 +89,24 @@ def _sweep(document: Document, name: str | None, stem: str, beside: Path | None)
         raise ConfigError(
             f"name: found {len(called)} characters, expected at most {MAX_NAME}: runs carry it."
         )
-    base = _base(file, document, called, beside)
-    _check_parameters(file, base, document)
-    spelled = file.model_copy(update={"name": called, "base": base.to_mapping()})
-    return Sweep(called, spelled, base)
+    base, values = _base(file, document, called, beside)
+    spelled = file.model_copy(update={"name": called, "base": values})
+    sweep = Sweep(called, spelled, base)
+    _check_parameters(sweep, document)
+    return sweep
 
 
-def _base(file: SweepFile, document: Document, name: str, beside: Path | None) -> ExperimentConfig:
-    """Return the base with the sweep's name, seeds and recording put in."""
+def _base(
+    file: SweepFile, document: Document, name: str, beside: Path | None
+) -> tuple[ExperimentConfig, dict[str, Any]]:
+    """Return the base with the sweep's name, seeds and recording, and the values that trials start from."""
     if isinstance(file.base, str):
         if beside is None:
             message = f"found the path {file.base!r}, expected the configuration itself: no file is beside it"
             raise refuse([Problem(("base",), message)], document)
-        experiment = load(beside / file.base)
-        within = Document(experiment.to_mapping())
+        path = beside / file.base
+        load(path)  # reports every mistake at its place in that file
+        within = read_yaml(read_text(path), str(path))
     else:
         within = _below(document, "base")
     at = {key: _below(document, key).places for key in ("seeds", "recording")}
@@ -113,7 +119,24 @@ def _base(file: SweepFile, document: Document, name: str, beside: Path | None) -
         places = {where[1:]: place for where, place in at["recording"].items() if where[:1] == (key,)}
         values.append((("recording", key), Document(value, places)))
     put(within, values)
-    return experiment_in(within, (), name, named_by=repr(name))
+    base = experiment_in(within, (), name, named_by=repr(name))
+    return base, _start_of_trials(base, given=within.value, parameters=file.parameters)
+
+
+def _start_of_trials(
+    base: ExperimentConfig, given: Mapping[str, Any], parameters: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the base as plain values, without the defaults that a parameter of the sweep decides anew.
+
+    The default of `exploration` follows from the learners, and an algorithm's own section from the algorithm:
+    where these are searched over, each trial gets the default that goes with its values.
+    """
+    values = base.to_mapping()
+    followers = {"exploration": _LEARNERS} | {key: {"algorithm"} for key in OWN_SECTIONS}
+    for key, leaders in followers.items():
+        if key not in given and leaders & set(parameters):
+            values.pop(key, None)
+    return values
 
 
 def _below(document: Document, key: str) -> Document:
@@ -122,14 +145,14 @@ def _below(document: Document, key: str) -> Document:
     return Document(document.value.get(key), places)
 
 
-def _check_parameters(file: SweepFile, base: ExperimentConfig, document: Document) -> None:
+def _check_parameters(sweep: Sweep, document: Document) -> None:
     """Try every end and choice of each parameter, beside some values of the others that it goes with."""
     lines: dict[str, None] = {}
     located: dict[Located, None] = {}
-    for path, parameter in file.parameters.items():
+    for path, parameter in sweep.file.parameters.items():
         for number, sample in enumerate(_samples(parameter)):
             try:
-                experiment = _fitting(file, base, path, sample, document)
+                experiment = _fitting(sweep, path, sample, document)
                 if number == 0 or path.startswith("env."):
                     _check_environment(experiment, path, document)
             except ConfigError as error:
@@ -139,21 +162,19 @@ def _check_parameters(file: SweepFile, base: ExperimentConfig, document: Documen
         raise ConfigError("\n".join(lines), tuple(located))
 
 
-def _fitting(
-    file: SweepFile, base: ExperimentConfig, path: str, sample: object, document: Document
-) -> ExperimentConfig:
+def _fitting(sweep: Sweep, path: str, sample: object, document: Document) -> ExperimentConfig:
     """Return an experiment with a value of a parameter, the others at the first values that go with it.
 
     Raises:
         ConfigError: none of those that were tried do.
     """
     samples = {
-        key: [sample] if key == path else list(_samples(each)) for key, each in file.parameters.items()
+        key: [sample] if key == path else list(_samples(each)) for key, each in sweep.file.parameters.items()
     }
     problem = None
     for values in itertools.islice(itertools.product(*samples.values()), _COMBINATIONS):
         try:
-            return _placed(base, dict(zip(samples, values, strict=True)), document)
+            return _placed(sweep, dict(zip(samples, values, strict=True)), document)
         except ConfigError as error:
             problem = problem or error
     assert problem is not None
@@ -167,9 +188,9 @@ def _samples(parameter: Range | list[Any]) -> Iterator[Any]:
         yield from parameter
 
 
-def _placed(base: ExperimentConfig, values: Mapping[str, Any], document: Document) -> ExperimentConfig:
+def _placed(sweep: Sweep, values: Mapping[str, Any], document: Document) -> ExperimentConfig:
     """Return the base with values, whose mistakes are told at the parameters' places."""
-    within = Document(base.to_mapping())
+    within = Document(sweep.start_of_trials)
     places = {path: document.place(("parameters", path)) for path in values}
     put(
         within,
@@ -178,7 +199,7 @@ def _placed(base: ExperimentConfig, values: Mapping[str, Any], document: Documen
             for path, value in values.items()
         ],
     )
-    return experiment_in(within, (), base.name, named_by=repr(base.name))
+    return experiment_in(within, (), sweep.name, named_by=repr(sweep.name))
 
 
 def _check_environment(experiment: ExperimentConfig, path: str, document: Document) -> None:

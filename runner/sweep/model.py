@@ -225,7 +225,7 @@ class Sweep:
 
     name: str
     file: SweepFile
-    """As described, with the base spelled out."""
+    """As described, with the base spelled out; without the defaults that a parameter decides anew."""
     base: ExperimentConfig
     """Its seeds and its recording are the sweep's."""
 
@@ -239,6 +239,12 @@ class Sweep:
         """Each trial's."""
         return self.base.seeds
 
+    @property
+    def start_of_trials(self) -> dict[str, Any]:
+        """The base as plain values, into which a trial's values are put."""
+        assert isinstance(self.file.base, dict)
+        return self.file.base
+
     def config(self, values: Mapping[str, Any]) -> ExperimentConfig:
         """Return the experiment with these values of the parameters.
 
@@ -246,7 +252,7 @@ class Sweep:
             ConfigError: they do not go together.
         """
         changes = [f"{path}={json.dumps(value)}" for path, value in values.items()]
-        return from_mapping(self.base.to_mapping(), changes)
+        return from_mapping(self.start_of_trials, changes)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, fit for JSON and YAML, which `from_values` takes back to an equal sweep."""

@@ -273,3 +273,31 @@ def test_importing_it_is_cheap():
     script = f"import sys, runner.config; print(*sorted(set({heavy}) & set(sys.modules)))"
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert ran.stdout.split() == []
+
+
+def test_separate_learners_explore_independently_unless_the_file_names_another_exploration(write):
+    assert load(write("episodes: 1\nmode: competitive")).exploration == "independent"
+    assert load(write("episodes: 1\ntables: per_agent\nrewards: team")).exploration == "independent"
+    assert load(write("episodes: 1\nmode: competitive\nexploration: shared")).exploration == "shared"
+    assert load(write("episodes: 1"), ["mode=competitive"]).exploration == "independent"
+
+
+def test_a_resolved_configuration_keeps_its_exploration(write):
+    """Recordings hold resolved configurations; a changed default must not change what they mean."""
+    stored = load(write("episodes: 1\nmode: competitive\nexploration: shared")).to_mapping()
+    assert stored["exploration"] == "shared"
+    assert from_mapping(stored).exploration == "shared"
+    joint = load(write("episodes: 1")).to_mapping()
+    assert joint["exploration"] == "shared"
+
+
+def test_another_algorithm_takes_the_section_of_the_one_in_the_file_away(write):
+    file = write(
+        "episodes: 1\nmode: competitive\nalgorithm: hysteretic_q_learning\nhysteretic: {decrease: 0.05}"
+    )
+    assert load(file, ["algorithm=q_learning"]).hysteretic is None
+    assert load(file, ["algorithm=hysteretic_q_learning"]).hysteretic.decrease == 0.05
+    other = load(file, ["algorithm=wolf_phc", "wolf_phc.win=0.01"])
+    assert (other.hysteretic, other.wolf_phc.win) == (None, 0.01)
+    with pytest.raises(ConfigError, match="goes with algorithm: hysteretic_q_learning"):
+        load(file, ["algorithm=q_learning", "hysteretic.decrease=0.1"])

@@ -115,3 +115,40 @@ def test_an_objective_that_is_never_recorded_is_refused_with_what_there_is():
         with pytest.raises(Exception, match="never recorded") as caught:
             plan_of(from_values(described(objective={"metric": metric})))
         assert expected in str(caught.value)
+
+
+def test_defaults_that_follow_from_a_parameter_follow_in_each_trial(file):
+    base = BASE | {"env": {}}
+    modes = {"mode": ["cooperative", "competitive"]}
+    searched = load_sweep(file(strategy="grid", trials=None, base=base, parameters=modes))
+    explorations = [searched.config({"mode": mode}).exploration for mode in ("cooperative", "competitive")]
+    assert explorations == ["shared", "independent"]
+    assert from_values(searched.to_mapping()) == searched
+
+
+def test_an_exploration_that_the_base_names_holds_in_every_trial(file):
+    named = load_sweep(
+        file(
+            strategy="grid",
+            trials=None,
+            base=BASE | {"env": {}, "exploration": "shared"},
+            parameters={"mode": ["cooperative", "competitive"]},
+        )
+    )
+    assert named.config({"mode": "competitive"}).exploration == "shared"
+    assert from_values(named.to_mapping()) == named
+
+
+def test_algorithms_with_sections_of_their_own_can_be_searched_over(file):
+    searched = load_sweep(
+        file(
+            strategy="grid",
+            trials=None,
+            base=BASE
+            | {"env": {}, "mode": "competitive", "algorithm": "wolf_phc", "wolf_phc": {"win": 0.01}},
+            parameters={"algorithm": ["q_learning", "wolf_phc", "hysteretic_q_learning"]},
+        )
+    )
+    assert searched.config({"algorithm": "q_learning"}).wolf_phc is None
+    assert searched.config({"algorithm": "wolf_phc"}).wolf_phc.win == 0.01
+    assert searched.config({"algorithm": "hysteretic_q_learning"}).hysteretic is not None
