@@ -10,9 +10,9 @@ from pathlib import Path
 from benchmarks.bench_reader import tutorial
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
-from runner.analysis.tables import tables_at
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.replay.tables import tables_at
 from runner.verify import verify
 
 READ = "import sys; from pathlib import Path; from benchmarks.bench_reader import read_all, read_episode; \

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 
 from runner import runs
-from runner.analysis.tables import last_step, tables_at
 from runner.config import ExperimentConfig, from_mapping
 from runner.environments import load_mdp
 from runner.errors import Diverged, RunnerError, StorageError
@@ -23,6 +22,7 @@ from runner.recording.contents import survey
 from runner.recording.reader import open_recording
 from runner.recording.telling import write_result
 from runner.recording.writer import RecordingFile
+from runner.replay.tables import last_step, tables_at
 from runner.runs import Run, unless_empty
 from runner.verify import initial_tables
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from runner.analysis.tables import held_at
 from runner.archive.places import at_hand
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.sections import RunTable
@@ -19,6 +18,7 @@ from runner.learning.learner import Held
 from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
+from runner.replay.tables import held_at
 from runner.runs import Run
 
 

@@ -19,7 +19,6 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-from runner.analysis.tables import initially_held
 from runner.config import from_mapping
 from runner.config.sections import RunTable
 from runner.environments import load_mdp
@@ -35,6 +34,7 @@ from runner.recording.digest import ContentHash
 from runner.recording.integrity import check_integrity
 from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
+from runner.replay.tables import initially_held
 
 CIRCUMSTANCES: Final = ("command", "directory", "host", "user")
 """Provenance that cannot explain a difference."""

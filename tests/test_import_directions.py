@@ -23,6 +23,7 @@ ORDER = """
     catalogue
     frames packing
     description
+    replay
     analysis
     archive
     origin

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.tables import TableReplay, history_of, last_step, step_of_episode
 from runner.errors import RunnerError
 from runner.recording.reader import Recording
+from runner.replay.history import history_of
+from runner.replay.tables import TableReplay, last_step, step_of_episode
 from runner.words import action_names, actions_in_words, states_in_words
 
 

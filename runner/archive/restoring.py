@@ -18,7 +18,6 @@ from runner.archive.columns import Records, of_phase, record_bytes, records_of
 from runner.archive.layout import Table
 from runner.archive.manifest import Entry, Manifest
 from runner.archive.reading import Archive
-from runner.archive.replay import Meetings, Tables
 from runner.archive.rows import message_payload
 from runner.config import from_mapping
 from runner.config.sections import Recording as Plan
@@ -34,6 +33,8 @@ from runner.recording.reader import open_recording
 from runner.recording.recorder import BLOCK_BYTES, capacity_of
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
+from runner.replay.snapshots import DerivedTables, SnapshotVisitor
+from runner.replay.tables import StepReplay
 
 _ROWS_AT_ONCE: Final = 1024
 _MOST_STEPS: Final = 2**63 // STEP_NANOSECONDS
@@ -140,13 +141,13 @@ class _Restoring:
     def _restore_learning(self, table: Table) -> None:
         """Restore the steps of a job, and the snapshots that they make."""
         seed = int(self._archive.metadata["run"]["seed"])
-        tables = Tables(self._archive.config, self._archive.mdp, seed, self._where)
-        meetings = Meetings(tables, self._snapshots(), partial(self._restore_snapshot, tables))
+        tables = DerivedTables(StepReplay(self._archive.config, self._archive.mdp, seed, self._where))
+        visitor = SnapshotVisitor(tables, self._snapshots(), partial(self._restore_snapshot, tables))
         for topic, records in self._records(table):
             if topic is schema.TRAIN_STEP:
-                meetings.take(records)
+                visitor.take(records)
             self._send_block(topic, records)
-        meetings.finish()
+        visitor.finish()
 
     def _records(self, table: Table) -> Iterator[tuple[Topic, Records]]:
         """Yield the rows of a table as records, at most so many as a chunk has."""
@@ -219,7 +220,7 @@ class _Restoring:
         table = Table(layout.Q_TABLES, (schema.Q_TABLE_TOPIC,), layout.SCHEMAS[layout.Q_TABLES])
         return (_Row(row["step"], row) for row in self._rows(table))
 
-    def _restore_snapshot(self, tables: Tables, snapshot: _Row) -> None:
+    def _restore_snapshot(self, tables: DerivedTables, snapshot: _Row) -> None:
         """Send a snapshot, from its values or as the steps before it make it."""
         row = snapshot.row
         where = f"{self._where}: the Q-table of {row['agent']!r} after {row['step']} steps"

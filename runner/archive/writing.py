@@ -21,12 +21,13 @@ from runner.archive.batches import Batches
 from runner.archive.descriptions import description_tables, run_table
 from runner.archive.layout import Table
 from runner.archive.manifest import Entry, Manifest, entries_of, is_inside
-from runner.archive.replay import Meetings, Tables
 from runner.archive.rows import PlacedTable, snapshot_row
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import decode_q_table, encode_q_table
 from runner.recording.reader import Recording
+from runner.replay.snapshots import DerivedTables, SnapshotVisitor
+from runner.replay.tables import StepReplay
 
 ROWS_A_GROUP: Final = 1 << 18
 BYTES_A_GROUP: Final = 32 << 20
@@ -178,18 +179,19 @@ class _Writing:
     def _write_learning(self, table: Table, steps: TableWriter) -> None:
         """Write the steps of a job, and beside them its snapshots, which they make."""
         recording = self._recording
-        tables = Tables(recording.config, recording.mdp, int(recording.run["seed"]), self._where)
+        seed = int(recording.run["seed"])
+        tables = DerivedTables(StepReplay(recording.config, recording.mdp, seed, self._where))
         columns = layout.SCHEMAS[layout.Q_TABLES]
         with TableWriter(self._folder / layout.Q_TABLES, columns) as snapshots:
-            meetings = Meetings(
+            visitor = SnapshotVisitor(
                 tables, self._snapshots(), lambda found: snapshots.add(self._snapshot_row(tables, found))
             )
             for topic, records, batch in self._batches.blocks(table):
                 steps.add(batch)
                 if topic is schema.TRAIN_STEP:
-                    meetings.take(records)
+                    visitor.take(records)
                 self._report(self._batches.steps)
-            meetings.finish()
+            visitor.finish()
 
     def _snapshots(self) -> Iterator[PlacedTable]:
         topic = schema.Q_TABLE_TOPIC
@@ -198,7 +200,7 @@ class _Writing:
             self._batches.same(topic, position, encode_q_table(table), payload)
             yield PlacedTable(position, table)
 
-    def _snapshot_row(self, tables: Tables, snapshot: PlacedTable) -> pa.RecordBatch:
+    def _snapshot_row(self, tables: DerivedTables, snapshot: PlacedTable) -> pa.RecordBatch:
         """Return the row of a snapshot: without its values if the steps before it tell them."""
         table = snapshot.table
         made = tables.at(table.step, table.table)

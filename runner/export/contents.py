@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any, Final
+from typing import Any
 
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.scene import is_whole
-
-_PHASES: Final = {"train": "training", "eval": "evaluation"}
 
 
 def shortcomings(recording: Recording) -> list[str]:
@@ -64,8 +62,8 @@ def whole_ranges(
     for start, stop in whole:
         if not start < stop <= count:
             raise RecordingError(
-                f"{where}: found no {_PHASES[phase]} episodes {start}:{stop}; there are {count:,}, from 0. "
-                "Ranges are START:STOP, STOP not included."
+                f"{where}: found no {schema.PHASE_NAMES[phase]} episodes {start}:{stop}; "
+                f"there are {count:,}, from 0. Ranges are START:STOP, STOP not included."
             )
     return whole
 

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.tables import step_of_episode, tables_at
 from runner.errors import RecordingError
 from runner.export.svg_maps import pair_map, policy_map
 from runner.frames import agents_of
 from runner.mdp import Mdp
 from runner.recording.reader import Recording
+from runner.replay.tables import step_of_episode, tables_at
 from runner.words import spoken, states_in_words
 
 Tables = list[NDArray[np.float64]]

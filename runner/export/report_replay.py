@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.analysis.outcomes import events_of
-from runner.analysis.tables import TableReplay, check_steps, tables_at
 from runner.errors import RecordingError
 from runner.export.contents import require_steps
 from runner.frames import agents_of
 from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.replay.checks import check_steps
+from runner.replay.tables import TableReplay, tables_at
 from runner.words import (
     action_names,
     actions_in_words,

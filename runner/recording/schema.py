@@ -312,6 +312,8 @@ ALL_BLOCK_TOPICS: Final = (
 
 PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_EPISODE)}
 """The step and the episode topic of each phase of a job."""
+PHASE_NAMES: Final = {"train": "training", "eval": "evaluation"}
+"""The phases in words."""
 
 NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", TRANSITION: "step", RESET: "reset"}
 """The field that numbers the messages of a fixed-width topic, from 0."""

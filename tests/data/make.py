@@ -18,10 +18,10 @@ from gymnasium.vector import SyncVectorEnv
 
 import runner
 from runner import execution
-from runner.analysis.tables import last_step, tables_at
 from runner.config import load
 from runner.job import Job
 from runner.recording import open as open_recording
+from runner.replay.tables import last_step, tables_at
 from runner.runs import Run
 from runner.wrappers import loop
 from tests.runner.wrappers.loops import Leaving, drive, parallel, play

@@ -12,6 +12,7 @@ from runner.recording import open as open_recording
 from runner.recording.blocks import HEADER, HEADER_BYTES
 from runner.recording.chunks import Packing, encode_chunk
 from runner.recording.contents import survey
+from runner.recording.repair import repair
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
 
@@ -43,6 +44,20 @@ def altered(source: Path, target: Path, topic: Topic | None, change: Change, **m
             _write(file, one, *_records(recording, one, turn))
         file.finish("result", entries["result"])
     return target
+
+
+def without_chunk(path: Path, topic: Topic, number: int) -> int:
+    """Damage a chunk of a topic, counted from 0, and repair the recording, so that it is lost.
+
+    Returns:
+        how many messages it held.
+    """
+    chunks = [part for part in survey(path).chunks if part.channel == topic.channel]
+    data = bytearray(path.read_bytes())
+    data[chunks[number].index.chunk_start_offset + 150] ^= 1
+    path.write_bytes(data)
+    repair(path)
+    return chunks[number].messages
 
 
 def _records(recording: Any, topic: Topic, change: Change) -> tuple[list[bytes], list[int]]:

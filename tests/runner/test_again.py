@@ -7,7 +7,6 @@ import pytest
 
 from runner import again
 from runner.again import evaluate, rerecord
-from runner.analysis.tables import tables_at
 from runner.documents import write_whole
 from runner.errors import Diverged, RecordingError, RunnerError
 from runner.execution import run_job
@@ -15,6 +14,7 @@ from runner.finding import find_run
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.replay.tables import tables_at
 from runner.runs import RUN_FILE, create_run, list_runs
 from runner.verify import verify
 from tests.runner.recording.making import TAXIS, experiment, make_run

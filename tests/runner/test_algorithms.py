@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from runner.again import evaluate
-from runner.analysis.tables import TableReplay, held_at, tables_at
 from runner.environments import load_mdp
 from runner.learning.learner import Learner
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts
+from runner.replay.tables import TableReplay, held_at, tables_at
 from runner.resume import resume
 from runner.runs import list_runs
 from runner.verify import verify

@@ -8,15 +8,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import runner
-from runner.analysis.tables import TableReplay, history_of, last_step, step_of_episode, tables_at
 from runner.environments import load_mdp
 from runner.errors import RecordingError
 from runner.learning.learner import Learner
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts
-from runner.recording.repair import repair
-from tests.runner.altering import altered
+from runner.replay.history import history_of
+from runner.replay.tables import TableReplay, last_step, step_of_episode, tables_at
+from tests.runner.altering import altered, without_chunk
 from tests.runner.recording.making import TAXIS, experiment, make_run
 
 SCHEDULES = {
@@ -177,16 +177,9 @@ def test_without_steps_there_are_the_snapshots(tmp_path):
 
 def test_behind_a_hole_there_are_no_tables(tmp_path):
     run = make_run(tmp_path, TAXIS, recording={"chunk_steps": 256}, snapshots={"every": None})
-    data = bytearray(run.recording.read_bytes())
     with open_recording(run.recording) as recording:
         total = recording.count(schema.TRAIN_STEP)
-    from runner.recording.contents import survey
-
-    chunks = [part for part in survey(run.recording).chunks if part.channel == schema.TRAIN_STEP.channel]
-    data[chunks[1].index.chunk_start_offset + 150] ^= 1
-    run.recording.write_bytes(data)
-    first = chunks[0].messages
-    repair(run.recording)
+    first = without_chunk(run.recording, schema.TRAIN_STEP, 1)
     with open_recording(run.recording) as recording:
         assert tables_at(recording, first)
         with pytest.raises(RecordingError, match=f"training steps {first} to .* were lost.*resume"):

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from runner.analysis.tables import history_of
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.replay.history import history_of
 from runner.verify import verify
 from tests.data.make import LOOPS, NAMES, TOGETHER, expectations, loop_expectations
 

@@ -23,8 +23,8 @@ from runner.recording.reader import Recording
 from runner.words import actions_in_words, states_in_words
 
 if TYPE_CHECKING:
-    from runner.analysis.tables import TableReplay
     from runner.learning.learner import Held
+    from runner.replay.tables import TableReplay
 
 _STEPS_AT_ONCE = 1 << 16
 _OF_TABLES = ("greedy_action", "policy_action")
@@ -157,7 +157,7 @@ def _from_tables(
     cause: Cause, parting: Parting, a: Recording, b: Recording, training: tuple[Parting, Cause] | None
 ) -> Cause:
     """Return the cause of another choice, with both Q-rows, and the first update that differs."""
-    from runner.analysis.tables import TableReplay
+    from runner.replay.tables import TableReplay
 
     steps = [_training_step(parting, recording) for recording in (a, b)]
     known = training is not None and training[0].step < min(steps)
@@ -199,7 +199,7 @@ def _replayed(a: Recording, b: Recording, stop: int) -> tuple[list[TableReplay],
     Raises:
         RecordingError: the tables cannot be had.
     """
-    from runner.analysis.tables import TableReplay
+    from runner.replay.tables import TableReplay
 
     start = _last_equal_snapshot(a, b, stop)
     left, right = TableReplay(a, start), TableReplay(b, start)

@@ -50,7 +50,7 @@ def command(
 
     With --state: its values, the policy if the algorithm learns one, the greedy action (ties go to the
     first), how often each action was taken there so far, and which step last changed each value. In Python:
-    runner.analysis.tables.tables_at().
+    runner.replay.tables.tables_at().
 
     \b
     Examples:

@@ -21,8 +21,8 @@ _BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
 
 
 @dataclass(frozen=True, eq=False)
-class Thoughts:
-    """What the learners thought at n steps, and at the steps `renewed` among them."""
+class StepValues:
+    """The learners' Q-values at n steps, and maps of them at the steps `renewed` among these."""
 
     values: NDArray[np.float64]
     """[n, sum of the agents' action counts]: each agent's values of its own actions; of a joint table the
@@ -30,19 +30,11 @@ class Thoughts:
     greedy: NDArray[np.int64]
     """[n, agents]: each agent's greedy action."""
     renewed: NDArray[np.int64]
-    """[k]: the rows at which the pictures were renewed."""
+    """[k]: the rows at which the maps were renewed."""
     value_maps: NDArray[np.float32]
     """[k, learners, pixels]: the greatest value in the state of each pixel; nan where there is none."""
     greedy_maps: NDArray[np.int32]
     """[k, learners, pixels]: the learner's greedy action there; -1 where there is none."""
-
-
-def no_thoughts() -> Thoughts:
-    """Return the thoughts of who was not asked."""
-    none = np.empty(0, np.int64)
-    return Thoughts(
-        np.empty((0, 0)), none[:, None], none, np.empty((0, 0, 0), np.float32), np.empty((0, 0, 0), np.int32)
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +42,8 @@ class Batch:
     """Steps of one phase, with what goes with them."""
 
     records: NDArray[np.void]
-    thoughts: Thoughts
+    values: StepValues | None
+    """None where they are unknown, or not exported."""
     episode: NDArray[np.int64]
     """[n]: training episodes; for evaluation those before it."""
     before: NDArray[np.void]

@@ -57,27 +57,6 @@ def bar_ends(values: Any, bounds: Any, left: float, length: float, fineness: int
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
-def pictures_of(tables: Any, states: Any, value: Any, greedy: Any) -> None:
-    """Take down a picture of each learner's table as it is now.
-
-    Args:
-        tables: of the kernel.
-        states: [pixels], the state at each; -1 where there is none.
-        value: [learners, pixels], filled with the highest values; nan where there is no state.
-        greedy: [learners, pixels], filled with the greedy actions; -1 where there is no state.
-    """
-    for i in range(value.shape[0]):
-        for pixel in range(value.shape[1]):
-            state = states[pixel]
-            if state < 0:
-                value[i, pixel] = np.nan
-                greedy[i, pixel] = -1
-            else:
-                value[i, pixel] = tables.value[i, state]
-                greedy[i, pixel] = tables.greedy[i, state]
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
 def arrows(greedy: Any, own: Any, moves: Any, vectors: Any) -> None:
     """Fill in the arrows of greedy actions; none where there is no state, or no move.
 

@@ -11,7 +11,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.export.rerun.classes import vocabulary_of
-from runner.export.rerun.columns import Batch, Sender, new_stream, no_thoughts
+from runner.export.rerun.columns import Batch, Sender, new_stream
 from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
 from runner.export.rerun.layout import Shown, blueprint, draw_background
@@ -91,7 +91,7 @@ class LiveStream:
         trained = np.repeat([piece.episode for piece in pieces], [len(piece.content) for piece in pieces])
         if phase == "train":
             trained = steps["episode"].astype(np.int64)
-        batch = Batch(steps, no_thoughts(), trained, self._before.get(phase, steps[:0]), time)
+        batch = Batch(steps, None, trained, self._before.get(phase, steps[:0]), time)
         self._before[phase] = steps[-TRAIL_STEPS:]
         self._events[phase].write(batch)
         if phase in self._grids:

@@ -17,7 +17,7 @@ from runner.analysis.evaluations import Evaluation
 from runner.errors import RecordingError
 from runner.export.contents import shortcomings
 from runner.export.rerun.classes import vocabulary_of
-from runner.export.rerun.columns import Batch, Sender, no_thoughts, scalars
+from runner.export.rerun.columns import Batch, Sender, scalars
 from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
 from runner.export.rerun.layout import Shown, draw_background
@@ -34,6 +34,7 @@ from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import leaves_of
+from runner.replay.checks import check_steps
 
 BATCH: Final = 8_192
 MOST_LINES: Final = 16
@@ -244,8 +245,11 @@ class LoopExporter:
                     steps = steps[
                         (steps["step"] % self._recording.environments == 0) & (steps["t"] != schema.NEVER)
                     ]
-                    if len(steps):
-                        yield steps
+                    if not len(steps):
+                        continue
+                    if self._scene is not None:
+                        check_steps(steps, self._recording.mdp, str(self._recording.path), "recorded")
+                    yield steps
 
     def _lines(self) -> dict[str, list[tuple[str, tuple[str, ...]]]]:
         """Return what of a step is drawn as lines: part, and for each leaf its name and where it stands.
@@ -328,7 +332,7 @@ class _Grid:
         episode = steps["episode"].astype(np.int64)
         if self._phase == "eval":
             episode = np.searchsorted(self._trained, steps["log_time"])
-        batch = Batch(steps, no_thoughts(), episode, before, time)
+        batch = Batch(steps, None, episode, before, time)
         self._writer.write(batch, self._phase)
         self._events.write(batch)
         if gaps:

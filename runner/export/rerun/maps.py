@@ -91,23 +91,28 @@ class MapWriter(Sender):
 
     def write(self, batch: Batch) -> None:
         """Send where each step of a batch is in the map, and the map where it was renewed."""
-        pictures, thoughts, n = self._pictures, batch.thoughts, len(batch.records)
+        assert batch.values is not None
+        pictures, known, n = self._pictures, batch.values, len(batch.records)
         middle = centres(pictures.height, pictures.width)
-        rows, times = thoughts.renewed, batch.times()
+        rows, times = known.renewed, batch.times()
         for i, learner in enumerate(self._learners):
             order = self._orders[i]
             pixel = np.argsort(order)[pictures.pixel[batch.records["state"]]]
             here = instances(rr.Boxes2D, n, centers=middle[pixel][:, None])
             self.send(f"map/{learner}/here", times, here)
             if len(rows):
-                greedy = thoughts.greedy_maps[:, i][:, order]
+                greedy = known.greedy_maps[:, i][:, order]
                 self.send(f"map/{learner}/stops", batch.times(rows), self._stops(i, greedy))
-                self._renew(batch, learner, thoughts.value_maps[:, i][:, order], self._arrows(i, greedy))
+                self._renew(batch, rows, learner, known.value_maps[:, i][:, order], self._arrows(i, greedy))
 
     def _renew(
-        self, batch: Batch, learner: str, values: NDArray[np.float32], moves: NDArray[np.float32]
+        self,
+        batch: Batch,
+        rows: NDArray[np.int64],
+        learner: str,
+        values: NDArray[np.float32],
+        moves: NDArray[np.float32],
     ) -> None:
-        rows = batch.thoughts.renewed
         times, n = batch.times(rows), len(rows)
         self.send(f"map/{learner}", times, images(values))
         frame = instances(rr.Boxes2D, n, half_sizes=np.full((n, 1, 2), 0.5, np.float32))

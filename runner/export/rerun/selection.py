@@ -111,6 +111,12 @@ def select(recording: Recording, request: Request) -> Selection:
         (one, span) for one in wanted for span in spans_of(evals, np.arange(one.start, one.stop))
     ]
     _tell(selection, request, train, numbers, evaluations, wanted)
+    unknown = _steps_without_values(recording, selection.train)
+    if unknown:
+        selection.warnings.append(
+            f"{unknown:,} of these training steps are exported without Q-values: steps before them were "
+            "lost, and the Q-tables are unknown until the next snapshot."
+        )
     return selection
 
 
@@ -127,10 +133,15 @@ def chosen_spans(recording: Recording, request: Request) -> list[Span]:
 def episodes_of(recording: Recording, phase: str) -> Episodes:
     """Return where the episodes of a phase lie, one that never ended among them."""
     steps, episodes = schema.PHASES[phase]
-    ends = [np.zeros(1, np.int64)]
-    ends += [block["last_step"].astype(np.int64) + 1 for block in recording.blocks(episodes)]
     total = recording.count(steps)
-    first = np.concatenate(ends)
+    first = np.full(recording.count(episodes) + 1, -1, np.int64)
+    first[0] = 0
+    for block in recording.blocks(episodes):
+        counted = block[block["episode"] < len(first) - 1]
+        number, stop = counted["episode"].astype(np.int64), counted["last_step"].astype(np.int64) + 1
+        first[number] = stop - counted["length"]
+        first[number + 1] = stop
+    first = np.maximum.accumulate(first)  # steps of episodes that were lost in a repair count as the first's
     first = first[first <= total]
     ended = len(first) - 1
     return Episodes(phase, np.append(first, total) if total > first[-1] else first, ended)
@@ -143,12 +154,29 @@ def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episode
     trials = int(recording.config["evaluation"]["trials"])
     found = []
     for start in range(0, evals.count, trials):
-        step = int(evals.first_step[start])
-        record = next(recording.blocks(schema.EVAL_STEP, step, step + 1))[0]
-        trained = int(record["log_time"]) // schema.STEP_NANOSECONDS - (step + 1)
+        stop = min(start + trials, evals.count)
+        bounds = int(evals.first_step[start]), int(evals.first_step[stop])
+        block = next(recording.blocks(schema.EVAL_STEP, *bounds), None)
+        if block is None:  # all of its steps were lost in a repair
+            continue
+        trained = int(block["log_time"][0]) // schema.STEP_NANOSECONDS - (int(block["step"][0]) + 1)
         after = int(np.searchsorted(train.first_step[1 : train.ended + 1], trained, side="right"))
-        found.append(Evaluation(after, trained, start, min(start + trials, evals.count)))
+        found.append(Evaluation(after, trained, start, stop))
     return found
+
+
+def _steps_without_values(recording: Recording, spans: Sequence[Span]) -> int:
+    """Return how many of the training steps in these spans have unknown Q-values."""
+    if not recording.lost and next((one.step for one in recording.snapshots()), -1) == 0:
+        return 0
+    from runner.replay.tables import known_steps  # loads Numba
+
+    known, unknown = known_steps(recording), 0
+    for span in spans:
+        for block in recording.blocks(schema.TRAIN_STEP, span.start, span.stop):
+            inside = [(block["step"] >= first) & (block["step"] <= last) for first, last in known]
+            unknown += len(block) - int(np.any(inside, axis=0).sum())
+    return unknown
 
 
 def spans_of(episodes: Episodes, numbers: NDArray[np.int64]) -> list[Span]:

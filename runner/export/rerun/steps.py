@@ -39,6 +39,7 @@ class StepWriter(Sender):
         super().__init__(stream, path)
         self._phase = phase
         self._learners = learners
+        self._values_shown = False
         self._values = ValueWriter(stream, path, mdp, words, len(learners))
         self._events = EventWriter(stream, path, phase, mdp)
         self._grid = GridWriter(stream, path, scene, marks, words) if scene and marks else None
@@ -59,18 +60,27 @@ class StepWriter(Sender):
         """Send a batch of steps."""
         records, times = batch.records, batch.times()
         self.send("reward", times, scalars(records["rewards"]))
-        self._values.write(batch)
         self._events.write(batch)
         if self._grid:
             self._grid.write(batch, self._phase)
         else:
             for name in ("state", "action"):
                 self.send(name, times, scalars(records[name].astype(np.float64)[:, None]))
-        if self._maps:
-            self._maps.write(batch)
+        self._write_values(batch)
+
+    def _write_values(self, batch: Batch) -> None:
+        """Send Q-values and maps; where they are unknown, clear what is shown of earlier steps."""
+        if batch.values is not None:
+            self._values.write(batch)
+            if self._maps:
+                self._maps.write(batch)
+        elif self._values_shown:
+            for part in ("q", "map"):
+                self.clear(part, [int(batch.time[0])])
+        self._values_shown = batch.values is not None
 
     def end(self, times: Iterable[int]) -> None:
-        """Say that from these times on nothing is known, until the next step that was exported."""
+        """Clear all views from these times on, until the next step that is exported."""
         moments = list(times)
         for part in ("grid", "q", "map"):
             self.clear(part, moments)

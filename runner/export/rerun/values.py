@@ -9,7 +9,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.export.rerun.classes import Vocabulary
-from runner.export.rerun.columns import Batch, Sender, instances, rgba, scalars, strips
+from runner.export.rerun.columns import Batch, Sender, StepValues, instances, rgba, scalars, strips
 from runner.export.rerun.scene import INK, MOVER_COLOURS, own_actions
 from runner.mdp import Mdp
 from runner.words import numbered_actions, spoken
@@ -63,14 +63,15 @@ class ValueWriter(Sender):
 
     def write(self, batch: Batch) -> None:
         """Send the values of each step of a batch: as they were before its update."""
-        values, n = batch.thoughts.values, len(batch.records)
+        assert batch.values is not None
+        values, n = batch.values.values, len(batch.records)
         columns = [
             *scalars(values),
-            *instances(rr.Points2D, n, class_ids=self._classes(batch)),
+            *instances(rr.Points2D, n, class_ids=self._classes(batch, batch.values)),
             *strips(self._bars(values)),
         ]
         self.send("q", batch.times(), columns)
-        rows = batch.thoughts.renewed  # the places are always the same, and cleared with the rest
+        rows = batch.values.renewed  # the places are always the same, and cleared with the rest
         places = np.broadcast_to(self._places(), (len(rows), 3 * values.shape[1], 2))
         self.send("q", batch.times(rows), instances(rr.Points2D, len(rows), positions=places))
 
@@ -82,16 +83,16 @@ class ValueWriter(Sender):
         ]
         return np.concatenate(columns).astype(np.float32)
 
-    def _classes(self, batch: Batch) -> NDArray[np.uint16]:
+    def _classes(self, batch: Batch, known: StepValues) -> NDArray[np.uint16]:
         """Return the label at each of those places, by number."""
-        words, thoughts = self._words, batch.thoughts
-        n, count = thoughts.values.shape
+        words = self._words
+        n, count = known.values.shape
         own = self._own[batch.records["action"]]
         explored = (batch.records["explored"][:, None] >> self._explored_bit & 1).astype(bool)
         classes = np.full((n, 3 * count), words.unmarked, np.uint16)
-        classes[:, :count] = words.values.of(thoughts.values)
+        classes[:, :count] = words.values.of(known.values)
         each, first = np.arange(n)[:, None], np.cumsum((0, *self._mdp.action_counts[:-1]))
-        classes[each, count + first + thoughts.greedy] = words.greedy
+        classes[each, count + first + known.greedy] = words.greedy
         classes[each, 2 * count + first + own] = np.where(explored, words.explored, words.chosen)
         return classes
 

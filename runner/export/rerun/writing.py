@@ -17,16 +17,17 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError, StorageError
 from runner.export.rerun.ahead import ahead
 from runner.export.rerun.classes import Vocabulary, vocabulary_of
-from runner.export.rerun.columns import Batch, Sender, Thoughts, ink, instances, new_stream, place, texts
+from runner.export.rerun.columns import Batch, Sender, StepValues, ink, instances, new_stream, place, texts
 from runner.export.rerun.layout import Shown, blueprint, draw_background, loop_blueprint
 from runner.export.rerun.metrics import MetricWriter, send_metrics
 from runner.export.rerun.scene import TRAIL_STEPS, Marks, Scene, marks_of, scene_of
-from runner.export.rerun.selection import Request, Selection, select
+from runner.export.rerun.selection import Request, Selection, Span, select
+from runner.export.rerun.step_values import StepValueReader
 from runner.export.rerun.steps import StepWriter
-from runner.export.rerun.thoughts import Thinker
 from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.replay.checks import check_steps
 
 BATCH: Final = 8_192
 """Rows sent at a time: larger columns are dropped by the web viewer."""
@@ -154,13 +155,13 @@ class RunExporter:
         words = self._vocabulary()
         self._stream.log(f"{source.root}/", rr.AnnotationContext(words.classes.context()), static=True)
         draw_background(self._stream, self.shown)
-        thinker = Thinker(self._recording, self._scene.placements if self._scene else None)
-        covered = {phase: self._send_phase(phase, words, thinker) for phase in ("train", "eval")}
+        values = StepValueReader(self._recording, self._scene.placements if self._scene else None)
+        covered = {phase: self._send_phase(phase, words, values) for phase in ("train", "eval")}
         self._send_notice(sorted(covered["train"] + covered["eval"]))
 
-    def _send_phase(self, phase: str, words: Vocabulary, thinker: Thinker) -> list[tuple[int, int]]:
+    def _send_phase(self, phase: str, words: Vocabulary, values: StepValueReader) -> list[tuple[int, int]]:
         """Send the steps of a phase; return the stretches of time that they cover."""
-        pieces = self._training(thinker) if phase == "train" else self._evaluating(thinker)
+        pieces = self._training(values) if phase == "train" else self._evaluating(values)
         path = f"{self._source.root}/{phase}"
         mdp, covered = self._recording.mdp, list[tuple[int, int]]()
         writer = StepWriter(self._stream, path, phase, mdp, self._scene, self._marks, words, self._learners)
@@ -179,18 +180,26 @@ class RunExporter:
             writer.end(ends)
         return covered
 
-    def _training(self, thinker: Thinker) -> Iterator[Piece]:
+    def _training(self, values: StepValueReader) -> Iterator[Piece]:
         for span in self._selection.train:
-            for block in self._recording.blocks(schema.TRAIN_STEP, span.start, span.stop):
-                for part in _parts(block):
-                    yield part, thinker.training(part), part["episode"].astype(np.int64)
+            for block in self._steps("train", span):
+                for part in values.split(block):
+                    yield part, values.training(part), part["episode"].astype(np.int64)
 
-    def _evaluating(self, thinker: Thinker) -> Iterator[Piece]:
+    def _evaluating(self, values: StepValueReader) -> Iterator[Piece]:
         for evaluation, span in self._selection.evaluations:
-            thinker.at(evaluation.train_step)
-            for block in self._recording.blocks(schema.EVAL_STEP, span.start, span.stop):
-                for part in _parts(block):
-                    yield part, thinker.evaluating(part), np.full(len(part), evaluation.after, np.int64)
+            for block in self._steps("eval", span):
+                after = np.full(len(block), evaluation.after, np.int64)
+                yield block, values.evaluating(block, evaluation.train_step), after
+
+    def _steps(self, phase: str, span: Span) -> Iterator[NDArray[np.void]]:
+        """Yield the steps of a span, at most a batch at a time, after checking them."""
+        recording, topic = self._recording, schema.PHASES[phase][0]
+        for block in recording.blocks(topic, span.start, span.stop):
+            for start in range(0, len(block), BATCH):
+                part = block[start : start + BATCH]
+                check_steps(part, recording.mdp, str(recording.path), schema.PHASE_NAMES[phase])
+                yield part
 
     def _vocabulary(self) -> Vocabulary:
         """Return the labels of the run; numbers as fine as its tables ask for."""
@@ -224,8 +233,8 @@ class RunExporter:
         sender.clear("text", [stop for _, stop in gaps if stop <= self.shown.last])
 
 
-Piece = tuple[NDArray[np.void], Thoughts, NDArray[np.int64]]
-"""Steps, what the learners thought at them, and the training episode of each."""
+Piece = tuple[NDArray[np.void], StepValues | None, NDArray[np.int64]]
+"""Steps, their Q-values if they are known, and the training episode of each."""
 
 
 def _batches(pieces: Iterator[Piece], trials: int) -> Iterator[Batch]:
@@ -233,7 +242,8 @@ def _batches(pieces: Iterator[Piece], trials: int) -> Iterator[Batch]:
     waiting: list[Piece] = []
     before: NDArray[np.void] | None = None
     for piece in pieces:
-        if waiting and sum(len(one[0]) for one in waiting) + len(piece[0]) > BATCH:
+        full = sum(len(one[0]) for one in waiting) + len(piece[0]) > BATCH
+        if waiting and (full or (waiting[-1][1] is None) != (piece[1] is None)):
             batch = _together(waiting, before, trials)
             yield batch
             before, waiting = batch.records[-TRAIL_STEPS:], []
@@ -244,27 +254,23 @@ def _batches(pieces: Iterator[Piece], trials: int) -> Iterator[Batch]:
 
 def _together(pieces: list[Piece], before: NDArray[np.void] | None, trials: int) -> Batch:
     records = np.concatenate([piece[0] for piece in pieces]) if len(pieces) > 1 else pieces[0][0]
-    thoughts = _thoughts_together([piece[1] for piece in pieces])
+    values = _joined([piece[1] for piece in pieces if piece[1] is not None])
     episode = np.concatenate([piece[2] for piece in pieces])
     time = records["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
-    return Batch(records, thoughts, episode, records[:0] if before is None else before, time, trials)
+    return Batch(records, values, episode, records[:0] if before is None else before, time, trials)
 
 
-def _thoughts_together(parts: list[Thoughts]) -> Thoughts:
-    if len(parts) == 1:
-        return parts[0]
+def _joined(parts: list[StepValues]) -> StepValues | None:
+    """Return the values of successive pieces as one; None if there are none."""
+    if len(parts) < 2:
+        return parts[0] if parts else None
     starts = np.cumsum([0] + [len(part.values) for part in parts])
     renewed = [part.renewed + start for part, start in zip(parts, starts[:-1], strict=True)]
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts])
         for name in ("values", "greedy", "value_maps", "greedy_maps")
     }
-    return Thoughts(renewed=np.concatenate(renewed), **joined)
-
-
-def _parts(block: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
-    for start in range(0, len(block), BATCH):
-        yield block[start : start + BATCH]
+    return StepValues(renewed=np.concatenate(renewed), **joined)
 
 
 def _cover(covered: list[tuple[int, int]], time: NDArray[np.int64]) -> None:

@@ -19,13 +19,13 @@ from runner.analysis.diff.sections import sections
 from runner.analysis.diff.settings import changes_in
 from runner.analysis.diff.trajectory import FIELDS, first_difference
 from runner.analysis.sections import markdown
-from runner.analysis.tables import tables_at
 from runner.cli import cli
 from runner.config import from_mapping
 from runner.execution import run_job
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.replay.tables import tables_at
 from runner.words import states_in_words
 from tests.runner.altering import altered
 from tests.runner.recording.making import stopping_after

@@ -13,12 +13,12 @@ from click.testing import CliRunner
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from runner.analysis.tables import tables_at
 from runner.cli import cli
 from runner.owner import owner
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.contents import survey
+from runner.replay.tables import tables_at
 from runner.runs import Run, list_runs
 from tests.runner.altering import altered
 

@@ -65,7 +65,7 @@ def test_replays_are_the_recorded_episodes_best_and_worst_among_them(recording, 
 
 
 def test_q_values_are_those_before_each_step(recording, page_of):
-    from runner.analysis.tables import tables_at
+    from runner.replay.tables import tables_at
 
     data = data_of(page_of(recording.run["name"]))["episodes"][1]
     steps = recording.episode_steps("train", 30)

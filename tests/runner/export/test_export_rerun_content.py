@@ -9,7 +9,6 @@ import pytest
 from rerun.chunk import RrdReader
 
 from runner.analysis.outcomes import events_of
-from runner.analysis.tables import TableReplay, tables_at
 from runner.export.rerun.scene import marks_of, own_actions, scene_of
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import viewer_program
@@ -17,6 +16,7 @@ from runner.export.rerun.writing import Source, export
 from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import open_recording
+from runner.replay.tables import TableReplay, tables_at
 
 TOPICS = {"train": schema.TRAIN_STEP, "eval": schema.EVAL_STEP}
 

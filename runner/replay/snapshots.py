@@ -1,0 +1,107 @@
+"""Snapshots as the recorded steps make them: an archive leaves these out, and a restore makes them again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.learning.learner import held_of
+from runner.replay.tables import StepReplay
+
+
+class DerivedTables:
+    """The tables of a run as far as its steps determine them, moved forward by the steps as they come.
+
+    Args:
+        replay: at the run's first step.
+    """
+
+    def __init__(self, replay: StepReplay) -> None:
+        self._replay = replay
+        self._given: set[int] = set()
+        self._known = True
+        """Whether the tables are the run's own: no step is missing since it began or they were given."""
+
+    def take(self, steps: NDArray[np.void]) -> None:
+        """Take the next training steps.
+
+        Raises:
+            RecordingError: the environment cannot have them.
+        """
+        if not len(steps):
+            return
+        first, last = int(steps["step"][0]), int(steps["step"][-1])
+        self._known &= first == self._replay.step and last == first + len(steps) - 1
+        if self._known:
+            self._replay.apply(steps)
+        self._replay.step = last + 1
+        self._given.clear()
+
+    def at(self, step: int, table: int) -> NDArray[np.float64] | None:
+        """Return a table after so many training steps, a view; None if the steps do not determine it."""
+        tables = self._replay.snapshot()
+        known = self._known and step == self._replay.step and 0 <= table < len(tables)
+        return tables[table] if known else None
+
+    def give(self, step: int, table: int, values: NDArray[np.float64]) -> None:
+        """Set a table to its recorded values; when all of a step are given, the tables are known again."""
+        replay = self._replay
+        tables = replay.snapshot()
+        if not 0 <= table < len(tables) or tables[table].shape != values.shape:
+            return  # archived as it is, but nothing can be derived from it
+        if step != replay.step:
+            replay.step, self._known = step, False
+            self._given.clear()
+        self._given.add(table)
+        self._known |= len(self._given) == len(tables)
+        tables[table] = values
+        replay.rewind(step, held_of(tables, replay.kinds))
+
+
+class Snapshot(Protocol):
+    """A table at a step."""
+
+    @property
+    def step(self) -> int:
+        """Training steps taken."""
+
+
+S = TypeVar("S", bound=Snapshot)
+
+
+class SnapshotVisitor(Generic[S]):
+    """Calls a function with each snapshot of a run when the training steps before it were taken.
+
+    Args:
+        tables: moved forward by the steps.
+        snapshots: in order.
+        visit: called with each.
+    """
+
+    def __init__(self, tables: DerivedTables, snapshots: Iterator[S], visit: Callable[[S], None]) -> None:
+        self._tables = tables
+        self._snapshots = snapshots
+        self._visit = visit
+        self._next = next(snapshots, None)
+
+    def take(self, steps: NDArray[np.void]) -> None:
+        """Take the next training steps."""
+        while self._next is not None and self._next.step <= int(steps["step"][-1]):
+            before = int(np.searchsorted(steps["step"], self._next.step))
+            self._tables.take(steps[:before])
+            self._visit_next()
+            steps = steps[before:]
+        self._tables.take(steps)
+
+    def finish(self) -> None:
+        """Visit the snapshots that are left."""
+        while self._next is not None:
+            self._visit_next()
+
+    def _visit_next(self) -> None:
+        assert self._next is not None
+        self._visit(self._next)
+        self._next = next(self._snapshots, None)

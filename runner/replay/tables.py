@@ -1,0 +1,393 @@
+"""Q-tables at any step: the nearest snapshot before it, moved forward by the recorded steps.
+
+with runner.recording.open(path) as recording:
+    tables = tables_at(recording, step=1_000_000)      # one float64 [states, actions] per learner
+
+Every replay of recorded steps goes through `StepReplay.apply`. It checks the steps first, because the
+compiled kernel indexes its arrays by what they say, without any check of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.config import from_mapping
+from runner.errors import RecordingError
+from runner.learning import kernel
+from runner.learning.learner import Held, Learner, held_of, kinds_of
+from runner.mdp import Mdp
+from runner.recording import schema
+from runner.recording.messages import QTable
+from runner.recording.reader import Recording
+from runner.replay.checks import check_steps
+
+NEAR_STEPS: Final = 200_000
+"""`TableReplay.seek` replays this many steps rather than load a snapshot on the way."""
+_NO_ROWS = np.empty((0, 0, 0))
+
+
+class StateProbe(NamedTuple):
+    """Values and greedy actions of some states, to be read before some of the steps of a block."""
+
+    before: NDArray[np.int64]
+    """[k]: rows of the block, ascending."""
+    states: NDArray[np.int32]
+    """[k, n]: the states to read before each of these rows; -1 for none."""
+    value: NDArray[np.float32]
+    """[k, learners, n]: filled with the highest value of each state; nan for none."""
+    greedy: NDArray[np.int32]
+    """[k, learners, n]: filled with the greedy action in each state; -1 for none."""
+
+
+class StepReplay:
+    """The tables of a run's learners, moved forward by its training steps in order.
+
+    Args:
+        config: the run's resolved configuration, as its recording holds it.
+        mdp: its environment.
+        seed: the seed of its job.
+        where: the recording or archive that the steps are from, for errors.
+    """
+
+    def __init__(self, config: Mapping[str, Any], mdp: Mdp, seed: int, where: str) -> None:
+        self._mdp = mdp
+        self._where = where
+        self._learner = Learner(from_mapping(config), mdp, seed)
+        self.step = 0
+        """Training steps that the tables have learned from."""
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """The names of the learners."""
+        return self._learner.agents
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The names of what each learner holds, in the order of a snapshot."""
+        return self._learner.kinds
+
+    @property
+    def tables(self) -> list[NDArray[np.float64]]:
+        """The Q-tables at `step`, [states, actions] per learner: views that `apply` changes."""
+        return [self._learner.table(i) for i in range(len(self.agents))]
+
+    @property
+    def held(self) -> list[Held]:
+        """All that each learner holds at `step`, by name: views that `apply` changes; `q` is its table."""
+        return [self._learner.held(i) for i in range(len(self.agents))]
+
+    @property
+    def own_actions(self) -> NDArray[np.int32]:
+        """Each learner's part of a joint action, [joint actions, learners]."""
+        return self._learner.model.own_action
+
+    @property
+    def greedy(self) -> NDArray[np.int32]:
+        """The greedy actions at `step`, [learners, states]: the lowest of the best ones."""
+        return self._learner.tables.greedy
+
+    def snapshot(self) -> list[NDArray[np.float64]]:
+        """Return all tables as a snapshot numbers them, those of one kind together: views."""
+        return self._learner.snapshot()
+
+    def rewind(self, step: int, held: list[Held]) -> None:
+        """Set the tables to what the learners held at a step."""
+        self._learner.set_held(held)
+        self.step = step
+
+    def empty_rows(self, count: int) -> NDArray[np.float64]:
+        """Return an array for the values seen in `count` steps: nan, [count, learners, most actions]."""
+        widths = self._learner.model.width
+        return np.full((count, len(widths), max(widths)), np.nan)
+
+    def apply(
+        self, steps: NDArray[np.void], rows: NDArray[np.float64] = _NO_ROWS, probe: StateProbe | None = None
+    ) -> None:
+        """Apply the updates of the training steps that follow.
+
+        Args:
+            steps: a block of records; the first is step number `self.step`.
+            rows: filled with each learner's values of a step's state before its update, [steps, learners,
+                most actions]; empty if they are not needed.
+            probe: states to look at on the way.
+
+        Raises:
+            RecordingError: steps are missing, or the environment cannot have such steps.
+        """
+        if not len(steps):
+            return
+        first, last = int(steps["step"][0]), int(steps["step"][-1])
+        if first > self.step:
+            raise self._lost(first)
+        if first < self.step or last != first + len(steps) - 1:
+            raise RecordingError(
+                f"{self._where}: found training steps {first} to {last} in a block of {len(steps)}, expected "
+                f"those from {self.step} on; `dualtaxi verify` checks the whole recording."
+            )
+        check_steps(steps, self._mdp, self._where)
+        records = steps.view(np.recarray)
+        if probe is None:
+            kernel.replay(*self._state, records, rows)
+        else:
+            _check_probe(probe, self._mdp)
+            _replay_probed(*self._state, records, rows, *probe)
+        self.step = last + 1
+
+    def values_in(self, states: NDArray[Any]) -> NDArray[np.float64]:
+        """Return each learner's values in these states now, [states, learners, most actions]."""
+        rows = self.empty_rows(len(states))
+        for i, table in enumerate(self.tables):
+            rows[:, i, : table.shape[1]] = table[states]
+        return rows
+
+    def read(self, probe: StateProbe) -> None:
+        """Fill a probe with the values and greedy actions as they are now, for all of its rows."""
+        _check_probe(probe, self._mdp)
+        for k in range(len(probe.states)):
+            _read_states(self._learner.tables, probe.states[k], probe.value[k], probe.greedy[k])
+
+    @property
+    def _state(self) -> tuple[Any, ...]:
+        return self._learner.seed, self._learner.model, self._learner.tables, self._learner.rules
+
+    def _lost(self, found: int) -> RecordingError:
+        return RecordingError(
+            f"{self._where}: training steps {self.step} to {found - 1} were lost, so the Q-tables after them "
+            "are unknown until the next snapshot; `dualtaxi resume` trains the run again."
+        )
+
+
+class TableReplay(StepReplay):
+    """The tables of a recorded run, moved forward by its recording.
+
+    Args:
+        recording: the run.
+        step: the training step to begin at.
+
+    Raises:
+        RecordingError: there is no such step, or the steps from the nearest snapshot are not recorded.
+    """
+
+    def __init__(self, recording: Recording, step: int = 0) -> None:
+        super().__init__(recording.config, recording.mdp, int(recording.run["seed"]), str(recording.path))
+        self._recording = recording
+        self._recorded = recording.count(schema.TRAIN_STEP)
+        self.rewind(*self._nearest_snapshot(step))
+        self.advance(step)
+
+    def advance(self, step: int) -> None:
+        """Replay up to a later step.
+
+        Raises:
+            RecordingError: the step is earlier, or not recorded.
+        """
+        self._advance(step, None)
+
+    def rows(self, stop: int) -> NDArray[np.float64]:
+        """Replay up to a step, and return the values that the learners saw on the way.
+
+        Returns:
+            float64 [steps, learners, most actions]: the values of each step's state before its update; nan
+            beyond a learner's own actions.
+
+        Raises:
+            RecordingError: the step is earlier, or not recorded.
+        """
+        seen = self.empty_rows(max(stop - self.step, 0))
+        self._advance(stop, seen)
+        return seen
+
+    def seek(self, step: int) -> None:
+        """Go to any step, from here or from the nearest snapshot before it, whichever takes less.
+
+        Raises:
+            RecordingError: there is no such step, or the steps from the nearest snapshot are not recorded.
+        """
+        lost = self._recording.lost.get(schema.TRAIN_STEP.name, [])
+        gap = any(start < step and stop > self.step for start, stop in lost)
+        if gap or not self.step <= step <= self.step + NEAR_STEPS:
+            nearest, held = self._nearest_snapshot(step)
+            if not self.step <= step or nearest > self.step:
+                self.rewind(nearest, held)
+        self.advance(step)
+
+    def _nearest_snapshot(self, step: int) -> tuple[int, list[Held]]:
+        nearest = _snapshot_before(self._recording, step, self.kinds)
+        if nearest is None:
+            raise RecordingError(f"{self._recording.path}: has no Q-table at or before step {step}.")
+        _check_shapes(self._recording, nearest[1], self.held)
+        return nearest
+
+    def _advance(self, stop: int, seen: NDArray[np.float64] | None) -> None:
+        first = self.step
+        if stop < first:
+            raise RecordingError(f"a replay at step {first} cannot go back to {stop}; begin another.")
+        if stop > max(self._recorded, first):
+            raise self._missing(stop)
+        for block in self._recording.blocks(schema.TRAIN_STEP, first, stop) if stop > first else ():
+            at = self.step - first
+            self.apply(block, _NO_ROWS if seen is None else seen[at : at + len(block)])
+        if self.step < stop:
+            raise self._lost(stop)
+
+    def _missing(self, stop: int) -> RecordingError:
+        recording = self._recording
+        has_steps = recording.config["recording"]["steps"] == "all"
+        taken = self._recorded if has_steps else recording.result.get("train_steps", stop)
+        if has_steps or taken < stop:
+            return RecordingError(
+                f"{recording.path}: found {taken} training steps, expected at least {stop}."
+            )
+        behind = next((snapshot.step for snapshot in recording.snapshots() if snapshot.step >= stop), None)
+        return RecordingError(
+            f"{recording.path}: was recorded without steps (recording.steps: none), and this takes the first "
+            f"{stop:,}; `dualtaxi rerecord` records them. The nearest Q-tables are those after {self.step:,}"
+            + (f" and {behind:,} steps." if behind is not None else " steps.")
+        )
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
+def _read_states(tables: Any, states: Any, value: Any, greedy: Any) -> None:
+    """Read the highest value and the greedy action of states, [n], into [learners, n]."""
+    for i in range(value.shape[0]):
+        for k in range(value.shape[1]):
+            state = states[k]
+            if state < 0:
+                value[i, k] = np.nan
+                greedy[i, k] = -1
+            else:
+                value[i, k] = tables.value[i, state]
+                greedy[i, k] = tables.greedy[i, state]
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
+def _replay_probed(
+    seed: Any,
+    model: Any,
+    tables: Any,
+    rules: Any,
+    steps: Any,
+    rows: Any,
+    before: Any,
+    states: Any,
+    value: Any,
+    greedy: Any,
+) -> None:
+    """Replay steps, and read the probed states before each of those in `before`."""
+    at = 0
+    for k in range(len(before)):
+        kernel.replay(seed, model, tables, rules, steps[at : before[k]], rows[at : before[k]])
+        at = before[k]
+        _read_states(tables, states[k], value[k], greedy[k])
+    kernel.replay(seed, model, tables, rules, steps[at:], rows[at:])
+
+
+def _check_probe(probe: StateProbe, mdp: Mdp) -> None:
+    """Refuse states that the tables do not have: compiled code would read beside them."""
+    if probe.states.size and not -1 <= probe.states.min() <= probe.states.max() < mdp.states:
+        raise IndexError(f"found states up to {probe.states.max()}, expected less than {mdp.states}.")
+
+
+def tables_at(recording: Recording, step: int) -> list[NDArray[np.float64]]:
+    """Return the tables after `step` training steps, one float64 [states, actions] per learner.
+
+    Raises:
+        RecordingError: there is no such step, or the steps from the nearest snapshot are not recorded.
+    """
+    return TableReplay(recording, step).tables
+
+
+def held_at(recording: Recording, step: int) -> list[Held]:
+    """Return all that the learners held after `step` training steps, by name; `q` are the tables.
+
+    Raises:
+        RecordingError: as for `tables_at`.
+    """
+    return TableReplay(recording, step).held
+
+
+def known_steps(recording: Recording) -> list[tuple[int, int]]:
+    """Return the steps at which the tables can be had, as ascending ranges (first, last) without overlap.
+
+    That is from each snapshot on up to the first step that was lost in a repair, or not recorded.
+    """
+    lost = sorted((start, stop) for start, stop in recording.lost.get(schema.TRAIN_STEP.name, []))
+    recorded = recording.count(schema.TRAIN_STEP)
+    found: list[tuple[int, int]] = []
+    for first in _snapshot_steps(recording):
+        reach = next((start for start, stop in lost if stop > first), recorded)
+        last = max(first, min(reach, recorded))
+        if found and first <= found[-1][1] + 1:
+            found[-1] = found[-1][0], max(found[-1][1], last)
+        else:
+            found.append((first, last))
+    return found
+
+
+def step_of_episode(recording: Recording, episode: int) -> int:
+    """Return how many training steps were taken when `episode` episodes had ended.
+
+    Raises:
+        RecordingError: fewer episodes were recorded, or the last of them was lost.
+    """
+    ended = recording.count(schema.TRAIN_EPISODE)
+    if not 0 <= episode <= ended:
+        raise RecordingError(
+            f"{recording.path}: found {ended} training episodes, expected at least {episode}."
+        )
+    if episode == 0:
+        return 0
+    record = recording.episodes("train", episode - 1, episode)
+    if not len(record):
+        raise RecordingError(f"{recording.path}: training episode {episode - 1} was lost.")
+    return int(record[0]["last_step"]) + 1
+
+
+def last_step(recording: Recording) -> int:
+    """Return the last training step at which the tables can be had."""
+    snapshots = max((snapshot.step for snapshot in recording.snapshots()), default=0)
+    return max(snapshots, recording.count(schema.TRAIN_STEP))
+
+
+def initially_held(recording: Recording) -> list[Held] | None:
+    """Return what the learners held before training, by the first snapshot; None if that is missing."""
+    nearest = _snapshot_before(recording, 0, kinds_of(from_mapping(recording.config)))
+    return nearest and nearest[1]
+
+
+def _check_shapes(recording: Recording, found: list[Held], expected: list[Held]) -> None:
+    shapes = [[table.shape for one in held for table in one.values()] for held in (found, expected)]
+    if shapes[0] != shapes[1]:
+        raise RecordingError(f"{recording.path}: found Q-tables of shape {shapes[0]}, expected {shapes[1]}.")
+
+
+def _snapshot_before(
+    recording: Recording, step: int, kinds: tuple[str, ...]
+) -> tuple[int, list[Held]] | None:
+    """Return the last complete snapshot at or before a step, and its step; None if there is none."""
+    tables = int(recording.run["learners"]) * len(kinds)
+    nearest: list[QTable] = []
+    group: list[QTable] = []
+    for snapshot in recording.snapshots(step, tables):
+        if snapshot.step > step:
+            break
+        group = [*group, snapshot] if group and group[0].step == snapshot.step else [snapshot]
+        if len(group) == tables:
+            nearest = group
+    if not nearest:
+        return None
+    return nearest[0].step, held_of([table.values for table in nearest], kinds)
+
+
+def _snapshot_steps(recording: Recording) -> list[int]:
+    """Return the steps of the complete snapshots, ascending."""
+    tables = int(recording.run["learners"]) * len(kinds_of(from_mapping(recording.config)))
+    counts: dict[int, int] = {}
+    for snapshot in recording.snapshots(0, tables):
+        counts[snapshot.step] = counts.get(snapshot.step, 0) + 1
+    return sorted(step for step, count in counts.items() if count == tables)
