@@ -19,7 +19,7 @@ try:
     from pettingzoo import ParallelEnv
 except ImportError as error:
     raise ImportError(
-        "dualtaxi.parallel needs pettingzoo, which is not installed: pip install 'dualtaxi[pettingzoo]'"
+        "dualtaxi.parallel needs pettingzoo, which is not installed: pip install 'pettingzoo>=1.25'"
     ) from error
 
 

@@ -2,9 +2,9 @@
 
     import runner
 
-    run = runner.run("configs/quick.yaml")                 # learns, and records every step
+    run = runner.run("quick")                              # learns, and records every step
     print(runner.frames.evaluations(run))                  # its measures, as a pandas frame
-    for run in runner.run_all("configs/quick.yaml", overrides=["seeds=[1, 2, 3]"]):
+    for run in runner.run_all("quick", overrides=["seeds=[1, 2, 3]"]):
         print(run.run_id, run.summary["content_digest"])
 
 The names below are imported when they are first used, so that `import runner` is quick.

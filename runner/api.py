@@ -2,7 +2,7 @@
 
 import runner
 
-run = runner.run("configs/quick.yaml", seed=3)
+run = runner.run("quick", seed=3)
 print(run.run_id, run.summary["last_evaluation"])
 """
 

@@ -10,7 +10,7 @@ without a traceback and exits with `exit_code`.
     ├── Diverged             a recording differs from what its job gives
     ├── RunNotFound          no run, or more than one, answers to a name
     ├── StorageError         a file or folder cannot be written, or the disk is full
-    └── MissingExtra         a command needs an optional package
+    └── MissingExtra         an optional package is needed that is not installed
 """
 
 from __future__ import annotations
@@ -89,13 +89,7 @@ class StorageError(RunnerError):
 
 
 class MissingExtra(RunnerError):
-    """A command needs a package that is not installed; the message says which extra brings it."""
-
-    def __init__(self, package: str, extra: str, purpose: str) -> None:
-        super().__init__(
-            f"{purpose} needs {package}, which is not installed: pip install 'dualtaxi[{extra}]', "
-            f"or from a clone of the project: pip install -e '.[{extra}]'"
-        )
+    """A package is needed that is not installed; the message says how to install it."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -2,7 +2,7 @@
 
     import runner
 
-    run = runner.run("configs/quick.yaml")
+    run = runner.run("quick")
     runner.frames.evaluations(run).plot("episode", "finish_percent")
 
 A run is a `Run`, an open `Recording`, or the path of a recording. pandas comes with the extra `frames`;
@@ -19,7 +19,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from runner.errors import MissingExtra, RecordingError
+from runner.errors import RecordingError
+from runner.extras import require
 from runner.runs import Run
 
 if TYPE_CHECKING:
@@ -300,11 +301,8 @@ def _at_hand(run: Run) -> Run:
 
 def _frame(data: Any) -> pd.DataFrame:
     """Return a frame of columns by name, or of rows."""
-    try:
-        import pandas
-    except ImportError as error:
-        raise MissingExtra("pandas", "frames", "a frame") from error
-    return pandas.DataFrame(data)
+    frame: pd.DataFrame = require("pandas", extra="frames", purpose="a frame").DataFrame(data)
+    return frame
 
 
 def _flat(record: Mapping[str, Any], prefixes: Mapping[str, str]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
     import runner
     from runner.notebook import plot, rerun_view
 
-    run = runner.run("configs/quick.yaml")
+    run = runner.run("quick")
     run                       # summary, replay, plots and maps
     plot(run, other)          # the learning curves of both
     rerun_view(run)           # the Rerun viewer, where rerun-notebook is installed
@@ -20,6 +20,7 @@ from html import escape
 from typing import Any, Final
 
 from runner.errors import MissingExtra
+from runner.extras import require
 from runner.runs import Run
 
 HEIGHT: Final = 760
@@ -109,15 +110,12 @@ def rerun_view(
         MissingExtra: rerun-notebook is not installed.
         RecordingError: a recording cannot be read, or has not what is asked for.
     """
-    try:
-        from rerun_notebook import Viewer
-    except ImportError as error:
-        raise MissingExtra("rerun-notebook", "notebook", "the Rerun viewer in a notebook") from error
+    notebook = require("rerun_notebook", extra="notebook", purpose="the Rerun viewer in a notebook")
     from runner.export.rerun.cache import exported
     from runner.export.rerun.selection import Request
 
     path, _ = exported(runs, Request(episodes=tuple(episodes), evaluations=tuple(evaluations)))
-    viewer = Viewer(width=width, height=height)
+    viewer = notebook.Viewer(width=width, height=height)
     viewer.send_rrd(path.read_bytes())
     return viewer
 

@@ -39,7 +39,7 @@ def test_without_packages_or_recording_it_shows_its_facts(run, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "matplotlib", None)
         shown = run._repr_html_()
-    assert "dualtaxi[plots]" in shown
+    assert "[plots]" in shown
     assert run.run_id in shown
     assert "<iframe" not in shown
     gone = runner.Run(Path("/nowhere"), run.facts | {"name": "<b>"})
@@ -64,7 +64,7 @@ def test_the_rerun_viewer_gets_the_run(monkeypatch, tmp_path):
 
 def test_without_rerun_notebook_it_says_what_to_install(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun_notebook", None)
-    with pytest.raises(MissingExtra, match=r"dualtaxi\[notebook\]"):
+    with pytest.raises(MissingExtra, match=r"\[notebook\]"):
         rerun_view(run)
 
 

@@ -17,7 +17,8 @@ from typing import Final, Protocol
 from runner.archive import layout
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Manifest, read_manifest
 from runner.documents import sync
-from runner.errors import MissingExtra, RecordingError, RunnerError, StorageError
+from runner.errors import RecordingError, RunnerError, StorageError
+from runner.extras import require
 
 ASIDE: Final = ".partial"
 """The folder of archives that are being written; one level down, where `*/steps.parquet` does not reach."""
@@ -65,10 +66,9 @@ def target_of(text: str) -> Target:
         MissingExtra: what is needed to speak to it is not installed.
     """
     if text.startswith(S3):
-        try:
-            from runner.archive.s3 import S3Target
-        except ModuleNotFoundError as error:
-            raise MissingExtra("boto3", "archive", "keeping archives in object storage") from error
+        require("boto3", extra="archive", purpose="keeping archives in object storage")
+        from runner.archive.s3 import S3Target
+
         return S3Target(text)
     if "://" in text:
         raise RunnerError(f"{text}: found a URL, expected a folder or {S3}BUCKET/PREFIX.")

@@ -73,7 +73,8 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "token": ("runner.cli.commands.token", "Make, list and revoke the tokens that a service asks for."),
     },
     "Set up": {
-        "config": ("runner.cli.commands.config", "Check a configuration; print the schema of one."),
+        "init": ("runner.cli.commands.init", "Make a folder to start in, with the shipped experiments."),
+        "config": ("runner.cli.commands.config", "List, copy and check configurations; print their schema."),
         "completion": ("runner.cli.commands.completion", "Print the completion script of a shell."),
     },
 }
@@ -84,9 +85,10 @@ _DISK_FULL: Final = tuple(getattr(errno, name) for name in ("ENOSPC", "EDQUOT") 
 
 _EPILOG = """\b
 First steps:
-  dualtaxi run configs/quick.yaml     learn for a second, recording every step
-  dualtaxi show @latest               what came of it
-  dualtaxi play @latest               see it drive
+  dualtaxi run quick        learn for a second, recording every step
+  dualtaxi show @latest     evaluations, tables and configuration of that run
+  dualtaxi play @latest     watch an episode of it
+  dualtaxi init             copy the shipped experiments into this folder
 
 \b
 A RUN is named by its id, a prefix of it, its name, a path, or @latest

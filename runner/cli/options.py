@@ -7,13 +7,13 @@ from typing import Final
 
 import click
 
-from runner.cli.parameters import RunName, TrialName
+from runner.cli.parameters import ConfigName, RunName, TrialName
 
 run_argument: Final = click.argument("run_name", metavar="RUN", type=RunName())
 
 runs_argument: Final = click.argument("run_names", metavar="RUN...", nargs=-1, required=True, type=RunName())
 
-config_argument: Final = click.argument("config", metavar="CONFIG", type=click.Path(path_type=Path))
+config_argument: Final = click.argument("config", metavar="CONFIG", type=ConfigName())
 
 recordings_option: Final = click.option(
     "--recordings",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, ClassVar
 
 import click
@@ -39,6 +40,50 @@ class RunName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # gener
         return [
             CompletionItem(name, help=text) for name, text in found.items() if name.startswith(incomplete)
         ]
+
+
+class ShippedName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+    """The name of a shipped experiment or sweep."""
+
+    name = "name"
+
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        """Return the names that begin so."""
+        from runner.config.shipped import shipped
+
+        return [
+            CompletionItem(each.name, help=each.about)
+            for each in shipped().values()
+            if each.name.startswith(incomplete)
+        ]
+
+
+class ConfigName(click.Path):
+    """A file, or the name of a shipped experiment; completes both.
+
+    Args:
+        kind: which shipped ones are completed: `experiment` or `sweep`.
+    """
+
+    def __init__(self, kind: str = "experiment") -> None:
+        super().__init__(path_type=Path)
+        self.kind = kind
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Return the shipped names that begin so, and have the shell add files."""
+        from runner.config.shipped import shipped
+
+        kinds = {each.name: each.kind for each in shipped().values()}
+        names = ShippedName().shell_complete(ctx, param, incomplete)
+        own = [item for item in names if kinds[item.value] == self.kind]
+        return [*own, *super().shell_complete(ctx, param, incomplete)]
 
 
 class _Numbers(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only

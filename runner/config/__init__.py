@@ -1,6 +1,6 @@
 """Configuration: a YAML file, or Python values, to one frozen and validated `ExperimentConfig`.
 
-    config = load("configs/quick.yaml", ["episodes=50", "evaluation.trials=10"])
+    config = load("quick", ["episodes=50", "evaluation.trials=10"])
 
 Everything that can be wrong is told in one `ConfigError`, a line for each problem.
 """

@@ -27,7 +27,8 @@ from runner.config.model import (
 )
 from runner.config.overrides import override
 from runner.config.problems import found, problems_in, refuse
-from runner.errors import ConfigError, nearest
+from runner.config.shipped import config_path, suggestion
+from runner.errors import ConfigError
 
 MAX_BYTES = 1 << 20
 """The largest file that is read; a configuration of a thousand lines is a twentieth of it."""
@@ -37,7 +38,8 @@ def load(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Experim
     """Return the experiment that a YAML file describes.
 
     Args:
-        path: The file; its name without the ending names the experiment, unless it says another.
+        path: The file, or the name of a shipped experiment such as `quick`; the file's name without the
+            ending names the experiment, unless it says another.
         overrides: `KEY=VALUE` each, as given to `--set`: the value is YAML, the key a path such as
             `evaluation.trials`. Later ones win.
 
@@ -45,7 +47,8 @@ def load(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> Experim
         ConfigError: The file cannot be read, or does not describe an experiment. The message has a
             line for each problem, with file, line, column and key.
     """
-    return from_text(read_text(FilePath(path)), os.fspath(path), overrides)
+    file = config_path(path)
+    return from_text(read_text(file), os.fspath(file), overrides)
 
 
 def from_text(text: str, source: str, overrides: Sequence[str] = ()) -> ExperimentConfig:
@@ -97,7 +100,7 @@ def read_text(file: FilePath) -> str:
         with file.open("rb") as stream:
             content = stream.read(MAX_BYTES + 1)
     except FileNotFoundError:
-        raise ConfigError(f"{file}: no such file.{_similar(file)}") from None
+        raise ConfigError(f"{file}: no such file.{suggestion(file)}") from None
     except IsADirectoryError:
         raise ConfigError(f"{file}: found a directory, expected a YAML file") from None
     except (OSError, ValueError) as error:
@@ -110,13 +113,6 @@ def read_text(file: FilePath) -> str:
         before, byte = content[: error.start], content[error.start]
         place = Place(str(file), before.count(b"\n") + 1, error.start - before.rfind(b"\n"))
         raise ConfigError(f"{place}: found the byte 0x{byte:02x}, expected text in UTF-8") from None
-
-
-def _similar(file: FilePath) -> str:
-    try:
-        return nearest(file.name, [beside.name for beside in file.parent.glob("*.y*ml")])
-    except OSError:
-        return ""
 
 
 def experiment_in(

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from runner.errors import MissingExtra, RecordingError
+from runner.errors import RecordingError
 from runner.export import svg
 from runner.export.plots_figure import matplotlib_of
 from runner.export.report_replay import Episode, deeds_in_words
+from runner.extras import require
 from runner.frames import agents_of
 from runner.mdp import Mdp
 from runner.recording.reader import Recording
@@ -76,12 +77,7 @@ def require_packages() -> None:
     Raises:
         MissingExtra: it is.
     """
-    for package in ("resvg_py", "PIL"):
-        try:
-            __import__(package)
-        except ImportError as error:
-            named = {"resvg_py": "resvg-py", "PIL": "pillow"}[package]
-            raise MissingExtra(named, "plots", "a film") from error
+    require("resvg_py", "PIL", extra="plots", purpose="a film")
     matplotlib_of("a film")
 
 

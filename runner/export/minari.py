@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import MissingExtra, RecordingError
+from runner.errors import RecordingError
 from runner.export.contents import whole_ranges
 from runner.export.minari_loops import Episode, loop_episodes, space_of
+from runner.extras import require
 from runner.recording import schema
 from runner.recording.reader import Recording
 
@@ -43,11 +44,7 @@ def require_packages() -> None:
     Raises:
         MissingExtra: it is not.
     """
-    try:
-        import h5py  # noqa: F401
-        import minari  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("Minari", "minari", "export minari") from error
+    require("h5py", "minari", extra="minari", purpose="export minari")
 
 
 def dataset_id(recording: Recording) -> str:

@@ -15,9 +15,10 @@ from itertools import count, islice
 from pathlib import Path
 from typing import Any, Final
 
-from runner.errors import MissingExtra, RunnerError
+from runner.errors import RunnerError
 from runner.export.contents import flat_text
 from runner.export.scalars import created, measures, seconds_of
+from runner.extras import require
 from runner.recording.reader import Recording
 
 RUN_TAG: Final = "dualtaxi.run_id"
@@ -50,12 +51,8 @@ def require_packages() -> None:
         MissingExtra: it is not.
     """
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    try:
-        with _quiet():
-            import mlflow  # noqa: F401
-            import sqlalchemy  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("mlflow-skinny", "mlflow", "export mlflow") from error
+    with _quiet():
+        require("mlflow", "sqlalchemy", extra="mlflow", purpose="export mlflow")
 
 
 def export(

@@ -10,7 +10,8 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from runner.errors import MissingExtra, RunnerError, StorageError
+from runner.errors import RunnerError, StorageError
+from runner.extras import require
 
 
 def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
@@ -103,7 +104,4 @@ def require_pyarrow(purpose: str) -> None:
     Raises:
         MissingExtra: it is not.
     """
-    try:
-        import pyarrow  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("pyarrow", "archive", purpose) from error
+    require("pyarrow", extra="archive", purpose=purpose)

@@ -20,8 +20,9 @@ import numpy as np
 
 from runner.analysis.groups import Group
 from runner.analysis.series import SHARES, is_loop, values_left_out
-from runner.errors import MissingExtra, RunnerError
+from runner.errors import RunnerError
 from runner.export.plots import Curve, Panel
+from runner.extras import require
 from runner.words import spoken
 
 if TYPE_CHECKING:
@@ -73,14 +74,8 @@ def matplotlib_of(purpose: str) -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
-    try:
-        import matplotlib as mpl
-        import matplotlib.figure
-        import matplotlib.layout_engine
-        import matplotlib.ticker
-    except ImportError as error:
-        raise MissingExtra("matplotlib", "plots", purpose) from error
-    return mpl
+    modules = ("matplotlib", "matplotlib.figure", "matplotlib.layout_engine", "matplotlib.ticker")
+    return require(*modules, extra="plots", purpose=purpose)
 
 
 def check_suffix(path: Path) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from runner.analysis.groups import Group, groups_of
 from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries, values_left_out
-from runner.errors import MissingExtra, RecordingError, RunnerError
+from runner.errors import RecordingError, RunnerError
 from runner.export import svg, svg_maps
 from runner.export.contents import flat_text, has_steps, shortcomings, why_no_steps
 from runner.export.plots import panels_of
@@ -30,6 +30,7 @@ from runner.export.report_replay import (
     training_episode,
     trial,
 )
+from runner.extras import require
 from runner.frames import agents_of, evaluation_records
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
@@ -294,10 +295,9 @@ def templates() -> Environment:
     Raises:
         MissingExtra: Jinja2 is not installed.
     """
-    try:
-        import jinja2
-    except ImportError as error:
-        raise MissingExtra("jinja2", "plots", "a report") from error
+    require("jinja2", extra="plots", purpose="a report")
+    import jinja2
+
     environment = jinja2.Environment(
         loader=jinja2.FunctionLoader(lambda name: (TEMPLATES / name).read_text("utf-8")),
         autoescape=True,

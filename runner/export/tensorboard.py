@@ -9,8 +9,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from runner.errors import MissingExtra
 from runner.export.scalars import created, measures, seconds_of
+from runner.extras import require
 from runner.frames import agents_of
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS, TRAIN_EPISODE
@@ -24,10 +24,7 @@ def require_packages() -> None:
     Raises:
         MissingExtra: it is not.
     """
-    try:
-        import tensorboardX  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("tensorboardX", "tensorboard", "export tensorboard") from error
+    require("tensorboardX", extra="tensorboard", purpose="export tensorboard")
 
 
 def write_events(recording: Recording, folder: Path) -> int:

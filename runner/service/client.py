@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 from urllib.parse import urlsplit
 
-from runner.errors import MissingExtra, RunnerError
+from runner.errors import RunnerError
+from runner.extras import require
 from runner.hashing import hash_of
 from runner.runs import Run
 from runner.service import watching
@@ -66,10 +67,9 @@ class Client:
     ) -> None:
         self.url = checked_url(url)
         self._patience, self._tell = patience, tell
-        try:
-            import httpx2
-        except ImportError as error:
-            raise MissingExtra("httpx2", "service", "speaking to a server") from error
+        require("httpx2", extra="service", purpose="speaking to a server")
+        import httpx2
+
         parts = urlsplit(self.url)
         origin = f"{parts.scheme}://{parts.netloc}"
         self._errors = httpx2.TransportError

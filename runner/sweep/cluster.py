@@ -12,7 +12,8 @@ import threading
 from dataclasses import replace
 from typing import Any, Final, Self
 
-from runner.errors import MissingExtra, RunnerError
+from runner.errors import RunnerError
+from runner.extras import require
 from runner.sweep.task import Result, Task, do
 
 _GOODBYE_SECONDS: Final = 30.0
@@ -25,11 +26,7 @@ def require_ray() -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
-    try:
-        import ray
-    except ImportError as error:
-        raise MissingExtra("ray", "ray", "a sweep on Ray") from error
-    return ray
+    return require("ray", extra="ray", purpose="a sweep on Ray")
 
 
 def connect(address: str | None, processors: int | None = None) -> Any:

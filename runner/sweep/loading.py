@@ -18,6 +18,7 @@ from runner.config.model import OWN_SECTIONS
 from runner.config.overrides import put
 from runner.config.problems import found, problems_in, refuse
 from runner.config.schema import Schema, without_references
+from runner.config.shipped import config_path
 from runner.errors import EnvironmentNotUsable, Located
 from runner.sweep.model import Range, Sweep, SweepFile
 
@@ -32,14 +33,15 @@ def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
     """Return the sweep that a YAML file describes.
 
     Args:
-        path: the file; its name without the ending names the sweep, unless it says another.
+        path: the file, or the name of a shipped sweep such as `modes`; the file's name without the ending
+            names the sweep, unless it says another.
         name: what the sweep is called instead.
 
     Raises:
         ConfigError: the file cannot be read, or does not describe a sweep. The message has a line for each
             problem, with file, line, column and key.
     """
-    file = Path(path)
+    file = config_path(path)
     document = read_yaml(read_text(file), str(file))
     return _sweep(document, name, file.stem, file.parent)
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from runner.errors import MissingExtra
+from runner.extras import require
 from runner.sweep.model import Objective, Range, SweepFile
 
 
@@ -24,10 +24,7 @@ def require_optuna() -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
-    try:
-        import optuna
-    except ImportError as error:
-        raise MissingExtra("optuna", "sweep", "a sweep") from error
+    optuna = require("optuna", extra="sweep", purpose="a sweep")
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     return optuna
 
@@ -87,10 +84,7 @@ class Search:
         Raises:
             MissingExtra: scikit-learn is not installed.
         """
-        try:
-            import sklearn  # noqa: F401 - Optuna's evaluator needs it
-        except ImportError as error:
-            raise MissingExtra("scikit-learn", "sweep", "what mattered in a sweep") from error
+        require("sklearn", extra="sweep", purpose="what mattered in a sweep")  # Optuna's evaluator needs it
         from optuna.importance import FanovaImportanceEvaluator, get_param_importances
         from optuna.trial import TrialState
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import MissingExtra
+from runner.extras import require
 
 JPEG_QUALITY = 90
 
@@ -27,8 +27,4 @@ def pillow() -> Any:
     Raises:
         MissingExtra: Pillow is not installed.
     """
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise MissingExtra("pillow", "plots", "recording frames") from error
-    return Image
+    return require("PIL.Image", extra="plots", purpose="recording frames")

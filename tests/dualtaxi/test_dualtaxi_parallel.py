@@ -105,4 +105,4 @@ def test_the_environment_needs_none_of_the_optional_packages():
 def test_without_pettingzoo_the_error_says_how_to_get_it():
     done = run("import sys; sys.modules['pettingzoo'] = None\nimport dualtaxi.parallel")
     assert done.returncode == 1
-    assert "pip install 'dualtaxi[pettingzoo]'" in done.stderr
+    assert "pip install 'pettingzoo>=1.25'" in done.stderr

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import MissingExtra
+from runner.extras import require
 
 Values = NDArray[np.float64]
 
@@ -47,11 +47,7 @@ def require_scipy() -> Any:
     Raises:
         MissingExtra: it is not installed.
     """
-    try:
-        import scipy.stats
-    except ImportError as error:
-        raise MissingExtra("scipy", "stats", "a comparison") from error
-    return scipy.stats
+    return require("scipy.stats", extra="stats", purpose="a comparison")
 
 
 def median(values: Values) -> float:

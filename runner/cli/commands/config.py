@@ -1,4 +1,4 @@
-"""`dualtaxi config`: check a configuration, print the schema."""
+"""`dualtaxi config`: list, copy and check configurations, print the schema."""
 
 from __future__ import annotations
 
@@ -7,18 +7,76 @@ from pathlib import Path
 import click
 
 from runner.cli.options import config_argument, json_option, set_option
-from runner.cli.output import print_json
+from runner.cli.output import draw, print_json, say, table
+from runner.cli.parameters import ShippedName
 
 
 @click.group("config")
 def command() -> None:
-    """Check a configuration; print the schema of one.
+    """List, copy and check configurations; print their schema.
 
     \b
     Examples:
-      dualtaxi config check configs/quick.yaml
+      dualtaxi config ls
+      dualtaxi config copy quick -o mine.yaml
+      dualtaxi config check mine.yaml
       dualtaxi config schema > schema.json
     """  # noqa: D301 - Click wants the backspace itself
+
+
+@command.command("ls")
+@json_option
+def ls(as_json: bool) -> None:
+    """List the shipped experiments, which `run` takes by name, and sweeps, which `sweep` does.
+
+    \b
+    Example:
+      dualtaxi config ls
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.config.shipped import shipped
+
+    if as_json:
+        print_json(
+            [
+                {"name": each.name, "kind": each.kind, "about": each.about, "path": str(each.path)}
+                for each in shipped().values()
+            ]
+        )
+        return
+    made = table("name", "kind", "about", left=("name", "kind", "about"), shrinking=("about",))
+    for each in shipped().values():
+        made.add_row(each.name, each.kind, each.about)
+    draw(made)
+
+
+@command.command("copy")
+@click.argument("name", metavar="NAME", type=ShippedName())
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="The file to write.  [default: NAME.yaml]",
+)
+@json_option
+def copy(name: str, output: Path | None, as_json: bool) -> None:
+    """Copy the shipped experiment NAME into a file of your own, to change it.
+
+    \b
+    Examples:
+      dualtaxi config copy quick
+      dualtaxi config copy hyperparameters -o search.yaml
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.config.shipped import copy_shipped, find_shipped
+
+    experiment = find_shipped(name)
+    target = output or Path(f"{name}.yaml")
+    copy_shipped(experiment, target)
+    if as_json:
+        print_json({"name": name, "path": str(target.absolute())})
+    else:
+        click.echo(target)
+        say(f"Next: {experiment.command.rpartition(' ')[0]} {target}")
 
 
 @command.command("check")
@@ -26,7 +84,7 @@ def command() -> None:
 @set_option
 @json_option
 def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
-    """Check the file CONFIG and print what it means, with every value spelled out.
+    """Check CONFIG, a file or a shipped experiment, and print it with every value spelled out.
 
     What is printed is a configuration again. Problems are told with file, line, column and key, all at
     once; the exit code is then 2. Whether there is such an environment is not looked up: `dualtaxi run`
@@ -34,8 +92,8 @@ def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
 
     \b
     Examples:
-      dualtaxi config check configs/quick.yaml
-      dualtaxi config check configs/quick.yaml --set episodes=50 --json
+      dualtaxi config check quick
+      dualtaxi config check mine.yaml --set episodes=50 --json
     """  # noqa: D301 - Click wants the backspace itself
     from runner.config import load
 

@@ -25,7 +25,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
 
     \b
     Example:
-      dualtaxi run configs/quick.yaml --set recording.steps=none
+      dualtaxi run quick --set recording.steps=none
       dualtaxi rerecord @latest
     """  # noqa: D301 - Click wants the backspace itself
     from runner.again import holds_steps, rerecord

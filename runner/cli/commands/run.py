@@ -72,7 +72,7 @@ def command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    """Train, evaluate and record the experiment in the file CONFIG.
+    """Train, evaluate and record the experiment CONFIG: a file, or a shipped one (`dualtaxi config ls`).
 
     Every step goes into a recording of its own folder. Several seeds make one run each, one after the
     other, or --at-once; what a run records is the same. Ctrl-C ends a run properly: what it recorded is
@@ -87,11 +87,12 @@ def command(
 
     \b
     Examples:
-      dualtaxi run configs/quick.yaml
-      dualtaxi run configs/cooperative.yaml --seed 7 --set discount=0.9 --name patient
-      dualtaxi run configs/quick.yaml --set 'seeds={count: 3}' --json
-      dualtaxi run configs/quick.yaml --set 'seeds={count: 100}' --set recording.steps=none --at-once 2
-      dualtaxi run configs/cooperative.yaml --live --live-every 100
+      dualtaxi run quick
+      dualtaxi run mine.yaml
+      dualtaxi run cooperative --seed 7 --set discount=0.9 --name patient
+      dualtaxi run quick --set 'seeds={count: 3}' --json
+      dualtaxi run quick --set 'seeds={count: 100}' --set recording.steps=none --at-once 2
+      dualtaxi run cooperative --live --live-every 100
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import checked_name, experiment_of, jobs_in
     from runner.runs import recordings_folder

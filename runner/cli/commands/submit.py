@@ -10,13 +10,14 @@ import click
 
 from runner.cli.options import json_option, required, server_option, token_file_option, token_option
 from runner.cli.output import draw, facts, print_json, say
+from runner.cli.parameters import ConfigName
 
 if TYPE_CHECKING:
     from runner.service.watching import Happened, JobThere
 
 
 @click.command("submit")
-@click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
+@click.argument("file", metavar="FILE", type=ConfigName())
 @server_option
 @token_option
 @token_file_option
@@ -41,13 +42,15 @@ def command(
 
     \b
     Examples:
-      dualtaxi submit configs/quick.yaml --server http://localhost:8000
-      dualtaxi submit configs/sweeps/hyperparameters.yaml --server http://localhost:8000 --watch
+      dualtaxi submit quick --server http://localhost:8000
+      dualtaxi submit hyperparameters --server http://localhost:8000 --watch
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.config.shipped import config_path
     from runner.service.address import found_token
     from runner.service.client import Client
 
     with Client(required(server), found_token(token, token_file), tell=say) as client:
+        file = config_path(file)
         job = client.submit(text_of(file), file.name)
         runs = "1 run" if job.runs == 1 else f"{job.runs:,} runs"
         say(f"Job {job.number}: {job.name}, {runs}; {client.url}/queue/{job.number}")

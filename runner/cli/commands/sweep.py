@@ -16,6 +16,7 @@ import click
 from runner.cli import INTERRUPTED
 from runner.cli.options import json_option, recordings_option
 from runner.cli.output import amount, draw, facts, print_json, say, size
+from runner.cli.parameters import ConfigName
 
 if TYPE_CHECKING:
     from runner.sweep.local import Workers
@@ -32,11 +33,20 @@ class _StartsUnlessTold(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command that is meant; a word that is no file is told as one that is misspelt."""
+        """Find the command that is meant; a word that is neither a file nor a shipped sweep is misspelt."""
+        from runner.config.shipped import shipped
+        from runner.errors import nearest
+
         word = args[0]
-        misspelt = not word.startswith("-") and not Path(word).suffix and not Path(word).exists()
-        if word in self.commands or misspelt:
+        sweeps = [each.name for each in shipped().values() if each.kind == "sweep"]
+        if word in self.commands:
             return super().resolve_command(ctx, args)
+        is_path = word.startswith("-") or Path(word).suffix or Path(word).exists()
+        if not is_path and word not in sweeps and not ctx.resilient_parsing:
+            ctx.fail(
+                f"{word!r} is neither a file, a shipped sweep, nor one of {', '.join(self.commands)}."
+                f"{nearest(word, [*self.commands, *sweeps])}"
+            )
         return START, self.commands[START], args
 
 
@@ -48,14 +58,14 @@ def command() -> None:
 
     \b
     Examples:
-      dualtaxi sweep start configs/sweeps/hyperparameters.yaml --dry-run
-      dualtaxi sweep start configs/sweeps/hyperparameters.yaml --workers 2
+      dualtaxi sweep start hyperparameters --dry-run
+      dualtaxi sweep start hyperparameters --workers 2
       dualtaxi sweep show hyperparameters
     """  # noqa: D301 - Click wants the backspace itself
 
 
 @command.command(START)
-@click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
+@click.argument("file", metavar="FILE", type=ConfigName("sweep"))
 @click.option(
     "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes.  [default: one a processor]"
 )
@@ -88,7 +98,9 @@ def start(
     as_json: bool,
     recordings: Path | None,
 ) -> None:
-    """Run the sweep in FILE: many runs of one experiment with other values.
+    """Run the sweep FILE: many runs of one experiment with other values.
+
+    FILE may also be the name of a shipped sweep, which `dualtaxi config ls` lists.
 
     Each trial is an ordinary run a seed, tagged sweep=NAME, in the recordings folder. A sweep that was
     killed or interrupted is gone on with by --resume: finished runs are not repeated, unfinished ones are
@@ -99,9 +111,9 @@ def start(
 
     \b
     Examples:
-      dualtaxi sweep start configs/sweeps/hyperparameters.yaml --dry-run
-      dualtaxi sweep start configs/sweeps/hyperparameters.yaml --workers 2
-      dualtaxi sweep start configs/sweeps/hyperparameters.yaml --resume
+      dualtaxi sweep start hyperparameters --dry-run
+      dualtaxi sweep start hyperparameters --workers 2
+      dualtaxi sweep start hyperparameters --resume
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import checked_name, interruptible
     from runner.runs import recordings_folder

@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.errors import MissingExtra, RunnerError
+from runner.errors import RunnerError
+from runner.extras import missing
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
@@ -44,7 +45,7 @@ def require_rerun(purpose: str) -> None:
         MissingExtra: it is not.
     """
     if importlib.util.find_spec("rerun") is None:
-        raise MissingExtra("rerun-sdk", "all", purpose)
+        raise missing("rerun", "all", purpose)
 
 
 def viewer_program() -> Path:

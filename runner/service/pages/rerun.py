@@ -95,12 +95,12 @@ def version() -> str:
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import version as installed
 
-    from runner.errors import MissingExtra
+    from runner.extras import missing
 
     try:
         return installed("rerun-sdk")
     except PackageNotFoundError as error:
-        raise MissingExtra("rerun-sdk", "all", "the Rerun viewer") from error
+        raise missing("rerun", "all", "the Rerun viewer") from error
 
 
 def viewer_files() -> Path:

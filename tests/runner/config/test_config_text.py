@@ -51,9 +51,9 @@ def test_a_file_that_is_not_there(tmp_path):
     (tmp_path / "quick.yaml").write_text("episodes: 1")
     with pytest.raises(ConfigError, match=r"quik\.yaml: no such file\. Did you mean 'quick\.yaml'\?"):
         load(tmp_path / "quik.yaml")
-    with pytest.raises(ConfigError, match=r"no such file\.$"):
+    with pytest.raises(ConfigError, match=r"no such file\. `dualtaxi config ls`"):
         load(tmp_path / "nowhere" / "x.yaml")
-    with pytest.raises(ConfigError, match=r"no such file\.$"):
+    with pytest.raises(ConfigError, match=r"no such file\. `dualtaxi config ls`"):
         load(tmp_path / "other")
     with pytest.raises(ConfigError, match="found a directory, expected a YAML file"):
         load(tmp_path)

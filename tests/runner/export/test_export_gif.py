@@ -123,5 +123,5 @@ def test_a_missing_package_is_named(pictured, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "resvg_py", None)
     result = gif(pictured("lake").recording, "-o", tmp_path / "film.gif")
     assert "resvg-py" in result.stderr
-    assert "pip install 'dualtaxi[plots]'" in result.stderr
-    assert "pip install -e '.[plots]'" in result.stderr
+    assert "pip install" in result.stderr
+    assert "[plots]" in result.stderr

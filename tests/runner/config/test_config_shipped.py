@@ -1,0 +1,82 @@
+"""Shipped experiments are found by name, wherever one is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+import runner
+from runner.cli import cli
+from runner.config import ConfigError, load
+from runner.config.shipped import SCHEMA_FILE, config_path, shipped, shipped_folder
+from runner.sweep.loading import load_sweep
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """An empty folder to type in."""
+    monkeypatch.chdir(tmp_path)
+
+
+def type_in(*words, code=0):
+    done = CliRunner().invoke(cli, words)
+    assert done.exit_code == code, done.output
+    return done
+
+
+def test_a_shipped_experiment_is_loaded_by_its_name():
+    assert load("quick").name == "quick"
+    assert load_sweep("modes").name == "modes"
+    run = runner.run("quick", overrides=["episodes=2", "evaluation=null"], recordings="recordings")
+    assert run.name == "quick"
+
+
+def test_a_file_of_that_name_comes_first(tmp_path):
+    Path("quick").write_text("episodes: 7\n")
+    assert load("quick").episodes == 7
+    assert config_path("configs/quick") == Path("configs/quick")
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("quik", "Did you mean 'quick'?"),
+        ("configs/quick.yaml", "`dualtaxi run quick`"),
+        ("sweeps/modes.yaml", "`dualtaxi sweep modes`"),
+        ("nothing", "`dualtaxi config ls`"),
+    ],
+)
+def test_a_name_that_is_none_is_answered_with_the_nearest(name, said):
+    with pytest.raises(ConfigError, match=r"no such file") as raised:
+        load(name)
+    assert said in str(raised.value)
+
+
+def test_every_shipped_experiment_is_listed_with_what_it_is_about():
+    names = {file.stem for file in shipped_folder().glob("**/*.yaml")}
+    assert set(shipped()) == names
+    text = type_in("config", "ls").stdout
+    for each in shipped().values():
+        assert each.about
+        assert each.name in text
+
+
+def test_a_copy_is_the_experiment_and_replaces_nothing():
+    type_in("config", "copy", "quick", "-o", "mine.yaml")
+    assert load("mine.yaml").episodes == load("quick").episodes
+    assert SCHEMA_FILE not in Path("mine.yaml").read_text()
+    assert "exists already" in type_in("config", "copy", "quick", "-o", "mine.yaml", code=2).stderr
+    assert "Did you mean 'quick'" in type_in("config", "copy", "quik", code=2).stderr
+
+
+def test_a_folder_to_start_in_is_made_and_nothing_in_it_replaced(tmp_path):
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs" / "quick.yaml").write_text("episodes: 7\n")
+    type_in("init")
+    assert (tmp_path / "configs" / "quick.yaml").read_text() == "episodes: 7\n"
+    assert (tmp_path / "recordings").is_dir()
+    assert "dualtaxi run" in (tmp_path / "README.md").read_text()
+    assert (tmp_path / "configs" / "schema.json").is_file()
+    assert "left as they are" in type_in("init").stderr
