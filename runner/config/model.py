@@ -145,13 +145,6 @@ class ExperimentConfig(Settings):
         if (self.tables, self.rewards) == ("joint", "individual"):
             message = "found 'individual', expected 'team': one joint table cannot learn from two rewards"
             raise refusal(("rewards",), message)
-        draws = self.algorithm in ("random", "wolf_phc")
-        if draws and self.evaluation is not None and self.evaluation.exact:
-            message = (
-                f"found true, but the algorithm is {self.algorithm}, which draws: only a greedy policy is "
-                "measured exactly"
-            )
-            raise refusal(("evaluation", "exact"), message)
         if self.quirks.second_table_uses_first_action and self.tables == "joint":
             message = "needs tables: per_agent (or mode: competitive), found tables: joint"
             raise refusal(("quirks", "second_table_uses_first_action"), message)

@@ -128,9 +128,10 @@ class Evaluation(Section):
     )
     exact: bool = Field(
         default=False,
-        description="Whether the greedy policy is measured exactly besides, over all start states and "
-        "against the optimum, from the environment's transition table. Needs a discount below 1 for "
-        "discounted values; with 1 these are not a number.",
+        description="Whether the evaluated policy is also measured exactly, over all start states and "
+        "against the optimum, from the environment's transition table: the greedy policy, or with wolf_phc "
+        "and random the policy that actions are drawn from. Discounted values need a discount below 1; with "
+        "1 they are not a number.",
     )
 
 

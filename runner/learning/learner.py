@@ -115,8 +115,17 @@ class Learner:
         self._policy[:] = (self.tables.greedy.T * np.array(self.model.stride)).sum(axis=1)
 
     @property
-    def policy(self) -> NDArray[np.int32]:
-        """The joint action of each state, [S], in the evaluation that was begun; -1 for a random one."""
+    def policy(self) -> NDArray[np.int32] | list[NDArray[np.float64]]:
+        """The policy of the evaluation that was begun.
+
+        The joint action of each state, [S]; of an algorithm that draws its actions one array a learner,
+        [S, width]: the probability of each of its own actions.
+        """
+        if not self.rules.learns:
+            return [np.full((self.mdp.states, width), 1 / width) for width in self.model.width]
+        if len(self.rules.algorithm) == algorithms.WOLF_PHC:
+            policies = [self.held(i)["policy"] for i in range(len(self.agents))]
+            return [policy / policy.sum(axis=1, keepdims=True) for policy in policies]
         return self._policy
 
     def evaluate(

@@ -5,8 +5,19 @@ outcome = evaluate_policy(mdp, policy, learners, 0.9)   what a policy gets, from
 best_response(mdp, policy, learner, learners, 0.9)      the most that one agent gets while the others stay
 """
 
-from runner.planning.evaluation import Cycle, Outcome, evaluate_policy
-from runner.planning.optimum import best_response, greedy_policy, optimal_values
+from runner.planning.evaluation import (
+    Cycle,
+    Outcome,
+    evaluate_policy,
+    evaluate_stochastic_policy,
+    random_policy,
+)
+from runner.planning.optimum import (
+    best_response,
+    best_response_to_stochastic,
+    greedy_policy,
+    optimal_values,
+)
 from runner.planning.yardstick import Yardstick
 
 __all__ = [
@@ -14,7 +25,10 @@ __all__ = [
     "Outcome",
     "Yardstick",
     "best_response",
+    "best_response_to_stochastic",
     "evaluate_policy",
+    "evaluate_stochastic_policy",
     "greedy_policy",
     "optimal_values",
+    "random_policy",
 ]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,10 +63,7 @@ def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount
     Raises:
         EnvironmentNotUsable: it has no step limit.
     """
-    if not mdp.step_limit:
-        raise EnvironmentNotUsable(
-            f"{mdp.env_id}: found no step limit, expected one: without it some episodes never end."
-        )
+    _require_step_limit(mdp)
     rows = np.arange(mdp.states)
     chosen = _Chosen(
         mdp.next_state[rows, policy],
@@ -74,6 +73,53 @@ def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount
         (mdp.events[rows, policy] & mdp.success_mask) != 0,
         mdp.summed_rewards[rows, policy] < mdp.penalty_below,
     )
+    return _measured(mdp, chosen, discount)
+
+
+def evaluate_stochastic_policy(
+    mdp: Mdp, policies: Sequence[NDArray[np.float64]], learners: int, discount: float
+) -> Outcome:
+    """Return what learners that draw their actions get, exactly: in expectation over all draws.
+
+    Args:
+        mdp: the environment.
+        policies: one a learner, [S, n]: the probability of each of its own n actions. Learners draw
+            independently of each other.
+        learners: 1, whose actions are the joint ones, or the number of agents.
+        discount: of the values; 1 for none.
+
+    Raises:
+        EnvironmentNotUsable: it has no step limit.
+    """
+    _require_step_limit(mdp)
+    joint = joint_probabilities(policies)
+    if ((joint > 0).sum(axis=1) == 1).all():
+        return evaluate_policy(mdp, joint.argmax(axis=1).astype(np.int32), learners, discount)
+    chosen = _merged(mdp, joint[..., None] * mdp.probability, learners)
+    return _measured(mdp, chosen, discount)
+
+
+def random_policy(mdp: Mdp) -> list[NDArray[np.float64]]:
+    """Return the policy that takes every joint action with the same probability, for one learner."""
+    return [np.full((mdp.states, mdp.joint_actions), 1 / mdp.joint_actions)]
+
+
+def joint_probabilities(policies: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Return the probability [S, J] of each joint action, the first learner's the most significant."""
+    return functools.reduce(
+        lambda joint, own: (joint[:, :, None] * own[:, None, :]).reshape(len(own), -1), policies
+    )
+
+
+def _require_step_limit(mdp: Mdp) -> None:
+    if not mdp.step_limit:
+        raise EnvironmentNotUsable(
+            f"{mdp.env_id}: found no step limit, expected one: without it some episodes never end."
+        )
+
+
+def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
+    """Return what the outcomes of chosen actions come to."""
     starts = np.flatnonzero(mdp.start > 0)
     weights = mdp.start[starts]
     if ((chosen.probability > 0).sum(axis=1) == 1).all():
@@ -91,7 +137,42 @@ class _Chosen:
     """[S, K, L]."""
     terminated: NDArray[np.bool_]
     success: NDArray[np.bool_]
-    penalty: NDArray[np.bool_]
+    penalty: NDArray[np.bool_] | NDArray[np.float64]
+    """Whether a step is a penalty; of merged outcomes the probability of it."""
+
+
+def _merged(mdp: Mdp, probability: NDArray[np.float64], learners: int) -> _Chosen:
+    """Return the outcomes of each state under a policy that draws, [S, J, K] as [S, K'].
+
+    Outcomes that go on alike are one, with the mean of their rewards: of 36 joint actions of two taxis many
+    lead to the same state, and the chances are followed outcome by outcome for every step of an episode.
+    """
+    state, action, outcome = np.nonzero(probability)
+    at = state, action, outcome
+    chance = probability[at]
+    success = (mdp.events[at] & mdp.success_mask) != 0
+    key = ((state * mdp.states + mdp.next_state[at]) * 2 + mdp.terminated[at]) * 2 + success
+    _, first, group = np.unique(key, return_index=True, return_inverse=True)
+    row = state[first]
+    column = np.arange(len(first)) - np.searchsorted(row, row)
+    shape = mdp.states, int(column.max()) + 1
+
+    def padded(values: NDArray[Any]) -> NDArray[Any]:
+        table = np.zeros((*shape, *values.shape[1:]), values.dtype)
+        table[row, column] = values
+        return table
+
+    total = np.bincount(group, chance)
+    rewards = mdp.rewards_of(learners)[at]
+    penalty = mdp.summed_rewards[at] < mdp.penalty_below
+    return _Chosen(
+        padded(mdp.next_state[at][first]),
+        padded(total),
+        padded(np.stack([np.bincount(group, chance * own) / total for own in rewards.T], axis=1)),
+        padded(mdp.terminated[at][first]),
+        padded(success[first]),
+        padded(np.bincount(group, chance * penalty) / total),
+    )
 
 
 def _deterministic(

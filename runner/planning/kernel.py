@@ -205,16 +205,17 @@ def expect(
     sums = np.zeros(gains.shape)
     for _ in range(limit):
         chances_before, sums_before = chances.copy(), sums.copy()
+        chances[:] = 0.0
+        sums[:] = gains
         for state in range(states):
-            chances[state] = 0.0
-            sums[state] = gains[state]
             for k in range(outcomes):
                 p, after = probability[state, k], next_state[state, k]
                 goes_on = not terminated[state, k]
                 chances[state, 0] += p * (1.0 if success[state, k] else goes_on * chances_before[after, 0])
                 chances[state, 1] += p * (goes_on * chances_before[after, 1] + (1.0 - goes_on))
                 if goes_on:
-                    sums[state] += p * sums_before[after]
+                    for i in range(gains.shape[1]):  # a loop: an array expression would allocate each time
+                        sums[state, i] += p * sums_before[after, i]
     return chances, sums
 
 

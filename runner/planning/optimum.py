@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,39 @@ def best_response(
     reward = (mdp.probability * mdp.rewards_of(learners)[..., learner]).sum(axis=-1)
     weight = _weight(mdp, discount)[rows, joint]
     return _iterated(mdp.next_state[rows, joint], weight, reward[rows, joint], discount)
+
+
+def best_response_to_stochastic(
+    mdp: Mdp, policies: Sequence[NDArray[np.float64]], learner: int, discount: float
+) -> NDArray[np.float64]:
+    """Return what one learner can get at most from each state while all others draw from their policies, [S].
+
+    Args:
+        mdp: the environment.
+        policies: one a learner, [S, n]: the probability of each of its own actions; a single one is over
+            joint actions, and its best response is the optimum.
+        learner: whose own action is free, and whose reward counts.
+        discount: below 1.
+
+    Raises:
+        EnvironmentNotUsable: the discount is not below 1.
+    """
+    widths = tuple(policy.shape[1] for policy in policies)
+    states, outcomes = mdp.states, mdp.probability.shape[2]
+
+    def by_own_action(array: NDArray[Any]) -> NDArray[Any]:
+        """Return [S, J, K] as [S, own action, others' joint actions and outcomes]."""
+        parts = np.moveaxis(array.reshape(states, *widths, outcomes), 1 + learner, 1)
+        return parts.reshape(states, widths[learner], -1)
+
+    others: NDArray[np.float64] = np.ones((states, 1))
+    for number, policy in enumerate(policies):
+        if number != learner:
+            others = (others[:, :, None] * policy[:, None, :]).reshape(states, -1)
+    chance = np.repeat(others, outcomes, axis=1)[:, None, :]
+    reward = chance * by_own_action(mdp.probability * mdp.rewards_of(len(policies))[..., learner])
+    weight = chance * by_own_action(_weight(mdp, discount))
+    return _iterated(by_own_action(mdp.next_state), weight, reward.sum(axis=-1), discount)
 
 
 def sweep_tolerance(discount: float) -> float:

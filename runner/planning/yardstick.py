@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.mdp import Mdp
-from runner.planning.evaluation import Outcome, evaluate_policy, start_mean
-from runner.planning.optimum import best_response, greedy_policy, optimal_values
+from runner.planning.evaluation import (
+    Outcome,
+    evaluate_policy,
+    evaluate_stochastic_policy,
+    start_mean,
+)
+from runner.planning.optimum import (
+    best_response,
+    best_response_to_stochastic,
+    greedy_policy,
+    optimal_values,
+)
+
+Policy = NDArray[np.int32] | Sequence[NDArray[np.float64]]
+"""The joint action of each state, or for each learner the probabilities of its own actions."""
 
 
 class Yardstick:
@@ -25,16 +39,20 @@ class Yardstick:
         self._learners = learners
         self._best: dict[float, tuple[float, Outcome]] = {}
 
-    def measure(self, policy: NDArray[np.int32], discount: float) -> dict[str, Any]:
+    def measure(self, policy: Policy, discount: float) -> dict[str, Any]:
         """Return the exact measures of a policy, named as in the recording.
 
         Where nothing is discounted there are no values of a process without end: they are nan.
 
         Args:
-            policy: [S]: the joint action of each state.
+            policy: [S]: the joint action of each state; or, for learners that draw, one array a learner,
+                [S, n]: the probability of each of its own actions.
             discount: of values; 1 for none.
         """
-        outcome = evaluate_policy(self._mdp, policy, self._learners, discount)
+        if isinstance(policy, np.ndarray):
+            outcome = evaluate_policy(self._mdp, policy, self._learners, discount)
+        else:
+            outcome = evaluate_stochastic_policy(self._mdp, policy, self._learners, discount)
         none = discount >= 1
         optimal_value, optimum = (np.nan, None) if none else self._optimum(discount)
         return {
@@ -57,8 +75,12 @@ class Yardstick:
             "cycle_percents": [cycle.percent for cycle in outcome.cycles],
         }
 
-    def _best_response(self, policy: NDArray[np.int32], learner: int, discount: float) -> float:
-        return start_mean(self._mdp, best_response(self._mdp, policy, learner, self._learners, discount))
+    def _best_response(self, policy: Policy, learner: int, discount: float) -> float:
+        if isinstance(policy, np.ndarray):
+            values = best_response(self._mdp, policy, learner, self._learners, discount)
+        else:
+            values = best_response_to_stochastic(self._mdp, policy, learner, discount)
+        return start_mean(self._mdp, values)
 
     def _optimum(self, discount: float) -> tuple[float, Outcome]:
         """Return the value of the best that all agents together can do, and how it goes."""

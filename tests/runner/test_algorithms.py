@@ -156,3 +156,17 @@ def test_another_algorithm_may_go_on_from_its_q_tables(run, tmp_path):
         for table, one in zip(tables, held, strict=True):
             assert one["q"].tobytes() == table.tobytes()
         assert verify(going_on.recording).sound
+
+
+@pytest.mark.parametrize("algorithm", ["wolf_phc", "random"])
+def test_a_policy_that_draws_is_measured_exactly(algorithm, tmp_path):
+    values = TAXIS | TWO | SAMPLED | {"algorithm": algorithm}
+    evaluation = {"every": 20, "trials": 400, "exact": True}
+    done = make_run(tmp_path, values, seed=2, evaluation=evaluation, recording={"steps": "none"})
+    with open_recording(done.recording) as recording:
+        exact = list(recording.optimality())[-1]
+        sampled = list(recording.metrics("eval"))[-1]
+    assert exact["finish_percent"] == pytest.approx(sampled["finish_percent"], abs=7.5)
+    gains = [best - own for own, best in zip(exact["values"], exact["best_responses"], strict=True)]
+    assert min(gains) > -1e-9
+    assert verify(done.recording).sound

@@ -13,7 +13,15 @@ from hypothesis import strategies as st
 from runner.environments import load_mdp
 from runner.errors import EnvironmentNotUsable
 from runner.mdp import Mdp
-from runner.planning import best_response, evaluate_policy, greedy_policy, optimal_values
+from runner.planning import (
+    best_response,
+    best_response_to_stochastic,
+    evaluate_policy,
+    evaluate_stochastic_policy,
+    greedy_policy,
+    optimal_values,
+    random_policy,
+)
 
 DISCOUNT = 0.9
 
@@ -144,6 +152,103 @@ def test_chances_are_followed_exactly(mdp, data):
     episodes = np.array([[float(x) for x in expected(mdp, policy, state)] for state in starts])
     np.testing.assert_allclose(said(outcome), mdp.start[starts] @ episodes, atol=1e-9)
     np.testing.assert_allclose(outcome.values, mdp.start @ values_of(mdp, policy), atol=1e-8)
+
+
+def two_policies(mdp, data):
+    """Return a stochastic policy of each agent, [S, 2], with zeros among its probabilities."""
+    chances = st.sampled_from([0.0, 0.25, 0.5, 1.0])
+    own = st.lists(chances, min_size=mdp.states, max_size=mdp.states)
+    return [np.array([[1 - p, p] for p in data.draw(own)]) for _ in mdp.agents]
+
+
+def folded(mdp, policies):
+    """Return the process whose only action is to draw from the policies: its outcomes are all [S, 4 K]."""
+    joint = (policies[0][:, :, None] * policies[1][:, None, :]).reshape(mdp.states, 4)
+    shape = mdp.states, 1, -1
+    return type(mdp)(
+        **vars(mdp)
+        | {
+            "next_state": mdp.next_state.reshape(shape),
+            "probability": (joint[..., None] * mdp.probability).reshape(shape),
+            "rewards": mdp.rewards.reshape(*shape, 2),
+            "terminated": mdp.terminated.reshape(shape),
+            "events": mdp.events.reshape(shape),
+        }
+    )
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(1, 2).flatmap(processes), st.data())
+def test_policies_that_draw_are_evaluated_exactly(mdp, data):
+    policies = two_policies(mdp, data)
+    mdp = type(mdp)(**{**vars(mdp), "step_limit": min(mdp.step_limit, 3)})
+    outcome = evaluate_stochastic_policy(mdp, policies, 2, DISCOUNT)
+    drawing, only = folded(mdp, policies), np.zeros(mdp.states, np.int32)
+    starts = np.flatnonzero(mdp.start)
+    episodes = np.array([[float(x) for x in expected(drawing, only, state)] for state in starts])
+    np.testing.assert_allclose(said(outcome), mdp.start[starts] @ episodes, atol=1e-9)
+    np.testing.assert_allclose(outcome.values, mdp.start @ values_of(drawing, only), atol=1e-8)
+
+
+@settings(deadline=None, max_examples=40)
+@given(processes(), st.data())
+def test_a_policy_that_draws_with_certainty_is_the_deterministic_one(mdp, data):
+    policy = a_policy(mdp, data)
+    certain = [np.eye(2)[policy // 2], np.eye(2)[policy % 2]]
+    assert evaluate_stochastic_policy(mdp, certain, 2, DISCOUNT) == evaluate_policy(mdp, policy, 2, DISCOUNT)
+    for learner in (0, 1):
+        np.testing.assert_allclose(
+            best_response_to_stochastic(mdp, certain, learner, DISCOUNT),
+            best_response(mdp, policy, learner, 2, DISCOUNT),
+            atol=1e-9,
+        )
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.integers(1, 2).flatmap(processes), st.data())
+def test_a_best_response_to_policies_that_draw_solves_its_optimality_equation(mdp, data):
+    policies = two_policies(mdp, data)
+    shape = mdp.states, 2, 2, -1
+    for learner in (0, 1):
+        found = best_response_to_stochastic(mdp, policies, learner, DISCOUNT)
+        going_on = DISCOUNT * ~mdp.terminated * found[mdp.next_state]
+        worth = (mdp.probability * (mdp.rewards[..., learner] + going_on)).reshape(shape).sum(axis=-1)
+        other = policies[1 - learner]
+        own = np.einsum("sab,sb->sa" if learner == 0 else "sab,sa->sb", worth, other)
+        np.testing.assert_allclose(own.max(axis=1), found, atol=1e-9)
+
+
+def test_matching_pennies_the_even_policy_cannot_be_exploited_and_any_other_can():
+    """One state, one step: the row player wins 1 where both choose the same side, else loses 1."""
+    pays = np.array([1.0, -1.0, -1.0, 1.0])
+    game = Mdp(
+        env_id="Pennies-v0",
+        kwargs={},
+        next_state=np.zeros((1, 4, 1), np.int32),
+        probability=np.ones((1, 4, 1)),
+        rewards=np.stack([pays, -pays], axis=-1).reshape(1, 4, 1, 2),
+        terminated=np.ones((1, 4, 1), np.bool_),
+        events=np.zeros((1, 4, 1), np.uint32),
+        start=np.ones(1),
+        step_limit=1,
+        agents=("row", "column"),
+        action_counts=(2, 2),
+        event_names=(),
+        success_events=(),
+        penalty_below=-5.0,
+    )
+    even, leaning = np.array([[0.5, 0.5]]), np.array([[0.8, 0.2]])
+    assert best_response_to_stochastic(game, [even, even], 0, DISCOUNT) == pytest.approx([0.0])
+    assert best_response_to_stochastic(game, [leaning, even], 1, DISCOUNT) == pytest.approx([0.6])
+    outcome = evaluate_stochastic_policy(game, [leaning, leaning], 2, DISCOUNT)
+    assert outcome.values == pytest.approx((0.36, -0.36))
+
+
+def test_random_taxis_deliver_in_five_of_six_episodes():
+    mdp = load_mdp("dualtaxi:DualTaxi-v1", {}, None)
+    outcome = evaluate_stochastic_policy(mdp, random_policy(mdp), 1, DISCOUNT)
+    assert outcome.finish_percent == pytest.approx(83.3386, abs=1e-4)
+    assert outcome.mean_length == pytest.approx(687.396, abs=1e-3)
 
 
 @settings(deadline=None, max_examples=40)

@@ -38,7 +38,7 @@ LAKE: dict[str, Any] = {
 
 
 SAMPLED: dict[str, Any] = {"evaluation": {"every": 20, "trials": 3}}
-"""No exact measures: what acts at random has no greedy policy."""
+"""Evaluations without exact measures."""
 
 
 def experiment(*parts: dict[str, Any], **values: Any) -> ExperimentConfig:
