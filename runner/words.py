@@ -60,6 +60,19 @@ def agent_actions(mdp: Mdp, action: int) -> tuple[int, ...]:
     return tuple(int(own) for own in np.unravel_index(action, mdp.action_counts))
 
 
+def exploration_in_words(mask: int, learners: Sequence[str]) -> str:
+    """Return who explored in a step: `explored` if all learners did, `taxi 1 explored`, or nothing.
+
+    Args:
+        mask: the step's `explored`: bit i is learner i.
+        learners: their names.
+    """
+    explorers = [spoken(name) for i, name in enumerate(learners) if mask >> i & 1]
+    if not explorers or len(explorers) == len(learners):
+        return "explored" if explorers else ""
+    return f"{' and '.join(explorers)} explored"
+
+
 def event_in_words(name: str) -> str:
     """Return an event's name as people say it: `taxi_1.drop_off` is `taxi 1 drop-off`."""
     agent, _, event = name.rpartition(".")

@@ -24,6 +24,8 @@ class Evaluation:
     start: int
     """First trial, counted over all evaluations."""
     stop: int
+    number: int = 0
+    """Counted from 0 in the order made, also where a repair lost others."""
 
     def trial(self, number: int, where: str) -> int:
         """Return the number of a trial, counted from 0, among those of all evaluations.
@@ -47,8 +49,9 @@ def evaluations_of(recording: Recording) -> list[Evaluation]:
     found: list[Evaluation] = []
     for metrics in recording.metrics("eval"):
         trials = int(metrics["trials"])
-        start = int(metrics["evaluation"]) * trials  # a repair may have lost the metrics of others
-        found.append(Evaluation(int(metrics["episode"]), int(metrics["step"]), start, start + trials))
+        number = int(metrics["evaluation"])  # a repair may have lost the metrics of others
+        start = number * trials
+        found.append(Evaluation(int(metrics["episode"]), int(metrics["step"]), start, start + trials, number))
     return found
 
 

@@ -28,9 +28,10 @@ from runner.export.plots_figure import COLOURS
 from runner.export.report import BROAD, TEMPLATES, curves, require_packages, templates
 from runner.export.report_maps import situation, situation_in_words
 from runner.export.report_replay import deeds_in_words
+from runner.frames import agents_of
 from runner.mdp import Mdp
 from runner.recording.reader import Recording
-from runner.words import spoken, states_in_words
+from runner.words import exploration_in_words, spoken, states_in_words
 
 _MOST_VALUES: Final = 6
 """Q-values shown of each run: the highest."""
@@ -161,7 +162,7 @@ def _picture(recording: Recording, step: np.void, title: str, after: bool) -> di
     mdp = recording.mdp
     state = int(step["next_state"] if after else step["state"])
     if after:
-        explored = "explored" if step["explored"] else "greedy"
+        explored = exploration_in_words(int(step["explored"]), agents_of(recording)) or "greedy"
         rewards = " and ".join(f"{reward:g}" for reward in step["rewards"])
         end = "; the end" if step["terminated"] else "; the step limit" if step["truncated"] else ""
         told = f"{deeds_in_words(mdp)[int(step['action'])]} ({explored}); reward {rewards}{end}"

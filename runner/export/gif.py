@@ -22,7 +22,7 @@ from runner.extras import require
 from runner.frames import agents_of
 from runner.mdp import Mdp
 from runner.recording.reader import Recording
-from runner.words import events_in_words, spoken, states_in_words
+from runner.words import events_in_words, exploration_in_words, spoken, states_in_words
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -123,7 +123,8 @@ def captions_of(mdp: Mdp, learners: list[str], episode: Episode, scene: bool = T
     totals = np.cumsum(episode.rewards, axis=0)
     captions = [[f"step 0 of {episode.length:,}", "the episode begins", ""]]
     for k in range(episode.steps):
-        explored = " (explored)" if episode.explored[k] else ""
+        explorers = exploration_in_words(int(episode.explored[k]), learners)
+        explored = f" ({explorers})" if explorers else ""
         rewards = _rewards(learners, episode.rewards[k].tolist(), totals[k].tolist())
         captions.append(
             [

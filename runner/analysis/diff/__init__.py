@@ -223,9 +223,11 @@ def _notes(a: Recording, b: Recording) -> list[str]:
             notes.append(f"{name} holds no steps, so no trajectory is compared; {again}")
         elif not recording.count(schema.TRAIN_STEP):
             notes.append(f"{name} has no training steps, so no trajectory of training is compared")
-        whole = unbroken(recording, "train")[0]
+        whole = unbroken(recording)[0]
         if whole < recording.count(schema.TRAIN_STEP):
             notes.append(f"{name} lost steps from step {whole:,} on: training is compared up to there")
+        if any(topic.startswith("/eval/") for topic in recording.lost):
+            notes.append(f"{name} lost parts of evaluations: those that are not whole are not compared")
     if not _same_sizes(a, b):
         notes.append("the environments have other states or actions: neither steps nor tables are compared")
     elif a.run["learners"] != b.run["learners"]:

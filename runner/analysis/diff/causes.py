@@ -1,7 +1,7 @@
 """Why two trajectories part, as far as the recordings show it.
 
-At the step where they part either the start state differs, or whether the learner explored, or which
-random action it took, or which action was greedy, or what the same action led to. A greedy action differs
+At the step where they part either the start state differs, or which learners explored, or which random
+action one of them took, or which action was greedy, or what the same action led to. A greedy action differs
 because the tables do: then the first update that made them differ is the cause, found by replaying both
 runs up to there side by side.
 """
@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from runner.analysis.diff.tables import own_actions_in_words
 from runner.analysis.diff.trajectory import Parting
 from runner.errors import RecordingError
+from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.words import actions_in_words, states_in_words
+from runner.replay.checks import check_steps
+from runner.words import actions_in_words, agent_actions, exploration_in_words, states_in_words
 
 if TYPE_CHECKING:
     from runner.learning.learner import Held
@@ -96,46 +98,65 @@ def kind_of(parting: Parting, a: Recording, b: Recording) -> Cause:
         longer = "B" if left is None else "A"
         return Cause("end", f"the same as far as the shorter goes; only {longer} goes on")
     for recording, step in ((a, left), (b, right)):
-        _check(recording, step)
+        name = schema.PHASE_NAMES[parting.phase]
+        check_steps(np.array([step]), recording.mdp, str(recording.path), name)
     if parting.field in ("episode", "t"):
         return Cause("transition", f"an episode ended in one of them: {_outcome_text(parting)}")
     if parting.t == 0 and left["state"] != right["state"]:
         states = [states_in_words(r.mdp)[s["state"]] for r, s in ((a, left), (b, right))]
         return Cause("start", f"other start state: {states[0]} in A, {states[1]} in B")
-    if bool(left["explored"]) != bool(right["explored"]):
-        explorer, other = ("A", "B") if left["explored"] else ("B", "A")
-        return Cause("exploration", f"{explorer} explored there, {other} took its greedy action")
+    explorers = [_explorers(recording, step) for recording, step in ((a, left), (b, right))]
+    alike = explorers[0] == explorers[1]
+    if len(explorers[0]) != len(explorers[1]):  # other learners: whether any of them explored
+        alike = any(explorers[0]) == any(explorers[1])
+    if not alike:
+        return Cause("exploration", _exploration_text(left, right, a, b))
     return _action_or_outcome(parting, left, right, a, b)
 
 
+def _explorers(recording: Recording, step: np.void) -> list[bool]:
+    """Return whether each learner explored in a step."""
+    return [bool(int(step["explored"]) >> i & 1) for i in range(len(agents_of(recording)))]
+
+
+def _exploration_text(left: np.void, right: np.void, a: Recording, b: Recording) -> str:
+    """Return who explored in either run: `A explored there, B took its greedy action`."""
+    words = [exploration_in_words(int(s["explored"]), agents_of(r)) for r, s in ((a, left), (b, right))]
+    if len(agents_of(a)) == len(agents_of(b)) == 1:
+        explorer, other = ("A", "B") if words[0] else ("B", "A")
+        acted = "an action of its learned policy" if _draws_actions(a, b) else "its greedy action"
+        return f"{explorer} explored there, {other} took {acted}"
+    said = ["all learners explored" if word == "explored" else word or "none explored" for word in words]
+    return f"other learners explored: {said[0]} in A, {said[1]} in B"
+
+
+def _draws_actions(a: Recording, b: Recording) -> bool:
+    """Return whether either run draws the actions that do not explore from a learned policy."""
+    return "wolf_phc" in (a.config.get("algorithm"), b.config.get("algorithm"))
+
+
 def _action_or_outcome(parting: Parting, left: np.void, right: np.void, a: Recording, b: Recording) -> Cause:
-    """Return what differs where two runs part that were in the same state, and explored alike."""
+    """Return what differs where two runs part in the same state, and the same learners explored."""
     actions = [actions_in_words(r.mdp)[s["action"]] for r, s in ((a, left), (b, right))]
     if left["action"] == right["action"]:
         told = _outcome_text(parting, a, b)
         return Cause("transition", f"the same action ({actions[0]}) led to something else: {told}")
     text = f"{actions[0]} in A, {actions[1]} in B"
-    if left["explored"]:
-        return Cause("random_action", f"both explored, and drew another action: {text}")
-    if "wolf_phc" in (a.config.get("algorithm"), b.config.get("algorithm")):
+    if _other_choices_are_random(left, right, a, b):
+        who = "both" if all(_explorers(a, left)) else "the same learners"
+        return Cause("random_action", f"{who} explored, and drew another action: {text}")
+    if _draws_actions(a, b):
         return Cause("policy_action", f"another action, drawn from a learned policy: {text}")
     return Cause("greedy_action", f"other greedy action: {text}")
 
 
-def _check(recording: Recording, step: np.void) -> None:
-    """Refuse a step that the environment cannot have.
-
-    Raises:
-        RecordingError: it is one.
-    """
-    mdp = recording.mdp
-    bounds = {"state": mdp.states, "next_state": mdp.states, "action": mdp.joint_actions}
-    for name, bound in bounds.items():
-        if step[name] >= bound:
-            raise RecordingError(
-                f"{recording.path}: found {name} {step[name]} in step {step['step']} of its phase, expected "
-                f"less than {bound}; `dualtaxi verify` tells what else is wrong."
-            )
+def _other_choices_are_random(left: np.void, right: np.void, a: Recording, b: Recording) -> bool:
+    """Return whether all learners that chose another action in B explored, in both runs."""
+    explorers = _explorers(a, left)
+    if len(explorers) != len(_explorers(b, right)) or len(explorers) != len(a.mdp.agents):
+        return bool(left["explored"])
+    own = [agent_actions(r.mdp, int(s["action"])) for r, s in ((a, left), (b, right))]
+    return all(explored for explored, ours, theirs in zip(explorers, *own, strict=True) if ours != theirs)
 
 
 def _outcome_text(parting: Parting, *recordings: Recording) -> str:
@@ -159,7 +180,7 @@ def _from_tables(
     """Return the cause of another choice, with both Q-rows, and the first update that differs."""
     from runner.replay.tables import TableReplay
 
-    steps = [_training_step(parting, recording) for recording in (a, b)]
+    steps = parting.trained or (parting.step, parting.step)  # taken when the step was chosen
     known = training is not None and training[0].step < min(steps)
     try:
         if known or steps[0] != steps[1] or a.run["agents"] != b.run["agents"]:
@@ -184,13 +205,6 @@ def _rows(replays: list[TableReplay], a: Recording, state: int) -> list[Row]:
         )
         for i, (agent, ours, theirs) in enumerate(zip(left.agents, left.tables, right.tables, strict=True))
     ]
-
-
-def _training_step(parting: Parting, recording: Recording) -> int:
-    """Return how many training steps a run had taken when the parting step was chosen."""
-    if parting.evaluation is None:
-        return parting.step
-    return int(recording.metrics("eval")[parting.evaluation]["step"])
 
 
 def _replayed(a: Recording, b: Recording, stop: int) -> tuple[list[TableReplay], Update | None]:

@@ -3,11 +3,13 @@
 Steps are compared in blocks: first by position until the first difference, then episode by episode,
 aligned by their time in it. Memory does not grow with the runs.
 
-Where a repair lost steps, a run is compared up to the first of them.
+Where a repair lost steps, training is compared up to the first of them, and evaluations that lost trials
+are left out.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.evaluations import Evaluation, evaluations_of
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
@@ -35,7 +38,7 @@ class Parting:
 
     phase: str
     evaluation: int | None
-    """Which evaluation, in the order made; None in training."""
+    """Which evaluation of run A, counted from 0; None in training."""
     after: int | None
     """Training episodes before that evaluation; None in training."""
     step: int
@@ -50,6 +53,8 @@ class Parting:
     a_step: np.void | None
     """The whole step in A; None if A has none there."""
     b_step: np.void | None
+    trained: tuple[int, int] | None = None
+    """Training steps before that evaluation, in A and in B; None in training."""
 
 
 @dataclass(frozen=True)
@@ -122,38 +127,30 @@ def _differs(a: Block, b: Block, name: str) -> NDArray[np.bool_]:
 
 def training_parting(a: Recording, b: Recording) -> Parting | None:
     """Return where the training of two runs parts; None if one goes as far as the other, the same way."""
-    streams = [
-        recording.blocks(schema.TRAIN_STEP, 0, unbroken(recording, "train")[0]) for recording in (a, b)
-    ]
+    streams = [recording.blocks(schema.TRAIN_STEP, 0, unbroken(recording)[0]) for recording in (a, b)]
     found = first_difference(streams[0], streams[1])
     return None if found is None else _parting("train", found)
 
 
 def evaluation_partings(a: Recording, b: Recording) -> Iterator[Parting]:
     """Yield, for each evaluation that both runs made after as much training, where it parts, if it does."""
-    for k, (left, right) in enumerate(zip(_evaluations(a), _evaluations(b), strict=False)):
-        if left.after != right.after:
+    others = {one.after: one for one in evaluations_of(b)}
+    for left in evaluations_of(a):
+        right = others.get(left.after)
+        if right is None:
             continue
-        trials = min(left.trials, right.trials)
-        found = first_difference(
-            _trial_steps(a, left.first, trials), _trial_steps(b, right.first, trials), _IN_AN_EVALUATION
-        )
+        trials = min(left.stop - left.start, right.stop - right.start)
+        steps = [_trial_steps(one, first, trials) for one, first in ((a, left.start), (b, right.start))]
+        if steps[0] is None or steps[1] is None:
+            continue
+        found = first_difference(steps[0], steps[1], _IN_AN_EVALUATION)
         if found is not None:
-            yield _parting("eval", found, k, left)
+            yield _parting("eval", found, (left, right))
 
 
-@dataclass(frozen=True)
-class _Evaluation:
-    """Trials of one evaluation: which is the first over the run, how many, after how many episodes."""
-
-    first: int
-    trials: int
-    after: int
-
-
-def unbroken(recording: Recording, phase: str) -> tuple[int, int]:
-    """Return how many steps and episodes of a phase are there before the first that were lost, if any."""
-    steps, episodes = schema.PHASES[phase]
+def unbroken(recording: Recording) -> tuple[int, int]:
+    """Return how many steps and episodes of training are there before the first that were lost, if any."""
+    steps, episodes = schema.PHASES["train"]
     ends = [
         min([recording.count(topic), *(start for start, _ in recording.lost.get(topic.name, []))])
         for topic in (steps, episodes)
@@ -161,34 +158,22 @@ def unbroken(recording: Recording, phase: str) -> tuple[int, int]:
     return ends[0], ends[1]
 
 
-def _evaluations(recording: Recording) -> Iterator[_Evaluation]:
-    """Yield the evaluations of which the recording holds every trial, in order."""
-    steps, episodes = unbroken(recording, "eval")
-    first = 0
-    for metrics in recording.iter_metrics("eval"):
-        one = _Evaluation(first, int(metrics["trials"]), int(metrics["episode"]))
-        first += one.trials
-        if (
-            first > episodes
-            or not one.trials
-            or recording.episodes("eval", first - 1, first)["last_step"][0] >= steps
-        ):
-            return
-        yield one
-
-
-def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Block]:
-    """Return the steps of some trials."""
+def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Block] | None:
+    """Return the steps of some trials; None unless all of them are there."""
     ends = recording.episodes("eval", first, first + trials)
-    start = int(ends[0]["last_step"]) + 1 - int(ends[0]["length"])
-    return recording.blocks(schema.EVAL_STEP, start, int(ends[-1]["last_step"]) + 1)
+    if not trials or len(ends) < trials:
+        return None
+    start, stop = int(ends[0]["last_step"]) + 1 - int(ends[0]["length"]), int(ends[-1]["last_step"]) + 1
+    lost = recording.lost.get(schema.EVAL_STEP.name, [])
+    if stop > recording.count(schema.EVAL_STEP) or any(a < stop and b > start for a, b in lost):
+        return None
+    return recording.blocks(schema.EVAL_STEP, start, stop)
 
 
 def _parting(
     phase: str,
     found: tuple[int, Block | None, Block | None],
-    number: int | None = None,
-    evaluation: _Evaluation | None = None,
+    evaluations: tuple[Evaluation, Evaluation] | None = None,
 ) -> Parting:
     _, left, right = found
     step = left if left is not None else right
@@ -197,18 +182,28 @@ def _parting(
     if left is not None and right is not None:
         name = next(name for name in FIELDS if _differs(left, right, name)[0])
         a, b = left[name][0].tolist(), right[name][0].tolist()
-    return Parting(
+    parting = Parting(
         phase,
-        number,
-        None if evaluation is None else evaluation.after,
+        None,
+        None,
         int(step["step"][0]),
-        int(step["episode"][0]) - (0 if evaluation is None else evaluation.first),
+        int(step["episode"][0]),
         int(step["t"][0]),
         name,
         a,
         b,
         None if left is None else left[0],
         None if right is None else right[0],
+    )
+    if evaluations is None:
+        return parting
+    own = evaluations[0] if left is not None else evaluations[1]
+    return dataclasses.replace(
+        parting,
+        evaluation=evaluations[0].number,
+        after=own.after,
+        episode=parting.episode - own.start,
+        trained=(evaluations[0].train_step, evaluations[1].train_step),
     )
 
 
@@ -252,7 +247,7 @@ def _lengths_of_both(a: Recording, b: Recording) -> Iterator[tuple[NDArray[np.in
 
     An episode longer than that comes alone.
     """
-    known = [unbroken(recording, "train") for recording in (a, b)]
+    known = [unbroken(recording) for recording in (a, b)]
     episodes = min(count for _, count in known)
     for first in range(0, episodes, _EPISODES_AT_ONCE):
         last = min(first + _EPISODES_AT_ONCE, episodes)

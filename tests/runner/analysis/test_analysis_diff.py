@@ -27,12 +27,13 @@ from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.replay.tables import tables_at
 from runner.words import states_in_words
-from tests.runner.altering import altered
+from tests.runner.altering import altered, without_chunk
 from tests.runner.recording.making import stopping_after
 
 BASE = {
     "name": "base",
     "mode": "competitive",
+    "exploration": "shared",
     "episodes": 120,
     "discount": 0.8,
     "epsilon": 0.6,
@@ -314,3 +315,107 @@ def test_the_command_says_what_differs_and_ends_with_1(record, folder):
     assert "Did you mean" in unknown.stderr
     wrong = run(cli, ["diff", ids[0], "nothing", "--recordings", str(folder)])
     assert wrong.exit_code == 2
+
+
+class TestIndependentExploration:
+    """Each learner explores by a draw of its own: `explored` says who did."""
+
+    FIRST_OF_TWO = 0b01
+
+    @pytest.fixture
+    def told(self, record, tmp_path):
+        """Return the cause of a difference, after a change to a step in which taxi 1 alone explored."""
+
+        def cause_of_change(change):
+            path = record("exploration=independent")
+            with open_recording(path) as whole:
+                explored = np.concatenate([block["explored"] for block in whole.blocks(schema.TRAIN_STEP)])
+            step = int(np.flatnonzero(explored == self.FIRST_OF_TWO)[20])
+
+            def changed(records):
+                change(records[step : step + 1])
+                return records
+
+            forged = altered(
+                path, tmp_path / "forged.mcap", schema.TRAIN_STEP, changed, result=without_digest
+            )
+            with open_recording(path) as a, open_recording(forged) as b:
+                difference = diff(a, b, first=True)
+            assert difference.parting.step == step
+            return difference.cause
+
+        return cause_of_change
+
+    def test_another_action_of_who_explored_is_random(self, told):
+        cause = told(lambda step: np.copyto(step["action"], (step["action"] + 6) % 36))
+        assert cause.kind == "random_action"
+        assert cause.text.startswith("the same learners explored")
+
+    def test_another_action_of_who_did_not_explore_is_greedy(self, told):
+        cause = told(
+            lambda step: np.copyto(step["action"], step["action"] // 6 * 6 + (step["action"] + 1) % 6)
+        )
+        assert cause.kind == "greedy_action"
+
+    def test_that_another_learner_explored_is_said(self, told):
+        cause = told(lambda step: step["explored"].fill(0b10))
+        assert cause.kind == "exploration"
+        assert cause.text == "other learners explored: taxi 1 explored in A, taxi 2 explored in B"
+
+    def test_that_both_learners_explored_is_said(self, told):
+        cause = told(lambda step: step["explored"].fill(0b11))
+        assert cause.text == "other learners explored: taxi 1 explored in A, all learners explored in B"
+
+    def test_the_cause_of_a_real_difference_is_in_the_tables(self, record):
+        setting = "exploration=independent"
+        with open_recording(record(setting)) as a, open_recording(record(setting, "discount=0.9")) as b:
+            difference = diff(a, b)
+        assert difference.cause.kind == "greedy_action"
+        assert difference.cause.update is not None
+
+
+@pytest.fixture
+def lossy(record, tmp_path):
+    """The base run with the metrics of its second evaluation lost, and the base run itself."""
+    path = tmp_path / "lossy.mcap"
+    path.write_bytes(record().read_bytes())
+    assert without_chunk(path, schema.EVAL_METRICS_TOPIC, 1) == 1
+    with open_recording(path) as damaged, open_recording(record()) as whole:
+        yield damaged, whole
+
+
+def test_lost_metrics_of_an_evaluation_shift_no_others(lossy):
+    for pair in (lossy, lossy[::-1]):
+        difference = diff(*pair)
+        assert difference.parting is None
+        assert difference.evaluations == []
+        assert any("lost parts of evaluations" in note for note in difference.notes)
+
+
+def test_an_evaluation_after_a_lost_one_is_compared_with_its_own_tables(lossy, record, tmp_path):
+    def change(records):
+        records["action"][records["episode"] == 24] ^= 1  # trial 4 of the third evaluation
+        return records
+
+    damaged, _ = lossy
+    forged = altered(record(), tmp_path / "forged.mcap", schema.EVAL_STEP, change, result=without_digest)
+    with open_recording(forged) as other:
+        ((parting, cause),) = diff(damaged, other).evaluations
+    assert (parting.evaluation, parting.after, parting.episode, parting.t) == (2, 120, 4, 0)
+    trained = damaged.metrics("eval")[-1]["step"]
+    state = int(parting.a_step["state"])
+    assert cause.rows[0].a == tables_at(damaged, trained)[0][state].tolist()
+
+
+def test_lost_trials_leave_out_their_evaluation_alone(record, tmp_path):
+    def change(records):
+        records["action"][records["episode"] == 24] ^= 1
+        return records
+
+    forged = altered(record(), tmp_path / "forged.mcap", schema.EVAL_STEP, change, result=without_digest)
+    path = tmp_path / "lossy.mcap"
+    path.write_bytes(record().read_bytes())
+    without_chunk(path, schema.EVAL_STEP, 0)
+    with open_recording(path) as damaged, open_recording(forged) as other:
+        ((parting, _),) = diff(damaged, other).evaluations
+    assert (parting.after, parting.episode) == (120, 4)
