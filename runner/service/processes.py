@@ -127,7 +127,16 @@ class ProcessPool:
         return future
 
     def _call(self, function: Callable[..., Any], args: Any, keywords: Any) -> Any:
-        child = self._started()
+        while True:
+            child = self._started()
+            was_idle = child.uses > 0
+            try:
+                return self._called(child, function, args, keywords)
+            except ProcessDied:
+                if not was_idle:  # else it may have died before: only a new process says whose fault it was
+                    raise
+
+    def _called(self, child: _Child, function: Callable[..., Any], args: Any, keywords: Any) -> Any:
         is_reusable = False
         try:
             kind, result = child.call((function, args, keywords), self.seconds)
