@@ -169,6 +169,8 @@ class ProcessPool:
                     raise Busy(f"the system has no process for it ({error.strerror}); try again.") from error
                 with self._lock:
                     self._children.add(child)
+                    if self._is_closed:  # after all others were killed
+                        child.kill()
                 return child
             if child.is_alive():
                 return child

@@ -1,0 +1,62 @@
+"""Work in child processes: limits on time and memory, on every platform's event loop."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+
+import pytest
+
+from runner.errors import RecordingError
+from runner.service.processes import OutOfMemory, ProcessDied, ProcessPool, TimedOut
+
+MEMORY = 256 << 20
+
+
+class WithoutReaders(asyncio.SelectorEventLoop):
+    """An event loop that cannot wait for a pipe, as that of Windows."""
+
+    def add_reader(self, *_):
+        raise NotImplementedError
+
+
+def refuse(path):
+    raise RecordingError(f"{path} is damaged.")
+
+
+@pytest.fixture
+def pool():
+    with ProcessPool(2, 30, MEMORY) as made:
+        yield made
+
+
+def test_results_and_errors_are_those_of_the_function_on_any_event_loop(pool):
+    async def calls():
+        assert await pool(os.path.join, "a", "b") == os.path.join("a", "b")  # noqa: PTH118
+        with pytest.raises(RecordingError, match="x is damaged"):
+            await pool(refuse, "x")
+
+    with asyncio.Runner(loop_factory=WithoutReaders) as loop:
+        loop.run(calls())
+
+
+def test_what_exceeds_a_limit_or_dies_is_given_up(pool):
+    with pytest.raises(OutOfMemory, match=r"more than 0\.25 GiB"):
+        pool.submit(bytearray, 2 * MEMORY).result()
+    with pytest.raises(ProcessDied):
+        pool.submit(os._exit, 3).result()
+    with ProcessPool(1, 0.5, MEMORY) as hasty, pytest.raises(TimedOut, match=r"longer than 0\.5 s"):
+        hasty.submit(time.sleep, 600).result()
+
+
+def test_closing_ends_calls_that_are_under_way():
+    pool = ProcessPool(1, 600, MEMORY)
+    calls = [pool.submit(time.sleep, 600) for _ in range(3)]
+    pool.close()
+    assert all(isinstance(call.exception(), ProcessDied) for call in calls)
+
+
+def test_a_process_is_used_again_when_it_is_kept():
+    with ProcessPool(1, 30, MEMORY, keep_seconds=60) as pool:
+        assert pool.submit(os.getpid).result() == pool.submit(os.getpid).result()
