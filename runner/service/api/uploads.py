@@ -12,6 +12,7 @@ from typing import Annotated, Final, Literal
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
+from fastapi.concurrency import contextmanager_in_threadpool
 from pydantic import BaseModel
 from starlette.requests import ClientDisconnect
 
@@ -130,7 +131,7 @@ async def tell(
     while upload.state == "verifying" and time.monotonic() < end and not stopping.is_set():
         await asyncio.sleep(1 / _LOOKS_A_SECOND)
         upload = uploads.get(upload_id, owner)
-    return _answer(uploads, upload, owner)
+    return await run_sync(_answer, uploads, upload, owner, limiter=request.app.state.writers)
 
 
 @router.head(
@@ -165,14 +166,18 @@ async def append(
     content_length: Annotated[int | None, Header(ge=0, lt=1 << 62, include_in_schema=False)] = None,
 ) -> Response:
     """Append bytes; what has come stays, also if the connection is cut."""
-    with uploads.appending(upload_id, owner, upload_offset, content_length) as sink:
+    writers = request.app.state.writers
+    appending = uploads.appending(upload_id, owner, upload_offset, content_length)
+    async with contextmanager_in_threadpool(appending) as sink:  # it opens files and asks the disk
         try:
-            await _receive(request.stream(), sink, request.app.state.writers)
+            await _receive(request.stream(), sink, writers)
         except ClientDisconnect:
             raise Refused(HTTPStatus.BAD_REQUEST, "the connection was cut; go on from the offset.") from None
-    return Response(
-        status_code=HTTPStatus.NO_CONTENT, headers=_position(uploads, uploads.get(upload_id, owner))
-    )
+
+    def position() -> dict[str, str]:
+        return _position(uploads, uploads.get(upload_id, owner))
+
+    return Response(status_code=HTTPStatus.NO_CONTENT, headers=await run_sync(position, limiter=writers))
 
 
 @router.post(
@@ -186,8 +191,11 @@ async def complete(
 ) -> UploadAnswer:
     """Have an upload put on disk and verified; it is a run when that has passed."""
     writers = request.app.state.writers
-    upload = await run_sync(uploads.complete, upload_id, owner, completion, limiter=writers)
-    return _answer(uploads, upload, owner)
+
+    def completed() -> UploadAnswer:
+        return _answer(uploads, uploads.complete(upload_id, owner, completion), owner)
+
+    return await run_sync(completed, limiter=writers)
 
 
 @router.delete(

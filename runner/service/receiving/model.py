@@ -44,6 +44,8 @@ class UploadLimits:
     """Of one upload."""
     most_open: int = 1_000
     """Uploads that are received or verified."""
+    most_open_each: int = 100
+    """Of them, those of one client."""
     spare_bytes: int = 256 << 20
     """Left free on the disk for runs that are being recorded on it."""
     idle_days: float = 7.0

@@ -18,6 +18,7 @@ from typing import Any, Final, Self
 
 from runner.errors import RunNotFound, StorageError
 from runner.runs import run_of_id
+from runner.service.logs import LOG
 from runner.service.receiving.appending import Appending
 from runner.service.receiving.folder import UploadFolder
 from runner.service.receiving.model import (
@@ -61,6 +62,9 @@ class Uploads:
         self._tell = settled
         self._recordings = recordings
         self._guard = threading.RLock()
+        """Held for moments only, never while the disk is used: the server's event loop may wait for it."""
+        self._beginning = threading.Lock()
+        """Held while an upload begins, so that the same bytes do not begin twice."""
         self._swept = 0.0
         self._used: set[str] = set()
         self._folder = UploadFolder(recordings)
@@ -121,16 +125,16 @@ class Uploads:
             TooLarge, TooMany: it is not taken.
             StorageError: there is no room.
         """
-        with self._guard:
-            if time.monotonic() - self._swept > SWEEP_SECONDS:
-                self._forget_old()
+        if time.monotonic() - self._swept > SWEEP_SECONDS:
+            self._forget_old()
+        with self._beginning:
             known = self._known(owner, announced)
             if known is not None:
                 stored = known.state == "stored"
                 return known.model_copy(update={"already": True}) if stored else known, False
             run_id = self._stored_as(announced)
             if not run_id:
-                self._check_room(announced.size)
+                self._check_room(owner, announced.size)
             upload = Upload(
                 upload_id=secrets.token_hex(16),
                 owner=owner,
@@ -140,10 +144,13 @@ class Uploads:
                 run_id=run_id,
                 already=bool(run_id),
             )
-            self._forget_some()
             self._folder.add(upload)
-            self._uploads[upload.upload_id] = upload
-            return upload, True
+            with self._guard:
+                forgotten = self._forget_some()
+                self._uploads[upload.upload_id] = upload
+        for upload_id in forgotten:
+            self._folder.remove(upload_id)
+        return upload, True
 
     @contextlib.contextmanager
     def appending(self, upload_id: str, owner: str, offset: int, length: int | None) -> Iterator[Appending]:
@@ -202,10 +209,12 @@ class Uploads:
         Raises:
             Conflict: it is being received or verified.
         """
-        with self._in_use(upload_id, owner) as upload, self._guard:
+        with self._in_use(upload_id, owner) as upload:
             if upload.state == "verifying":
                 raise Conflict("the upload is being verified; wait for its end.")
-            self._forget(upload)
+            with self._guard:
+                del self._uploads[upload_id]
+            self._folder.remove(upload_id)
 
     @contextlib.contextmanager
     def _in_use(self, upload_id: str, owner: str) -> Iterator[Upload]:
@@ -227,7 +236,7 @@ class Uploads:
         """Return the upload of the same bytes by the same owner, unless it came to nothing."""
         if announced.digest is None:
             return None
-        for upload in self._uploads.values():
+        for upload in self.all():
             same = (upload.announced.digest, upload.announced.size) == (announced.digest, announced.size)
             if same and upload.owner == owner and upload.state != "refused":
                 gone = upload.state == "stored" and self._run(upload.run_id) is None
@@ -246,11 +255,16 @@ class Uploads:
         run = run_of_id(run_id, self._recordings)
         return None if run is None else run.summary
 
-    def _check_room(self, size: int | None) -> None:
+    def _check_room(self, owner: str, size: int | None) -> None:
         if (size or 0) > self.limits.most_bytes:
             raise TooLarge(f"found {size:,} bytes, expected at most {self.limits.most_bytes:,}.")
-        underway = sum(upload.state in ("receiving", "verifying") for upload in self._uploads.values())
-        if underway >= self.limits.most_open:
+        owners = [upload.owner for upload in self.all() if upload.state in ("receiving", "verifying")]
+        if owners.count(owner) >= self.limits.most_open_each:
+            raise TooMany(
+                f"{self.limits.most_open_each:,} of your uploads are open, which is all that a client may "
+                "have; complete some or give them up."
+            )
+        if len(owners) >= self.limits.most_open:
             raise TooMany(f"{self.limits.most_open:,} uploads are open; try again when some are done.")
         self._check_free(size or 0)
 
@@ -263,38 +277,48 @@ class Uploads:
             upload = self._uploads.get(upload_id)
         if upload is None or upload.state != "verifying":
             return
-        verdict = self._verifier.verify(self._folder.of(upload_id), self._recordings)
+        try:
+            verdict = self._verifier.verify(self._folder.of(upload_id), self._recordings)
+        except Exception:  # or it would stand as being verified until the server is started again
+            LOG.exception("verification", extra={"upload": upload_id})
+            problem = "something unexpected went wrong while it was verified; complete it again."
+            verdict = Verdict(problem=problem, try_again=True)
         if verdict is None:
             return  # the server stops
         settled = upload.model_copy(update=_settled(verdict))
         with contextlib.suppress(StorageError):  # after a restart it is verified once more, to the same end
             self._folder.write(settled)
         if settled.state != "receiving":
-            self._folder.remove_body(upload_id)
-        self._tell(settled)
-        with self._guard:
-            self._uploads[upload_id] = settled
+            with contextlib.suppress(OSError):  # removed with the rest of it, when it is forgotten
+                self._folder.remove_body(upload_id)
+        try:
+            self._tell(settled)
+        finally:
+            with self._guard:
+                self._uploads[upload_id] = settled
 
     def _forget_old(self) -> None:
         """Forget the uploads to which nothing comes any more, and those that are long over."""
         self._swept, now = time.monotonic(), time.time()
-        with self._guard:
-            for upload in list(self._uploads.values()):
-                days = (now - self._folder.touched(upload)) / 86400
-                idle = upload.state == "receiving" and upload.upload_id not in self._used
-                most = self.limits.idle_days if idle else self.limits.kept_days
-                if (idle or upload.state in ("stored", "refused")) and days > most:
-                    self._forget(upload)
+        for upload in self.all():
+            if upload.state == "verifying":
+                continue
+            days = (now - self._folder.touched(upload)) / 86400
+            most = self.limits.idle_days if upload.state == "receiving" else self.limits.kept_days
+            with self._guard:
+                is_same = self._uploads.get(upload.upload_id) is upload
+                if days <= most or not is_same or upload.upload_id in self._used:
+                    continue
+                del self._uploads[upload.upload_id]
+            self._folder.remove(upload.upload_id)
 
-    def _forget_some(self) -> None:
-        """Forget the oldest uploads that are over, but for as many as may be open."""
+    def _forget_some(self) -> list[str]:
+        """Forget the oldest uploads that are over, but for as many as may be open; return their ids."""
         over = [upload for upload in self._uploads.values() if upload.state in ("stored", "refused")]
-        for upload in sorted(over, key=lambda upload: upload.created)[: -self.limits.most_open]:
-            self._forget(upload)
-
-    def _forget(self, upload: Upload) -> None:
-        del self._uploads[upload.upload_id]
-        self._folder.remove(upload.upload_id)
+        oldest = sorted(over, key=lambda upload: upload.created)[: -self.limits.most_open]
+        for upload in oldest:
+            del self._uploads[upload.upload_id]
+        return [upload.upload_id for upload in oldest]
 
 
 def _settled(verdict: Verdict) -> dict[str, Any]:

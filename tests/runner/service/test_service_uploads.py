@@ -6,7 +6,9 @@ import contextlib
 import json
 import os
 import shutil
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -400,3 +402,42 @@ def test_what_is_over_or_abandoned_is_forgotten_in_time(lake, tmp_path):
     ]
     assert visible(tmp_path / "runs") == [lake.run_id]
     again.close()
+
+
+def test_removing_an_upload_keeps_no_other_waiting(uploads, lake, monkeypatch):
+    """The event loop of the server asks for uploads: it must not wait for the disk."""
+    data, go_on = lake.recording.read_bytes(), threading.Event()
+    given_up, _ = uploads.begin(ANNA, Announcement(name="given up"))
+    upload, _ = uploads.begin(ANNA, announced(data))
+    monkeypatch.setattr("runner.service.receiving.folder.shutil.rmtree", lambda *_, **__: go_on.wait(60))
+    with ThreadPoolExecutor(2) as threads:
+        removal = threads.submit(uploads.give_up, given_up.upload_id, ANNA)
+        try:
+            until(lambda known: len(known) == 1, uploads.all)
+            assert threads.submit(uploads.get, upload.upload_id, ANNA).result(20) == upload
+            assert not removal.done()
+        finally:
+            go_on.set()
+
+
+def test_an_upload_whose_verification_fails_unexpectedly_can_be_completed_again(uploads, lake, monkeypatch):
+    data = lake.recording.read_bytes()
+    with monkeypatch.context() as broken:
+        broken.setattr(uploads._verifier, "verify", lambda *_: json.loads("no verdict"))
+        failed = send(uploads, data)
+    assert failed.state == "receiving"
+    assert failed.problem == "something unexpected went wrong while it was verified; complete it again."
+    again = uploads.complete(failed.upload_id, ANNA, completion(data))
+    assert over(uploads, again).state == "stored"
+
+
+def test_one_client_cannot_hold_all_uploads(tmp_path):
+    uploads = Uploads(tmp_path / "runs", UploadLimits(most_open=3, most_open_each=2))
+    for _ in range(2):
+        uploads.begin(ANNA, Announcement())
+    with pytest.raises(TooMany, match="2 of your uploads are open"):
+        uploads.begin(ANNA, Announcement())
+    uploads.begin(BEN, Announcement())
+    with pytest.raises(TooMany, match="3 uploads are open"):
+        uploads.begin(BEN, Announcement())
+    uploads.close()
