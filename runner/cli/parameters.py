@@ -158,16 +158,18 @@ class NumberList(_Numbers):
         return tuple(_number(part.strip()) for part in text.split(","))
 
 
-class SpotName(_Numbers):
-    """`EPISODE:T`, or `eval:N:TRIAL:T`."""
+class StepReference(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+    """A step of an episode: `EPISODE:T`, or `eval:N:TRIAL:T`."""
 
-    name = "spot"
-    expected = "EPISODE:T such as 120:5, or eval:N:TRIAL:T"
+    name = "step"
 
-    def parsed(self, text: str) -> tuple[int, ...]:
-        """Return (episode, t) or (N, trial, t); what is not said is 0."""
-        parts = text.removeprefix("eval:").split(":")
-        wanted = 3 if text.startswith("eval:") else 2
-        if len(parts) > wanted:
-            raise ValueError(text)
-        return tuple(map(_number, parts)) + (0,) * (wanted - len(parts))
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, ...]:
+        """Return (episode, t) or (N, trial, t)."""
+        from runner.analysis.step_reference import parse_step_reference
+
+        try:
+            return parse_step_reference(value)
+        except RunnerError as error:
+            self.fail(str(error), param, ctx)

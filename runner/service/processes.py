@@ -74,7 +74,7 @@ class ProcessPool:
         self._lock = threading.Lock()
         self._children: set[_Child] = set()
         self._idle: list[_Child] = []
-        self._is_closed = False
+        self._closed = threading.Event()
 
     def __enter__(self) -> Self:
         """Start the process that all others are forked from, so that the first call need not wait for it."""
@@ -88,7 +88,7 @@ class ProcessPool:
     def close(self) -> None:
         """End all processes; calls under way fail."""
         with self._lock:
-            self._is_closed = True
+            self._closed.set()
             children = list(self._children)
         for child in children:
             child.kill()
@@ -159,7 +159,7 @@ class ProcessPool:
         """Return an idle process that lives, or a new one."""
         while True:
             with self._lock:
-                if self._is_closed:
+                if self._closed.is_set():
                     raise ProcessDied("the service is stopping.")
                 child = self._idle.pop() if self._idle else None
             if child is None:
@@ -169,7 +169,7 @@ class ProcessPool:
                     raise Busy(f"the system has no process for it ({error.strerror}); try again.") from error
                 with self._lock:
                     self._children.add(child)
-                    if self._is_closed:  # after all others were killed
+                    if self._closed.is_set():  # after all others were killed
                         child.kill()
                 return child
             if child.is_alive():

@@ -13,7 +13,7 @@ from runner.cli.choosing import choice_options, request_of, tell
 from runner.cli.finding import find_recorded
 from runner.cli.options import recordings_option
 from runner.cli.output import say
-from runner.cli.parameters import RunName, SpotName
+from runner.cli.parameters import RunName, StepReference
 
 if TYPE_CHECKING:
     from runner.export.rerun.spots import Spot
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 @click.option(
     "--at",
     "spot",
-    type=SpotName(),
+    type=StepReference(),
     metavar="EPISODE:T",
-    help="Where to look: a step of a training episode; eval:N:TRIAL:T for a step of an evaluation.",
+    help="Where to look: a step of a training episode; eval:N:TRIAL:T for a step of an evaluation. "
+    "A T or TRIAL that is left out is 0.",
 )
 @click.option("--web", is_flag=True, help="Serve the web viewer on 127.0.0.1 instead of opening a window.")
 @click.option(

@@ -6,9 +6,11 @@ import json
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
+from starlette.concurrency import run_in_threadpool
 
 from runner import amounts
 from runner.analysis.groups import flat_config
+from runner.analysis.step_reference import episode_reference, parse_step_reference, step_reference
 from runner.errors import RunnerError
 from runner.runs import Run
 from runner.service import played
@@ -21,9 +23,6 @@ from runner.service.pages.spots import (
     after_step,
     episode_in_words,
     episode_place,
-    episode_text,
-    parse_spot,
-    spot_text,
 )
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
@@ -42,7 +41,10 @@ Names = Annotated[list[str] | None, Query(max_length=100)]
 @router.get("")
 async def overview(request: Request, catalogue: CatalogueOf, run: Names = None) -> Response:
     """Show what differs between runs, and their curves over each other."""
-    found = await _chosen(catalogue, run)
+    return await run_in_threadpool(_overview, request, await _chosen(catalogue, run))
+
+
+def _overview(request: Request, found: list[Run]) -> Response:
     settings = [{"seed": str(each.seed), **_flat(each)} for each in found]
     keys = list(dict.fromkeys(key for each in settings for key in each))
     told = [(key, [each.get(key, amounts.UNKNOWN) for each in settings]) for key in keys]
@@ -63,12 +65,13 @@ async def divergence(
     """Show the first step at which two runs differ, and why."""
     found = _two(await _chosen(catalogue, run))
     told = await _difference(found, kept, apart)
-    return page(
+    return await run_in_threadpool(
+        page,
         request,
         "compare_divergence.html",
         **_head(found, "/divergence"),
         told=told,
-        spot=spot_text,
+        spot=step_reference,
         after=after_step,
     )
 
@@ -83,7 +86,7 @@ async def tables(
     for figure in told["figures"]:
         if "high" not in figure:  # Matplotlib writes styles into its elements, which the policy forbids here
             figure["address"] = picture_address(figure["svg"])
-    return page(request, "compare_tables.html", **_head(found, "/tables"), told=told)
+    return await run_in_threadpool(page, request, "compare_tables.html", **_head(found, "/tables"), told=told)
 
 
 @router.get("/replay")
@@ -97,10 +100,15 @@ async def replay(
 ) -> Response:
     """Show an episode of two runs, in step; the one in which they part unless another is asked for."""
     found = _two(await _chosen(catalogue, run))
-    spot = parse_spot(at)
+    spot = parse_step_reference(at) if at else ()
     if not spot:
         partings = (await _difference(found, kept, apart))["partings"]
         spot = after_step(partings[0]["spot"]) if partings else (0, 0)
+    return await run_in_threadpool(_replays, request, found, spot)
+
+
+def _replays(request: Request, found: list[Run], spot: tuple[int, ...]) -> Response:
+    """Return the page of both replays; their recordings are read for the pictures."""
     around = [_replay_link(found, spot, by) for by in (-1, 1)]
     return page(
         request,
@@ -113,7 +121,7 @@ async def replay(
         after=around[1],
         scenes=[_still(each) for each in found],
         base=link("/compare/replay", {"run": [each.run_id for each in found]}),
-        prefix=episode_text(spot),
+        prefix=episode_reference(spot),
     )
 
 
@@ -141,7 +149,8 @@ def _two(found: list[Run]) -> list[Run]:
 async def _difference(found: list[Run], kept: KeptOf, apart: ApartOf) -> dict[str, Any]:
     """Return in what two runs differ, as `played.difference` has it."""
     key = ("difference", *map(timed_state_of, found))
-    told: dict[str, Any] = json.loads(await kept.awaited(key, lambda: apart(played.difference, *found), LONG))
+    body = await kept.awaited(key, lambda: apart(played.difference, *found), LONG)
+    told: dict[str, Any] = await run_in_threadpool(json.loads, body)
     return told
 
 
@@ -194,7 +203,7 @@ def _replay_link(found: list[Run], spot: tuple[int, ...], by: int) -> str:
     if spot[-2] + by < 0:
         return ""
     other = [*spot[:-2], spot[-2] + by, 0]
-    return link("/compare/replay", {"run": [each.run_id for each in found], "at": spot_text(other)})
+    return link("/compare/replay", {"run": [each.run_id for each in found], "at": step_reference(other)})
 
 
 def _still(run: Run) -> str:

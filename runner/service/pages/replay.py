@@ -8,7 +8,9 @@ from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse
+from starlette.concurrency import run_in_threadpool
 
+from runner.analysis.step_reference import episode_reference
 from runner.errors import RunnerError
 from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
@@ -18,7 +20,7 @@ from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
 from runner.service.pages.frame import framed
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page
-from runner.service.pages.spots import episode_place, episode_text
+from runner.service.pages.spots import episode_place
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
@@ -74,14 +76,26 @@ async def replay_trial(
 async def _replay(
     request: Request, run: Run, kept: KeptOf, apart: ApartOf, which: tuple[int, ...], t: int
 ) -> Response:
-    """Return the page of a step of an episode."""
+    """Return the page of a step of an episode, rendered by a thread: it reads the recording."""
+    part: bytes | RunnerError
+    try:
+        part = await part_of(run, kept, apart, which, max(0, t - BEFORE))
+    except RunnerError as error:
+        part = error
+    return await run_in_threadpool(_rendered, request, run, which, t, part)
+
+
+def _rendered(
+    request: Request, run: Run, which: tuple[int, ...], t: int, part: bytes | RunnerError
+) -> Response:
+    """Return the page of a step, or of the error that came of its episode."""
     spot = (*which, t)
     shown: dict[str, Any] = {"problem": "", "part": None}
     status = HTTPStatus.OK
-    try:
-        shown |= _shown(json.loads(await part_of(run, kept, apart, which, max(0, t - BEFORE))), t)
-    except RunnerError as error:
-        shown["problem"], status = message_of(error, request), HTTPStatus.NOT_FOUND
+    if isinstance(part, RunnerError):
+        shown["problem"], status = message_of(part, request), HTTPStatus.NOT_FOUND
+    else:
+        shown |= _shown(json.loads(part), t)
     with open_recording(run.recording) as recording:
         around = _around(run, recording, which)
     return page(
@@ -93,7 +107,7 @@ async def _replay(
         **shown,
         which=which,
         source=f"/api/v1/runs/{run.run_id}/replay/{episode_place(spot)}",
-        spot=episode_text(spot),
+        spot=episode_reference(spot),
     )
 
 

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse
 
+from runner.analysis.step_reference import parse_step_reference
 from runner.cache import cache_folder
 from runner.errors import RunnerError, StorageError
 from runner.service import played
@@ -24,7 +25,7 @@ from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
 from runner.service.guard import POLICY
 from runner.service.pages.frame import framed
 from runner.service.pages.rendering import link, page
-from runner.service.pages.spots import episode_in_words, parse_spot, replay_address
+from runner.service.pages.spots import episode_in_words, replay_address
 
 router = APIRouter(include_in_schema=False)
 
@@ -42,7 +43,7 @@ _SECONDS: Final = 60
 @router.get("/runs/{run}/rerun")
 def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
     """Show the Rerun viewer, opened at a step."""
-    spot = parse_spot(at)
+    spot = parse_step_reference(at) if at else ()
     return page(
         request,
         "run_rerun.html",
@@ -62,7 +63,7 @@ async def frame(
     at: Annotated[str, Query(max_length=60)] = "",
 ) -> Response:
     """Show nothing but the viewer, at a step."""
-    spot = parse_spot(at)
+    spot = parse_step_reference(at) if at else ()
     key = ("spot", state_of(run), spot)
     step = await kept.awaited(key, lambda: apart(played.spot, run, spot), LONG)
     asked: dict[str, Any] = {"episodes": spot[0]} if len(spot) == 2 else {"evaluations": list(spot[:1])}

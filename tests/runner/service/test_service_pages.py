@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
 import re
 
 import pytest
 
 from runner.finding import find_run
+from runner.recording import reader
 from runner.recording.reader import open_recording
 from runner.words import states_in_words
 from tests.runner.export.outline import Outline
@@ -116,6 +119,8 @@ PAGES = (
     "/runs/first/learned",
     "/runs/first/config",
     "/runs/first/rerun?at=3:2",
+    "/runs/first/rerun?at=3",
+    "/runs/first/rerun?at=eval:10",
     "/runs/first/rerun/frame?at=3:2",
     "/compare?run=first&run=second",
     "/compare/divergence?run=first&run=second",
@@ -128,6 +133,7 @@ PAGES = (
     "/submit?from=first",
     "/submit?sweep=true",
     "/disk",
+    "/compare/replay?run=first&run=second&at=eval:60",
 )
 
 
@@ -140,9 +146,9 @@ MISSING = [
     ("/runs/nothing", 404, "no run"),
     ("/runs/first/replay/train/60", 404, "there are 60, from 0"),
     ("/runs/first/replay/eval/7/0", 404, "the nearest after 10"),
-    ("/runs/first/rerun?at=1", 400, "expected EPISODE:T"),
+    ("/runs/first/rerun?at=1:x", 400, "expected EPISODE:T"),
     ("/compare?run=first", 400, "expected 2 to 12"),
-    ("/compare/replay?run=first&run=second&at=eval:60", 400, "expected EPISODE:T"),
+    ("/compare/replay?run=first&run=second&at=eval", 400, "expected EPISODE:T"),
     ("/sweeps/nothing", 404, "no sweep"),
     ("/queue/9", 404, "no job 9"),
 ]
@@ -265,3 +271,22 @@ def test_what_a_run_keeps_of_its_failure_does_not_say_where_the_folder_is(client
     pages = [page_of(client, "/runs/first"), page_of(client, "/runs/first/config")]
     assert told.json()["error"] in pages[0]
     assert [text for text in (told.text, *pages) if str(recordings) in text] == []
+
+
+@pytest.mark.parametrize(
+    "address", ["/runs/first/replay/train/3", "/compare/replay?run=first&run=second&at=3"]
+)
+def test_no_recording_is_read_by_the_event_loop(client, monkeypatch, address):
+    """A slow disk must keep nobody waiting but who asks for what is on it."""
+    read = reader.open_recording
+    read_by_loop = []
+
+    def opened(path):
+        with contextlib.suppress(RuntimeError):
+            read_by_loop.append(asyncio.get_running_loop())
+        return read(path)
+
+    monkeypatch.setattr(reader, "open_recording", opened)
+    monkeypatch.setattr("runner.service.pages.replay.open_recording", opened)
+    assert client.get(address).status_code == 200
+    assert read_by_loop == []
