@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from runner.errors import RecordingError
-from runner.frames import agents_of, evaluation_records, training_records
+from runner.frames import agents_of, evaluation_records, loop_summary, training_records
 from runner.recording.reader import Recording, open_recording
 from runner.runs import Run
 
@@ -39,6 +39,7 @@ def describe(run: Run, recording: Recording) -> dict[str, Any]:
         "eval": evaluation_records(recording),
         "optimality": [_without_times(measures) for measures in recording.optimality()],
         "train": training_records(recording),
+        "loop": None if recording.kind == "job" else loop_summary(recording),
     }
 
 
@@ -63,7 +64,7 @@ def _without_recording(run: Run) -> dict[str, Any]:
     """Return what `run.json` alone tells: the run never came to record anything, or its file is gone."""
     unknown = dict.fromkeys(("content_digest", "train_steps", "eval_steps", "episodes", "seconds"))
     nothing: dict[str, Any] = {"bytes": 0, "provenance": {}}
-    nothing |= {part: [] for part in ("tables", "eval", "optimality", "train")}
+    nothing |= {part: [] for part in ("tables", "eval", "optimality", "train")} | {"loop": None}
     told = {key: run.summary.get(key) for key in unknown}
     return {**_identity(run), **told, **nothing, "config": run.facts.get("config", {})}
 

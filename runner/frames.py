@@ -35,6 +35,11 @@ if TYPE_CHECKING:
 
 Phase = Literal["train", "eval"]
 
+RECENT_EPISODES: Final = 100
+"""Training episodes that the summary of a loop averages, the last ones."""
+LARGEST: Final = 1e300
+"""Values beyond it are left out of means: their sums, and the margins of an axis, would overflow."""
+
 _BEFORE: Final = ("step", "episode", "t", "state", "action", "next_state", "next_observation")
 _BEHIND: Final = ("terminated", "truncated", "explored", "acted", "agents_terminated", "agents_truncated")
 """The fields of a step in the order of its columns: those before the rewards, and those behind them."""
@@ -212,9 +217,76 @@ def evaluation_records(recording: Recording) -> list[dict[str, Any]]:
     Each has `episode` (training episodes before it), `finish_percent` (None where the environment does
     not say what success is), `mean_length`, `mean_penalties`, ..., `events` by name, summed over the
     trials, and under `training` what `training_records` has.
+
+    The evaluations of a loop are its evaluation episodes between two training episodes. They have no `step`
+    and no `training`; `mean_penalties` is None where the environment does not define penalties; returns that
+    are not finite are left out of `mean_returns` and counted in `not_finite`.
     """
     agents, events = agents_of(recording), event_names_of(recording)
+    if recording.kind != "job":
+        return _loop_evaluations(recording, agents, events)
     return [evaluation_record(metrics, agents, events) for metrics in recording.metrics("eval")]
+
+
+def loop_summary(recording: Recording) -> dict[str, Any]:
+    """Return the last results of a loop, computed from its recording.
+
+    Keys: `last_evaluation` (None if there was none) with `episode`, `trials`, `finish_percent`,
+    `mean_length`, `mean_penalties` and `mean_return` (summed over agents); `recent_training` with
+    `episodes`, `mean_length` and `mean_return` of the last `RECENT_EPISODES`; `logged`, the last value logged
+    under each name. A value that is unknown or not finite is None.
+    """
+    from runner.recording import schema
+
+    total = recording.count(schema.TRAIN_EPISODE)
+    evaluations = evaluation_records(recording)
+    recent = recording.episodes("train", max(0, total - RECENT_EPISODES), total)
+    return {
+        "last_evaluation": None if not evaluations else _brief(evaluations[-1]),
+        "recent_training": {
+            "episodes": len(recent),
+            "mean_length": finite_mean(recent["length"]),
+            "mean_return": finite_mean(recent["returns"].sum(axis=1)),
+        },
+        "logged": _last_logged(recording),
+    }
+
+
+def _last_logged(recording: Recording) -> dict[str, float | None]:
+    """Return the last value logged under each name, from the result if that carries them."""
+    from runner.recording import schema
+
+    logged = recording.result.get("logged")
+    if isinstance(logged, dict) and all(value is None or type(value) is float for value in logged.values()):
+        return logged
+    return {
+        scalar["name"]: scalar["value"] if math.isfinite(scalar["value"]) else None
+        for scalar in recording.decoded(schema.SCALAR_TOPIC)
+    }
+
+
+def finite_mean(values: NDArray[Any]) -> float | None:
+    """Return the mean of those values that are finite and no larger than `LARGEST`; None without any."""
+    usable = is_usable(values)
+    return float(values[usable].mean()) if usable.any() else None
+
+
+def is_usable(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which values are finite and small enough that sums of them stay finite."""
+    return abs(values) <= LARGEST  # false for NaN
+
+
+def trained_before(recording: Recording) -> NDArray[np.int64]:
+    """Return for each evaluation episode of a loop how many training episodes had ended before it."""
+    import numpy as np
+
+    from runner.recording import schema
+
+    trained, tested = (
+        np.concatenate([np.empty(0, np.uint64), *(block["log_time"] for block in recording.blocks(topic))])
+        for topic in (schema.TRAIN_EPISODE, schema.EVAL_EPISODE)
+    )
+    return np.searchsorted(trained, tested)
 
 
 def training_records(recording: Recording) -> list[dict[str, Any]]:
@@ -255,6 +327,57 @@ def evaluation_record(
         "events": dict(zip(events, metrics["events"], strict=True)),
         "training": _training_side(metrics, agents),
     }
+
+
+def _loop_evaluations(
+    recording: Recording, agents: Sequence[str], events: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Return a record for each group of evaluation episodes with no training episode between them."""
+    import numpy as np
+
+    from runner.recording import schema
+
+    before, first = trained_before(recording), 0
+    found: dict[int, list[NDArray[np.void]]] = {}
+    for block in recording.blocks(schema.EVAL_EPISODE):
+        after, first = before[first : first + len(block)], first + len(block)
+        for episodes in np.unique(after).tolist():
+            found.setdefault(episodes, []).append(block[after == episodes])
+    environment = recording.environment
+    return [
+        _loop_evaluation(number, episode, np.concatenate(found[episode]), agents, events)
+        | ({} if environment["success_events"] else {"successes": None, "finish_percent": None})
+        | ({} if environment["penalty_below"] is not None else {"mean_penalties": None})
+        for number, episode in enumerate(sorted(found))
+    ]
+
+
+def _loop_evaluation(
+    number: int, episode: int, trials: NDArray[np.void], agents: Sequence[str], events: Sequence[str]
+) -> dict[str, Any]:
+    returns = trials["returns"]
+    return {
+        "evaluation": number,
+        "episode": episode,
+        "trials": len(trials),
+        "successes": int(trials["success"].sum()),
+        "finish_percent": 100 * float(trials["success"].mean()),
+        "mean_length": float(trials["length"].mean()),
+        "mean_penalties": float(trials["penalties"].mean()),
+        "terminations": int(trials["terminated"].sum()),
+        "mean_returns": {agent: finite_mean(returns[:, i]) for i, agent in enumerate(agents)},
+        "not_finite": int((~is_usable(returns)).sum()),
+        "events": dict(zip(events, trials["events"].sum(axis=0, dtype=int).tolist(), strict=True)),
+    }
+
+
+def _brief(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a summary has of an evaluation of a loop."""
+    returns = list(record["mean_returns"].values())
+    brief = {
+        key: record[key] for key in ("episode", "trials", "finish_percent", "mean_length", "mean_penalties")
+    }
+    return brief | {"mean_return": None if None in returns else sum(returns)}
 
 
 def _training_side(metrics: Mapping[str, Any], agents: Sequence[str]) -> dict[str, Any]:

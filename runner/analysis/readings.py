@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.series import LARGEST, LOGGED, SHARES, Readings, RunSeries
+from runner.analysis.series import LOGGED, SHARES, Readings, RunSeries
 from runner.errors import RecordingError
-from runner.frames import agents_of, evaluation_records, event_names_of, training_records
+from runner.frames import LARGEST, agents_of, evaluation_records, is_usable, training_records
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.words import spoken
@@ -58,26 +58,20 @@ def loop_series(recording: Recording) -> RunSeries:
     for name, values in _binned_scalars(recording, edges, not_finite).items():
         for k in np.flatnonzero(~np.isnan(values)).tolist():
             training.setdefault(int(edges[k + 1]), {})[f"{LOGGED}{name}"] = {"": float(values[k])}
+    evaluations = evaluation_records(recording)
+    if left_out := sum(record["not_finite"] for record in evaluations):
+        not_finite["mean_return"] = left_out
     return RunSeries(
         run_id=recording.run["run_id"],
         name=recording.run["name"],
         seed=int(recording.run["seed"]),
         status=recording.status,
         config=_without_seed(recording.config, int(recording.run["seed"])),
-        evaluation=_loop_evaluations(recording, not_finite),
+        evaluation=[(record["episode"], _loop_readings(record)) for record in evaluations],
         training=sorted(training.items()),
         content_digest=recording.result.get("content_digest", ""),
         not_finite=dict(not_finite),
     )
-
-
-def trained_before(recording: Recording) -> NDArray[np.int64]:
-    """Return for each evaluation episode of somebody's own loop how many of training had ended before."""
-    trained, tested = (
-        np.concatenate([np.empty(0, np.uint64), *(block["log_time"] for block in recording.blocks(topic))])
-        for topic in (schema.TRAIN_EPISODE, schema.EVAL_EPISODE)
-    )
-    return np.searchsorted(trained, tested)
 
 
 def evaluation_readings(record: Mapping[str, Any]) -> Readings:
@@ -88,12 +82,21 @@ def evaluation_readings(record: Mapping[str, Any]) -> Readings:
     for name, count in record["events"].items():
         agent, _, kind = name.rpartition(".")
         events.setdefault(f"event.{kind}", {})[agent] = count / trials
-    means = {
-        "mean_length": {"": record["mean_length"]},
-        "mean_penalties": {"": record["mean_penalties"]},
-        "mean_return": dict(record["mean_returns"]),
-    }
+    returns = {agent: value for agent, value in record["mean_returns"].items() if value is not None}
+    means: Readings = {"mean_length": {"": record["mean_length"]}}
+    if record["mean_penalties"] is not None:
+        means["mean_penalties"] = {"": record["mean_penalties"]}
+    if returns:
+        means["mean_return"] = returns
     return known | means | events
+
+
+def _loop_readings(record: Mapping[str, Any]) -> Readings:
+    """Return the readings of an evaluation of a loop; the return of a single agent has no name."""
+    readings = evaluation_readings(record)
+    if len(record["mean_returns"]) == 1 and "mean_return" in readings:
+        readings["mean_return"] = {"": next(iter(readings["mean_return"].values()))}
+    return readings
 
 
 def exact_readings(measures: Mapping[str, Any], agents: Sequence[str]) -> Readings:
@@ -139,11 +142,6 @@ def _stretch(episodes: int) -> int:
     """Return how many episodes are told as one."""
     widths: Iterator[int] = (factor * int(10**power) for power in range(18) for factor in (1, 2, 5))
     return next(width for width in widths if episodes <= width * _POINTS)
-
-
-def is_usable(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which values are finite and small enough to be summed and drawn."""
-    return np.abs(values) <= LARGEST  # false for NaN
 
 
 def _binned_episodes(
@@ -204,34 +202,3 @@ def _binned_scalars(
         counts[name][k] += 1
     with np.errstate(invalid="ignore"):
         return {name: sums[name] / counts[name] for name in sums}
-
-
-def _loop_evaluations(recording: Recording, not_finite: Counter[str]) -> list[tuple[int, Readings]]:
-    """Return the means of the evaluation episodes, by the training episodes that were done before."""
-    before, first = trained_before(recording), 0
-    agents, events = agents_of(recording), event_names_of(recording)
-    known = bool(recording.environment["success_events"])
-    found: dict[int, list[NDArray[np.void]]] = {}
-    for block in recording.blocks(schema.EVAL_EPISODE):
-        after, first = before[first : first + len(block)], first + len(block)
-        for episodes in np.unique(after).tolist():
-            found.setdefault(episodes, []).append(block[after == episodes])
-    evaluations = []
-    for episodes, parts in found.items():
-        trials = np.concatenate(parts)
-        usable = is_usable(trials["returns"])
-        if not usable.all():
-            not_finite["mean_return"] += int((~usable).sum())
-        readings: Readings = {"mean_length": {"": float(trials["length"].mean())}}
-        sums = np.where(usable, trials["returns"], 0.0).sum(axis=0)
-        if means := _means(agents, sums, usable.sum(axis=0)):
-            readings["mean_return"] = means
-        if known:
-            readings["finish_percent"] = {"": 100 * float(trials["success"].mean())}
-        if recording.environment["penalty_below"] is not None:
-            readings["mean_penalties"] = {"": float(trials["penalties"].mean())}
-        for i, name in enumerate(events):
-            agent, _, kind = name.rpartition(".")
-            readings.setdefault(f"event.{kind}", {})[agent] = float(trials["events"][:, i].mean())
-        evaluations.append((episodes, readings))
-    return sorted(evaluations, key=lambda one: one[0])

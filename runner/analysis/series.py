@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from runner.frames import LARGEST
 from runner.words import event_in_words
 
 Readings = dict[str, dict[str, float]]
@@ -40,8 +41,6 @@ class RunSeries:
         return self.status == "finished"
 
 
-LARGEST: Final = 1e300
-"""Larger values are left out of the readings: their sums, and the margins of an axis, would overflow."""
 SHARES: Final = "training.reward"
 """The metric whose lines are shares of a whole."""
 LOGGED: Final = "training.logged."

@@ -21,13 +21,20 @@ MADE: Final = ("same_as", "path")
 PROGRAMS: Final = (
     *("run_id", "name", "config", "seed", "status", "tags", "note", "created"),
     *("episodes", "episodes_to_do", "train_steps", "eval_steps", "seconds"),
-    *("finish_percent", "mean_length", "mean_penalties", "bytes", "content_digest", "same_as"),
+    *("finish_percent", "mean_length", "mean_penalties", "mean_return", "logged"),
+    *("bytes", "content_digest", "same_as"),
     *("mode", "environment", "host", "git", "archive", "path"),
 )
 """What programs are told of a run, unless they ask for other columns."""
-HEADINGS: Final = {"finish_percent": "finished %", "bytes": "size", "tag": "tags", "same_as": "same as"}
+HEADINGS: Final = {
+    "finish_percent": "finished %",
+    "mean_return": "return",
+    "bytes": "size",
+    "tag": "tags",
+    "same_as": "same as",
+}
 """What stands above a column, if that is not its name."""
-_OFTEN_EMPTY: Final = ("tag", "same_as", "note", "archive")
+_OFTEN_EMPTY: Final = ("tag", "same_as", "note", "archive", "logged")
 _FIELD_OF: Final = {"run_id": "id", "tags": "tag", "content_digest": "digest"}
 
 
@@ -67,7 +74,8 @@ def value(row: dict[str, Any], column: str) -> Any:
             return round((datetime.now(UTC) - moment(row)).total_seconds())
         case "path":
             return str(Path(row["root"], row["entry"], RECORDING_FILE))
-    return row[FIELDS[name].column or name] if name in FIELDS else row[name]
+    found = row[FIELDS[name].column or name] if name in FIELDS else row[name]
+    return json.loads(found) if name == "logged" else found
 
 
 def as_json(row: dict[str, Any], columns: Sequence[str] = PROGRAMS) -> dict[str, Any]:
@@ -85,7 +93,7 @@ def in_words(row: dict[str, Any], column: str) -> str:
     found = value(row, column)
     if column == "episodes" and row["episodes_to_do"] not in (None, found):
         return f"{UNKNOWN if found is None else f'{found:,}'} of {row['episodes_to_do']:,}"
-    if found is None or found == []:
+    if found is None or found in ([], {}):
         return "" if column in _OFTEN_EMPTY else UNKNOWN
     if column == "created":
         return f"{moment(row):%Y-%m-%d %H:%M}"
@@ -95,8 +103,16 @@ def in_words(row: dict[str, Any], column: str) -> str:
     return f"{found:,}" if plain else str(found)
 
 
+def _logged_in_words(values: dict[str, float | None]) -> str:
+    """Return logged values on one line: `loss 0.0123, entropy 1.5`."""
+    return ", ".join(
+        f"{name} {'not finite' if value is None else f'{value:,.4g}'}" for name, value in values.items()
+    )
+
+
 _IN_WORDS: Final[dict[str, Callable[[Any], str]]] = {
-    **dict.fromkeys(("finish_percent", "mean_length", "mean_penalties"), number),
+    **dict.fromkeys(("finish_percent", "mean_length", "mean_penalties", "mean_return"), number),
+    "logged": _logged_in_words,
     "age": age,
     "bytes": size,
     "seconds": duration,

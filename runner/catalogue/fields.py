@@ -57,6 +57,12 @@ _ALL: Final = (
     Field("finish_percent", Kind.NUMBER, "percent of the last evaluation's trials that finished"),
     Field("mean_length", Kind.NUMBER, "mean length of the last evaluation's trials"),
     Field("mean_penalties", Kind.NUMBER, "mean penalties of the last evaluation's trials"),
+    Field(
+        "mean_return",
+        Kind.NUMBER,
+        "of a loop: mean return in its last evaluation, or in its last 100 training episodes",
+    ),
+    Field("logged", Kind.PROSE, "the values that a loop logged last, by name"),
     Field("seconds", Kind.NUMBER, "how long it took"),
     Field("bytes", Kind.SIZE, "the size of its recording"),
     Field("digest", Kind.START, "the content digest: equal content, equal digest"),

@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from typing import Any, Final
 
 from peewee import BigIntegerField, BooleanField, CompositeKey, Field, FloatField, Model, TextField
@@ -17,6 +18,9 @@ SEEDS: Final = 2**64
 _LARGEST: Final = 2**63 - 1
 _MODES: Final = {("joint", "team"): "cooperative", ("per_agent", "individual"): "competitive"}
 _DEPTH: Final = 20
+_LOGGED: Final = 64
+_NAME: Final = 200
+"""Logged names that are kept, and the letters of one."""
 _TEXT: Final = 4000
 """The most characters kept of a text, and the most settings of a configuration."""
 
@@ -68,6 +72,9 @@ class Row(Model):
     finish_percent = FloatField(null=True)
     mean_length = FloatField(null=True)
     mean_penalties = FloatField(null=True)
+    mean_return = FloatField(null=True)
+    logged = TextField(null=True)
+    """The last value logged under each name, as a JSON object; null for a value that is not finite."""
     seconds = FloatField(null=True)
     bytes = BigIntegerField(null=True)
     digest = TextField(null=True)
@@ -121,6 +128,8 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         "train_steps": train,
         "eval_steps": evaluation,
         **{key: number(last.get(key)) for key in ("finish_percent", "mean_length", "mean_penalties")},
+        "mean_return": _mean_return(summary),
+        "logged": json.dumps(_logged(summary)),
         "seconds": number(summary.get("seconds")),
         "bytes": size,
         "digest": text(summary.get("content_digest")),
@@ -143,6 +152,21 @@ def _recorded(run: Run) -> Mapping[str, Any]:
         with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
             return recording.done()
     return {}
+
+
+def _mean_return(summary: Mapping[str, Any]) -> float | None:
+    """Return the mean return of a loop's last evaluation; of its last training episodes without one."""
+    last, recent = (_mapping(summary.get(key)) for key in ("last_evaluation", "recent_training"))
+    return number((last or recent).get("mean_return"))
+
+
+def _logged(summary: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return the last logged values of a loop by name."""
+    return {
+        name: number(value)
+        for name, value in islice(_mapping(summary.get("logged")).items(), _LOGGED)
+        if text(name, _NAME) == name
+    }
 
 
 def text(value: Any, most: int = _TEXT) -> str | None:

@@ -45,7 +45,7 @@ def evaluation_table(
     unbounded = console.options.update(width=UNBOUNDED)
     left_out: list[str] = []
     while True:
-        made = _drawn([*_measures(records), *[event.column(records) for event in events], _fill(records)])
+        made = _drawn([*_measures(records), *[event.column(records) for event in events], *_fill(records)])
         if left_out:
             made.caption = f"No room for: {', '.join(left_out)}."
             made.caption_justify = "left"
@@ -84,19 +84,29 @@ def _events(names: Iterable[str], success_events: Sequence[str]) -> list[_Event]
 
 
 def _measures(records: Sequence[Mapping[str, Any]]) -> list[_Column]:
-    return [
-        _Column("episode", [f"{record['episode']:,}" for record in records]),
-        _Column("finish %", [number(record["finish_percent"]) for record in records]),
-        _Column("mean length", [f"{record['mean_length']:.1f}" for record in records]),
-        _Column("mean penalties", [f"{record['mean_penalties']:.1f}" for record in records]),
-    ]
+    """Return the columns of the measures that the environment defines; of a loop also the return."""
+    columns = [_Column("episode", [f"{record['episode']:,}" for record in records])]
+    if not all("training" in record for record in records):
+        columns.append(_Column("trials", [f"{record['trials']:,}" for record in records]))
+        columns.append(_Column("mean return", [_returns(record["mean_returns"]) for record in records]))
+    measures = (("finish %", "finish_percent"), ("mean length", "mean_length"))
+    for heading, key in (*measures, ("mean penalties", "mean_penalties")):
+        if "training" in records[0] or any(record[key] is not None for record in records):
+            columns.append(_Column(heading, [number(record[key]) for record in records]))
+    return columns
 
 
-def _fill(records: Sequence[Mapping[str, Any]]) -> _Column:
-    """Return how full the tables are; each of several to the percent."""
+def _returns(returns: Mapping[str, float | None]) -> str:
+    return "/".join(number(value) for value in returns.values())
+
+
+def _fill(records: Sequence[Mapping[str, Any]]) -> list[_Column]:
+    """Return how full the tables are, each of several to the percent; nothing for a loop."""
+    if not all("training" in record for record in records):
+        return []
     filled = [list(record["training"]["percent_filled"].values()) for record in records]
     digits = 0 if len(filled[0]) > 1 else 1
-    return _Column("filled %", ["/".join(f"{percent:.{digits}f}" for percent in own) for own in filled])
+    return [_Column("filled %", ["/".join(f"{percent:.{digits}f}" for percent in own) for own in filled])]
 
 
 def _drawn(columns: Sequence[_Column]) -> Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -13,13 +14,27 @@ from runner.cli.output import console, draw, table
 
 _NARROWEST: Final = 14
 """The width at which a shrinking column can still be read."""
-_MISSED: Final = ("config", "bytes", "episodes", "seed", "folder", "age")
+_MISSED: Final = ("config", "logged", "bytes", "episodes", "seed", "folder", "age")
 _LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
-_SHRINKING: Final = ("name", "config", "tags", "note", "environment", "host", "archive", "folder", "path")
+_SHRINKING: Final = (
+    "name",
+    "config",
+    "tags",
+    "note",
+    "logged",
+    "environment",
+    "host",
+    "archive",
+    "folder",
+    "path",
+)
 
 
 def print_csv(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
-    """Print rows as CSV on stdout, with a heading; several tags are separated by blanks."""
+    """Print rows as CSV on stdout, with a heading.
+
+    Several tags are separated by blanks, logged values are a JSON object.
+    """
     import csv
     import io
 
@@ -28,8 +43,14 @@ def print_csv(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
     writer.writerow(columns)
     for row in rows:
         told = as_json(row, columns).values()
-        writer.writerow([" ".join(item) if isinstance(item, list) else item for item in told])
+        writer.writerow([_csv_cell(item) for item in told])
     click.echo(text.getvalue(), nl=False)
+
+
+def _csv_cell(item: Any) -> Any:
+    if isinstance(item, list):
+        return " ".join(item)
+    return json.dumps(item) if isinstance(item, dict) else item
 
 
 def usual_columns(rows: Sequence[dict[str, Any]], folders: int) -> list[str]:
@@ -39,9 +60,14 @@ def usual_columns(rows: Sequence[dict[str, Any]], folders: int) -> list[str]:
         "tag": any(row["tags"] for row in rows),
         "same_as": any(row["same_as"] for row in rows),
         "folder": folders > 1,
+        "finish_percent": any(row["finish_percent"] is not None for row in rows)
+        or all(row["mean_return"] is None for row in rows),
+        "mean_return": any(row["mean_return"] is not None for row in rows),
+        "logged": any(row["logged"] != "{}" for row in rows),
     }
-    usual = ("id", "name", "config", "seed", "status", "tag", "episodes", "finish_percent", "bytes", "age")
-    return [column for column in (*usual, "same_as", "folder") if telling.get(column, True)]
+    identity = ("id", "name", "config", "seed", "status", "tag", "episodes")
+    results = ("finish_percent", "mean_return", "logged", "bytes", "age", "same_as", "folder")
+    return [column for column in (*identity, *results) if telling.get(column, True)]
 
 
 def print_table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:

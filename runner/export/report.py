@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -38,6 +39,7 @@ from runner.words import event_in_words, spoken
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
 Choice = tuple[str, int, int]
 """An episode to show: ("train", number, 0), or ("eval", training episodes before it, trial)."""
@@ -83,7 +85,7 @@ def render_report(recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> 
     for path in recordings:
         with open_recording(path) as recording:
             series.append(read_series(recording))
-            runs.append(_run(recording, series[-1], len(runs), chosen))
+            runs.append(_run(recording, len(runs), chosen))
     page = (
         templates()
         .get_template("report.html")
@@ -103,7 +105,7 @@ def render_report(recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> 
 # --- one run ------------------------------------------------------------------------------------------
 
 
-def _run(recording: Recording, series: RunSeries, number: int, chosen: Sequence[Choice]) -> dict[str, Any]:
+def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[str, Any]:
     """Return all that the page says of a run."""
     evaluations = evaluation_records(recording)
     environment = recording.environment
@@ -119,7 +121,10 @@ def _run(recording: Recording, series: RunSeries, number: int, chosen: Sequence[
         "learners": agents_of(recording),
         "environment": environment,
         "facts": _facts(recording),
-        "last": evaluations[-1] if evaluations else _last_of_loop(series),
+        "conduct": _conduct(recording),
+        "made_by": recording.config.get("made_by", ""),
+        "last": evaluations[-1] if evaluations else None,
+        "last_return": _return_of(evaluations[-1]) if evaluations else None,
         "steps": has_steps(recording),
         "evaluations": evaluations,
         "event_names": [_heading(name) for name in environment["event_names"]],
@@ -147,13 +152,17 @@ def _notes(recording: Recording) -> list[str]:
     return notes
 
 
-def _last_of_loop(series: RunSeries) -> dict[str, Any] | None:
-    """Return the measures of the evaluation episodes that came last in somebody's own loop, if it has any."""
-    if not series.evaluation:
-        return None
-    episode, readings = series.evaluation[-1]
-    names = ("finish_percent", "mean_length", "mean_penalties")
-    return {"episode": episode} | {name: readings.get(name, {}).get("") for name in names}
+def _conduct(recording: Recording) -> str:
+    """Return how the agents of a run act: `learning`, `random`, or unknown, in a `loop`."""
+    if recording.kind != "job":
+        return "loop"
+    return "random" if recording.config["algorithm"] == "random" else "learning"
+
+
+def _return_of(evaluation: Mapping[str, Any]) -> float | None:
+    """Return the mean return of an evaluation, summed over agents; None if one is not finite."""
+    returns = list(evaluation["mean_returns"].values())
+    return None if None in returns else sum(returns)
 
 
 def _facts(recording: Recording) -> dict[str, str]:
@@ -305,8 +314,15 @@ def templates() -> Environment:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters["number"] = _number
+    environment.filters |= {"number": _number, "code": code}
     return environment
+
+
+def code(text: str) -> Markup:
+    """Return a text as HTML in which what stands between backticks is set as code."""
+    from markupsafe import Markup, escape
+
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def _number(value: float | None, digits: int = 1) -> str:

@@ -69,6 +69,7 @@ class Recorder:
         beat: called about once a second while the recorder lives, by who writes.
         sizes: the fixed-width topics of the recording; those of a job unless given.
         threads: False packs and writes in the thread that records.
+        watch: called with the records of a block as they are taken in; the block is used again.
     """
 
     def __init__(
@@ -83,8 +84,10 @@ class Recorder:
         beat: Callable[[], None] = lambda: None,
         sizes: Mapping[Topic, Sizes] | None = None,
         threads: bool = True,
+        watch: Callable[[Topic, NDArray[np.void]], None] = lambda *_: None,
     ) -> None:
         self._file = file
+        self._watch = watch
         self._past = past or Past()
         sizes = sizes or {topic: block_counts(topic, learners, events) for topic in schema.BLOCK_TOPICS}
         self._lanes = {
@@ -246,6 +249,7 @@ class Recorder:
             self._past.check_new(topic, fresh)
         block.filled += len(positions)
         self.counts[topic.name] += len(positions)
+        self._watch(topic, fresh)
         if known:
             self._close_block(lane, write=False)
             return

@@ -65,15 +65,14 @@ def records(path: Path, which: Which, start: int, stop: int, most: int) -> bytes
 
     Raises:
         Refused: they are more than `most`.
-        RecordingError: the recording cannot be read, or is of a loop, which has none.
+        RecordingError: the recording cannot be read, or is of a loop, which has no reports of training.
     """
     with open_recording(path) as recording:
         if which == "optimality":
             found = list(recording.optimality())
         else:
-            recording.require_job(
-                "a report of training or an evaluation", "Its metrics can be had all the same."
-            )
+            if which != "evaluations":
+                recording.require_job("a report of training", "Its metrics can be had all the same.")
             found = (evaluation_records if which == "evaluations" else training_records)(recording)
         shown = found[start:stop]
         if len(shown) > most:

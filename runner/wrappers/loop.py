@@ -33,6 +33,7 @@ from runner.recording.writer import create_recording
 from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
 from runner.service.outbox import Follower, connected, is_server, outbox_folder
 from runner.wrappers.described import Described, as_json
+from runner.wrappers.outcomes import Outcomes
 from runner.wrappers.plan import Plan
 from runner.wrappers.values import lone_number
 
@@ -96,6 +97,7 @@ class Loop(Generic[R]):
             self._file.close()
             self._mark_failed(error)
             raise
+        self._outcomes = Outcomes(described.mdp)
         self._recorder = Recorder(
             self._file,
             learners=len(described.agents),
@@ -104,6 +106,7 @@ class Loop(Generic[R]):
             chunk_steps=plan.chunk_steps,
             beat=self.run.beat,
             sizes=sizes_of(facts, str(path)),
+            watch=self._outcomes.take_records,
         )
         self._follower = Follower(client, self.run, lambda: self._file.size) if client else None
         self.closed = False
@@ -188,6 +191,7 @@ class Loop(Generic[R]):
             step, episode = self.rows(phase).place
             fields = {"name": name, "value": number, "phase": phase, "step": step, "episode": episode}
             self._recorder.append(self._topics["/scalar"], encode(schema.SCALAR, fields), position)
+            self._outcomes.take_logged(name, number)
 
     def snapshot(self, phase: str, name: str, array: Any) -> None:
         """Record an array of numbers as it is now.
@@ -320,8 +324,8 @@ class Loop(Generic[R]):
             | {
                 "episodes": self._recorder.counts["/train/episode"],
                 "steps_recorded": True,
-                "last_evaluation": None,
             }
+            | self._outcomes.summary()
             | ({"error": kept_message(error)} if error else {})
         )
         write_result(self._file, status, result)

@@ -53,12 +53,15 @@ def command(
 
     \b
       id name config seed status tag note created age episodes steps finish_percent
-      mean_length mean_penalties seconds bytes digest mode environment host git
-      archive folder, and config.PATH for any value of the configuration
+      mean_length mean_penalties mean_return logged seconds bytes digest mode
+      environment host git archive folder, and config.PATH for any value of the
+      configuration
 
     Shown are the training episodes done (of those to do, where some are missing), how many percent of the
     last evaluation's trials finished, the size of the recording, how long ago the run began, and which run
-    recorded the same content before; some of that is left out where a terminal is narrow.
+    recorded the same content before; of a loop also the mean return in its last evaluation (in its last 100
+    training episodes, if it has none) and the last values it logged. Some of that is left out where a
+    terminal is narrow.
 
     \b
     Examples:

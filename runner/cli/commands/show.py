@@ -10,7 +10,19 @@ import click
 
 from runner.cli.finding import find, restored
 from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import UNKNOWN, age, console, draw, duration, facts, print_json, say, size, title
+from runner.cli.output import (
+    UNKNOWN,
+    age,
+    console,
+    draw,
+    duration,
+    facts,
+    number,
+    print_json,
+    say,
+    size,
+    title,
+)
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -30,7 +42,9 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
 
     With --json also the whole series: under `eval` an object for each evaluation, with the training
     episodes before it, finish_percent, mean_length, mean_penalties and the count of every event; under
-    `optimality` its exact measures, if the run takes them; under `train` one for each report of training.
+    `optimality` its exact measures, if the run takes them; under `train` one for each report of training;
+    under `loop` the last results of a loop: its last evaluation, the means of its last 100 training episodes
+    and the last values it logged.
 
     \b
     Examples:
@@ -53,6 +67,8 @@ def _draw(run: Run, told: dict[str, Any]) -> None:
     parts: list[RenderableType] = [facts(_head(run, told))]
     if told["eval"]:
         parts += [title("Evaluations"), evaluation_table(told["eval"], told["success_events"], console())]
+    if told["loop"]:
+        parts += [title("Last results"), facts(_loop_results(told["loop"]))]
     if told["optimality"]:
         parts += [title("Greedy policy, exactly"), facts(_exactly(run, told["optimality"][-1]))]
     if told["tables"]:
@@ -82,6 +98,21 @@ def _head(run: Run, told: dict[str, Any]) -> dict[str, str]:
         "digest": told["content_digest"] or f"{UNKNOWN} (told when a run ends properly)",
         "file": f"{run.recording}  {size(told['bytes'])}" if told["bytes"] else "no recording",
     }
+
+
+def _loop_results(loop: dict[str, Any]) -> dict[str, str]:
+    """Return the means of the last training episodes of a loop and the values it logged last."""
+    recent = loop["recent_training"]
+    episodes = f"last {recent['episodes']:,} episodes" if recent["episodes"] > 1 else "one episode"
+    results = {"training": "no episode ended"}
+    if recent["episodes"]:
+        results = {
+            "training": f"mean return {number(recent['mean_return'])}, mean length "
+            f"{number(recent['mean_length'])} ({episodes})"
+        }
+    for name, value in loop["logged"].items():
+        results[f"logged {name}"] = "not finite" if value is None else f"{value:,.6g}"
+    return results
 
 
 def _exactly(run: Run, measures: dict[str, Any]) -> dict[str, str]:

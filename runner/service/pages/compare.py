@@ -17,7 +17,7 @@ from runner.service import played
 from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
 from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, timed_state_of
-from runner.service.pages.frame import head_of
+from runner.service.pages.frame import head_of, is_loop, last_evaluation
 from runner.service.pages.rendering import link, page, picture_address
 from runner.service.pages.spots import (
     after_step,
@@ -178,9 +178,11 @@ def _flat(run: Run) -> dict[str, str]:
 
 def _results(found: list[Run]) -> list[tuple[str, list[str]]]:
     """Return what came of runs, a row a measure."""
-    last = [each.summary.get("last_evaluation") or {} for each in found]
+    last = [last_evaluation(each) for each in found]
+    returns = [amounts.number(each.get("mean_return")) for each in last]
     return [
         ("Status", [each.status for each in found]),
+        *([("Mean return in the last evaluation", returns)] if any(map(is_loop, found)) else []),
         ("Success in the last evaluation, %", [amounts.number(each.get("finish_percent")) for each in last]),
         ("Mean length of its trials", [amounts.number(each.get("mean_length")) for each in last]),
         ("Penalties a trial", [amounts.number(each.get("mean_penalties")) for each in last]),

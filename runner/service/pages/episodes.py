@@ -1,4 +1,4 @@
-"""The episodes of a run, a page at a time: how each went, and a link to its replay."""
+"""The episodes of a run, a page at a time: how each went, and a link to its replay if it has one."""
 
 from __future__ import annotations
 
@@ -28,10 +28,12 @@ def episodes(
     phase: Literal["train", "eval"] = "train",
     number: Annotated[int, Query(alias="page", ge=1, lt=10**9)] = 1,
 ) -> Response:
-    """Show the episodes of a phase, each a link to its replay."""
+    """Show the episodes of a phase; those of a job link to their replay."""
     total = recording.count(recording.topic(f"/{phase}/episode"))
     first = (number - 1) * ROWS
     columns = episode_columns(recording, phase, min(first, total), min(first + ROWS, total))
+    if recording.environment["penalty_below"] is None:
+        columns.pop("penalties")
     titles = [_title(name) for name in columns if name not in _NO_COLUMNS]
     return page(
         request,
@@ -69,7 +71,7 @@ def _episode_rows(
     return [
         {
             "name": addresses[i].replace("eval/", "").replace("train/", "").replace("/", ", trial "),
-            "href": f"/runs/{run.run_id}/replay/{addresses[i]}",
+            "href": f"/runs/{run.run_id}/replay/{addresses[i]}" if recording.kind == "job" else "",
             "cells": [_end(lists, i), *(f"{lists[name][i]:,g}" for name in names)],
         }
         for i in range(len(addresses))

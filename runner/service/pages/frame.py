@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from runner.errors import RecordingError
+from runner.frames import loop_summary
+from runner.recording.reader import open_recording
 from runner.runs import Run
 
 TABS: Final = (
@@ -33,3 +36,24 @@ def head_of(run: Run) -> dict[str, Any]:
         "tags": run.tags,
         "note": run.note,
     }
+
+
+def is_loop(run: Run) -> bool:
+    """Return whether a run was recorded from a loop."""
+    return "made_by" in run.facts.get("config", {})
+
+
+def loop_results(run: Run) -> dict[str, Any]:
+    """Return the last results of a loop as `loop_summary` does; none if the recording cannot be read."""
+    try:
+        with open_recording(run.recording) as recording:
+            return loop_summary(recording)
+    except RecordingError:
+        recent = {"episodes": 0, "mean_length": None, "mean_return": None}
+        return {"last_evaluation": None, "recent_training": recent, "logged": {}}
+
+
+def last_evaluation(run: Run) -> dict[str, Any]:
+    """Return the measures of the last evaluation of a run by name; empty without one."""
+    found = loop_results(run)["last_evaluation"] if is_loop(run) else run.summary.get("last_evaluation")
+    return found or {}

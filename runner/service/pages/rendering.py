@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import functools
-import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from http import HTTPStatus
@@ -14,9 +13,9 @@ from urllib.parse import urlencode
 
 import jinja2
 from fastapi import Request, Response
-from markupsafe import Markup, escape
 
 from runner import amounts
+from runner.export.report import code
 from runner.service.pages import static
 
 TEMPLATES: Final = files("runner.service.pages") / "templates"
@@ -44,7 +43,7 @@ def templates() -> jinja2.Environment:
         "size": amounts.size,
         "duration": amounts.duration,
         "age": _age,
-        "code": _code,
+        "code": code,
         "count": lambda value: amounts.number(value, 0),
         "sentence": lambda text: f"{text[:1].upper()}{text[1:]}{'' if text[-1:] in '.:' else '.'}",
         "with_name": lambda value, name: (name, value),
@@ -90,11 +89,6 @@ def _source(name: str) -> str | None:
         if (folder / name).is_file():
             return (folder / name).read_text("utf-8")
     return None
-
-
-def _code(text: str) -> Markup:
-    """Return a text in which what stands between backticks is code."""
-    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def _age(moment: datetime | str) -> str:

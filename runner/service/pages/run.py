@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 from collections import deque
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from http import HTTPStatus
+from itertools import islice
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
@@ -13,7 +15,7 @@ from fastapi.responses import RedirectResponse
 
 from runner import amounts
 from runner.errors import RecordingError, RunnerError
-from runner.frames import agents_of, evaluation_record
+from runner.frames import agents_of, evaluation_record, evaluation_records
 from runner.labels import MAX_NOTE
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
@@ -33,7 +35,7 @@ from runner.service.dependencies import (
     state_of,
 )
 from runner.service.pages.forms import Form
-from runner.service.pages.frame import framed
+from runner.service.pages.frame import framed, is_loop, loop_results
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page
 from runner.words import event_in_words
@@ -47,6 +49,8 @@ router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 MOST_LINES: Final = 500
 """Lines of a run's log that its page shows: the last ones."""
 MOST_EVALUATIONS: Final = 500
+MOST_LOGGED: Final = 8
+"""Logged values on the first page of a run."""
 BROAD: Final = 60_000
 """A map of more characters than this is shown over the whole width."""
 _LEVELS: Final = {1: "debug", 2: "info", 3: "warning", 4: "error", 5: "fatal"}
@@ -99,14 +103,21 @@ def standing(
 def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
     """Show the last evaluations."""
     is_job = recording.kind == "job"
-    last = deque(recording.iter_metrics("eval") if is_job else (), MOST_EVALUATIONS)
     learners, events = agents_of(recording), recording.environment["event_names"]
+    if is_job:
+        last = deque(recording.iter_metrics("eval"), MOST_EVALUATIONS)
+        shown = [evaluation_record(metrics, learners, events) for metrics in last]
+        total = recording.count(recording.topic("/eval/metrics"))
+    else:
+        records = evaluation_records(recording)
+        shown, total = records[-MOST_EVALUATIONS:], len(records)
     return page(
         request,
         "run_evaluations.html",
         **framed(run, "evaluations"),
-        evaluations=[evaluation_record(metrics, learners, events) for metrics in last],
-        of=recording.count(recording.topic("/eval/metrics")) if is_job else 0,
+        evaluations=shown,
+        of=total,
+        is_job=is_job,
         learners=learners,
         event_names=[event_in_words(name) for name in events],
     )
@@ -155,10 +166,7 @@ def _standing(run: Run, jobs: Jobs, settings: Settings) -> dict[str, Any]:
     last = summary.get("last_evaluation") or {}
     done = summary.get("episode", summary.get("episodes"))
     to_do = run.facts.get("config", {}).get("episodes")
-    facts = {
-        "Success in the last evaluation": _percent(last.get("finish_percent")),
-        "Mean length of its trials": amounts.number(last.get("mean_length")),
-        "Penalties a trial": amounts.number(last.get("mean_penalties")),
+    facts = _results(run, last) | {
         "Training episodes": amounts.UNKNOWN if done is None else f"{done:,}",
         "Steps of training": amounts.number(summary.get("train_steps"), 0),
         "Steps of evaluation": amounts.number(summary.get("eval_steps"), 0),
@@ -174,6 +182,32 @@ def _standing(run: Run, jobs: Jobs, settings: Settings) -> dict[str, Any]:
         "job": number,
         "is_live": run.status == "running" or (number is not None and run.status != "finished"),
     }
+
+
+def _results(run: Run, last: Mapping[str, Any]) -> dict[str, str]:
+    """Return the last results of a run by name: of a loop those that it has."""
+    if not is_loop(run):
+        return {
+            "Success in the last evaluation": _percent(last.get("finish_percent")),
+            "Mean length of its trials": amounts.number(last.get("mean_length")),
+            "Penalties a trial": amounts.number(last.get("mean_penalties")),
+        }
+    results = loop_results(run)
+    evaluation, recent = results["last_evaluation"] or {}, results["recent_training"]
+    episodes = f"the last {recent['episodes']:,} training episodes"
+    measures = {
+        "Success in the last evaluation": _percent(evaluation.get("finish_percent")),
+        "Mean return in the last evaluation": amounts.number(evaluation.get("mean_return")),
+        "Mean length of its trials": amounts.number(evaluation.get("mean_length")),
+        "Penalties a trial": amounts.number(evaluation.get("mean_penalties")),
+        f"Mean return of {episodes}": amounts.number(recent["mean_return"]),
+        f"Mean length of {episodes}": amounts.number(recent["mean_length"]),
+    }
+    logged = {
+        f"Logged last: {name}": "not finite" if value is None else f"{value:,.4g}"
+        for name, value in islice(results["logged"].items(), MOST_LOGGED)
+    }
+    return {name: text for name, text in measures.items() if amounts.UNKNOWN not in text} | logged
 
 
 def _job_of(run: Run, jobs: Jobs) -> tuple[int | None, dict[str, Any]]:

@@ -14,12 +14,16 @@ import numpy as np
 import pandas
 import pytest
 from click.testing import CliRunner
+from starlette.testclient import TestClient
 
 import runner
+from runner import frames
 from runner.analysis.readings import read_series
 from runner.cli import cli
 from runner.recording import schema
 from runner.recording.reader import open_recording
+from runner.service.app import create_app
+from runner.service.settings import Settings
 from tests.runner.wrappers.loops import Rooms, make, play
 
 
@@ -58,6 +62,77 @@ def test_ls_and_show_tell_of_loops(folder):
     assert (told["train_steps"], told["eval_steps"]) == (400, 60)
     assert told["config"]["made_by"] == "runner.record"
     assert dualtaxi(folder, "show", "rooms").exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_ls_and_show_have_the_returns_of_a_loop_and_what_it_logged(folder, name):
+    with open_recording(runner.find_run(name, folder).recording) as recording:
+        trials = recording.episodes("eval", 0, None)
+        episodes = recording.episodes("train", 0, None)[-100:]
+    row = next(run for run in json.loads(dualtaxi(folder, "ls", "--json").stdout) if run["name"] == name)
+    assert row["mean_return"] == pytest.approx(trials["returns"].sum(axis=1).mean())
+    assert row["mean_length"] == pytest.approx(trials["length"].mean())
+    assert row["logged"].keys() == {"loss"}
+    assert (row["finish_percent"] is None) == (name != "lake")
+    listed = dualtaxi(folder, "ls", "--columns", "name,mean_return,logged", name).stdout
+    assert f"{row['mean_return']:,.1f}" in listed
+    assert f"loss {row['logged']['loss']:.4g}" in listed
+
+    shown = json.loads(dualtaxi(folder, "show", name, "--json").stdout)
+    assert [record["trials"] for record in shown["eval"]] == [len(trials)]
+    assert shown["eval"][0]["mean_length"] == pytest.approx(trials["length"].mean())
+    assert shown["loop"]["logged"] == row["logged"]
+    recent = shown["loop"]["recent_training"]
+    assert recent["episodes"] == len(episodes)
+    assert recent["mean_return"] == pytest.approx(episodes["returns"].sum(axis=1).mean())
+    text = dualtaxi(folder, "show", name).stdout
+    assert "Evaluations" in text
+    assert f"mean return {recent['mean_return']:,.1f}" in text
+    assert "logged loss" in text
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_what_a_loop_says_of_itself_at_its_end_is_what_its_recording_holds(folder, name):
+    run = runner.find_run(name, folder)
+    with open_recording(run.recording) as recording:
+        counted = frames.loop_summary(recording)
+        assert counted["last_evaluation"] == pytest.approx(recording.result["last_evaluation"])
+        assert counted["recent_training"] == pytest.approx(recording.result["recent_training"])
+        del recording.result["logged"]  # as in recordings made before
+        assert frames.loop_summary(recording)["logged"] == counted["logged"]
+
+
+def test_a_report_does_not_say_that_a_loop_learns(folder, tmp_path):
+    dualtaxi(folder, "report", "lake", "-o", str(tmp_path / "report.html"))
+    page = (tmp_path / "report.html").read_text()
+    assert "by trial and error" not in page
+    assert "A loop over <b>FrozenLake-v1</b>" in page
+    assert "No evaluation was recorded" not in page
+    assert '<th scope="col">trials</th>' in page
+    assert "<code>dualtaxi view</code>" in page
+
+
+def test_pages_of_a_loop_show_its_evaluations_and_link_to_no_replay(folder, tmp_path):
+    settings = Settings(recordings=(folder,), tokens=tmp_path / "tokens.json")
+    with TestClient(create_app(settings), base_url="http://localhost") as client:
+
+        def page(address):
+            answer = client.get(address, headers={"Accept": "text/html"})
+            assert answer.status_code == 200
+            return answer.text
+
+        for name in ("lake", "pole"):
+            evaluations = page(f"/runs/{name}/evaluations")
+            assert "No evaluation was recorded" not in evaluations
+            assert "/replay/" not in evaluations + page(f"/runs/{name}/episodes")
+            overview = page(f"/runs/{name}")
+            assert "Mean return in the last evaluation" in overview
+            assert "Logged last: loss" in overview
+            assert "<dd>–</dd>" not in overview
+        compared = page("/compare?run=lake&run=pole")
+        assert "Mean return in the last evaluation" in compared
+        answer = client.get("/api/v1/runs/pole/evaluations").json()
+        assert answer["total"] == len(answer["records"]) == 1
 
 
 @pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
