@@ -35,7 +35,7 @@ soak: $(VENV)/.installed-dev  ## kill 200 runs at random moments, and resume eac
 	$(BIN)/python -m tests.reliability.soak --kills 200
 
 fuzz: $(VENV)/.installed-dev  ## feed the reader a million mutated recordings (Linux)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt atheris
+	$(BIN)/python -m pip install --constraint constraints.txt atheris
 	$(BIN)/python -W ignore -m tests.reliability.fuzz --runs 1000000
 
 damage: $(VENV)/.installed-dev  ## change 10,000 single bytes, each to be found by verify
@@ -47,15 +47,18 @@ clean:  ## remove the environment and caches; recordings stay
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	@echo 'Installing dualtaxi and its packages into $(VENV): a few minutes, once.'
+	$(BIN)/python -m pip install --constraint constraints.txt --editable .
 	touch $@
 
 $(VENV)/.installed-service: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[service]'
+	@echo 'Installing dualtaxi with the service into $(VENV): a few minutes, once.'
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[service]'
 	touch $@ $(VENV)/.installed
 
 $(VENV)/.installed-dev: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@echo 'Installing dualtaxi with all that the tests need into $(VENV): a few minutes, once.'
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[dev]'
 	touch $@ $(VENV)/.installed $(VENV)/.installed-service

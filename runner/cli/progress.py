@@ -56,6 +56,25 @@ def steps_line(label: str) -> Iterator[Callable[[int], None]]:
 
 
 @contextlib.contextmanager
+def stage_line(stage: str) -> Iterator[Callable[[str], None]]:
+    """Show on a terminal what is being done and for how long, where there is nothing to count.
+
+    Yields:
+        A function that is called with the next stage, such as `drawing`.
+    """
+    with _line(
+        lambda rich: [
+            rich.SpinnerColumn(),
+            rich.TextColumn("{task.description}", markup=False),
+            rich.TimeElapsedColumn(),
+        ]
+    ) as update:
+        if update is not None:
+            update(description=stage, refresh=True)
+        yield lambda text: update(description=text, refresh=True) if update is not None else None
+
+
+@contextlib.contextmanager
 def bytes_line(label: str) -> Iterator[Callable[[int, int], None]]:
     """Give what is told the bytes done and their number: a line of them, where there is a terminal."""
     with _line(

@@ -49,10 +49,10 @@ def refuse_running(run: Run | None) -> None:
 
 @contextlib.contextmanager
 def announcing() -> Iterator[None]:
-    """Say so when a kernel must be compiled, as it must once after an installation."""
-    from runner.learning.compilation import announced
+    """Say so when a kernel must be compiled, as it must the first time for an algorithm."""
+    from runner.learning.compilation import MESSAGE, announced
 
-    with announced(lambda: say("Compiling the learning kernel, this once: a few seconds.")):
+    with announced(lambda: say(MESSAGE)):
         yield
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from numba.core import event
+
+MESSAGE: Final = "Compiling a kernel for this algorithm and number of agents: a few seconds, the first time."
 
 
 class _Once(event.Listener):  # type: ignore[misc]  # Numba has no types

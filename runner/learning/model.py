@@ -65,8 +65,11 @@ def build_model(mdp: Mdp, tables: str) -> Model:
     masks = classes["mask"]
     event_mask, event_class = np.unique(masks, return_inverse=True)
     support = np.flatnonzero(mdp.start > 0)
+    next_state = mdp.next_state.reshape(-1)
+    # Always read-only, as arrays out of a recording are not: a kernel is compiled for one or the other.
+    next_state.flags.writeable = False
     return Model(
-        next_state=mdp.next_state.reshape(-1),
+        next_state=next_state,
         outcome_class=class_of.astype(np.int32),
         cumulative=_cumulative(mdp.probability.reshape(-1, mdp.probability.shape[-1])),
         rewards=np.ascontiguousarray(classes["rewards"]),

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from runner.analysis.compare import Comparison
     from runner.analysis.groups import Group
     from runner.analysis.series import RunSeries
+    from runner.runs import Run
 
 
 @click.command("compare")
@@ -81,30 +82,40 @@ def command(
     from runner.analysis.compare.moments import moment_of
     from runner.analysis.compare.sections import sections
     from runner.analysis.compare.statistics import require_scipy
+    from runner.cli.progress import stage_line
 
     require_one_form(as_json, as_markdown)
     require_scipy()
     if html is not None:
         require_page(html, force)
     moment, metrics = moment_of(at, target, chosen)
-    groups, notes = grouped(_read(run_names, recordings), by)
-    require_two(groups, by)
-    comparison = compare(groups, metrics_of(groups, metrics), moment, notes)
+    runs = find_all_recorded(run_names, recordings)
+    page = ""
+    with stage_line("reading runs") as stage:
+        groups, notes = grouped(_read(runs), by)
+        require_two(groups, by)
+        stage("computing intervals")
+        comparison = compare(groups, metrics_of(groups, metrics), moment, notes)
+        if html is not None:
+            stage("drawing the page")
+            page = _write_page(html, force, comparison, groups)
     if html is not None:
-        (say if as_json else click.echo)(_write_page(html, force, comparison, groups))
+        for note in comparison.notes:
+            say(f"Note: {note}.")
+        (say if as_json else click.echo)(page)
     if as_json:
         print_json(dataclasses.asdict(comparison))
     elif html is None:
         print_sections(sections(comparison), as_markdown)
 
 
-def _read(names: tuple[str, ...], recordings: Path | None) -> list[RunSeries]:
-    """Return the metrics of all runs that answer to the names."""
+def _read(runs: list[Run]) -> list[RunSeries]:
+    """Return the metrics of runs."""
     from runner.analysis.readings import read_series
     from runner.recording.reader import open_recording
 
     found = []
-    for run in find_all_recorded(names, recordings):
+    for run in runs:
         with open_recording(run.recording) as recording:
             found.append(read_series(recording))
     return found
@@ -117,7 +128,5 @@ def _write_page(path: Path, force: bool, comparison: Comparison, groups: list[Gr
 
     page = render_comparison(comparison, groups)
     write_text_new(path, force, page)
-    for note in comparison.notes:
-        say(f"Note: {note}.")
     runs = sum(len(group.runs) for group in groups)
     return f"{path}: {len(comparison.metrics)} metrics of {runs} runs in {len(groups)} groups"

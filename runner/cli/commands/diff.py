@@ -68,6 +68,7 @@ def command(
     from runner.analysis.diff import diff
     from runner.analysis.diff.asked import as_json as told
     from runner.analysis.diff.asked import level_of, with_seconds, without
+    from runner.cli.progress import stage_line
     from runner.recording.reader import open_recording
 
     require_one_form(as_json, as_markdown)
@@ -76,11 +77,14 @@ def command(
         require_page(html, force)
     left, right = find_recorded(a, recordings), find_recorded(b, recordings)
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
-        difference = diff(recording_a, recording_b, levels, first)
-        difference = difference if first else with_seconds(difference, left, right)
-        difference = without(difference, ignore, everything)
+        with stage_line("comparing") as stage:
+            difference = diff(recording_a, recording_b, levels, first)
+            difference = difference if first else with_seconds(difference, left, right)
+            difference = without(difference, ignore, everything)
+            if html is not None:
+                stage("drawing the page")
+                page = _write_page(html, force, difference, recording_a, recording_b)
         if html is not None:
-            page = _write_page(html, force, difference, recording_a, recording_b)
             (say if as_json or as_markdown else click.echo)(page)
     if as_json:
         print_json(told(difference))

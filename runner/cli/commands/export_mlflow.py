@@ -38,13 +38,16 @@ def command(
       dualtaxi export mlflow @latest
       dualtaxi export mlflow k3v9m2xq --tracking-uri http://127.0.0.1:5000 --with-recording
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.progress import stage_line
     from runner.export.contents import shortcomings
     from runner.export.mlflow import export, require_packages
     from runner.recording.reader import open_recording
 
     require_packages()
-    with open_recording(find_recorded(run_name, recordings).recording) as recording:
-        done = export(recording, tracking, experiment, with_recording, force)
+    run = find_recorded(run_name, recordings)
+    with open_recording(run.recording) as recording:
+        with stage_line("writing to the store"):
+            done = export(recording, tracking, experiment, with_recording, force)
         for note in (*shortcomings(recording), *done.notes):
             say(note)
     if done.already:

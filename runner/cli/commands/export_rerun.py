@@ -47,6 +47,8 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     import time
 
+    from runner.cli.progress import stage_line
+    from runner.cli.working import announcing
     from runner.export.places import require_new
     from runner.export.rerun.viewer import require_rerun
     from runner.recording.reader import open_recording
@@ -59,7 +61,7 @@ def command(
     path = output or Path(f"{run.name}-{run.run_id}.rrd")
     require_new(path, force)
     request = request_of(episodes, evaluations, every, everything)
-    with open_recording(run.recording) as recording:
+    with open_recording(run.recording) as recording, announcing(), stage_line("exporting"):
         source = Source(recording, f"{run.name}, seed {run.seed} ({run.run_id})")
         (selection,) = export([source], request, path)
     tell(selection)

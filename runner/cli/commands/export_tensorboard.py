@@ -33,6 +33,7 @@ def command(run_name: str, output: Path | None, force: bool, recordings: Path | 
       dualtaxi export tensorboard @latest
       dualtaxi export tensorboard k3v9m2xq -o logs/patient --force
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.progress import stage_line
     from runner.export.contents import shortcomings
     from runner.export.places import new_folder
     from runner.export.tensorboard import OURS, require_packages, write_events
@@ -42,7 +43,7 @@ def command(run_name: str, output: Path | None, force: bool, recordings: Path | 
     run = find_recorded(run_name, recordings)
     path = output or Path("tensorboard", f"{run.facts['name']}-{run.run_id}")
     with open_recording(run.recording) as recording:
-        with new_folder(path, force, OURS) as folder:
+        with new_folder(path, force, OURS) as folder, stage_line("writing events"):
             count = write_events(recording, folder)
         for shortcoming in shortcomings(recording):
             say(shortcoming)

@@ -61,12 +61,19 @@ def command(
     if step is not None and episode is not None:
         raise click.UsageError("--step and --episode exclude each other: choose one.")
     from runner.analysis.qtable import at_moment, told_of
+    from runner.cli.progress import stage_line
+    from runner.cli.working import announcing
     from runner.export.places import require_new
     from runner.recording.reader import open_recording
 
     if output is not None:
         require_new(output, force)
-    with open_recording(find_recorded(run_name, recordings).recording) as recording:
+    run = find_recorded(run_name, recordings)
+    with (
+        open_recording(run.recording) as recording,
+        announcing(),
+        stage_line("replaying recorded steps"),
+    ):
         replay = at_moment(recording, step, episode)
         told = told_of(recording, replay, state)
         tables = replay.tables

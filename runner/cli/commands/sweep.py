@@ -184,6 +184,7 @@ def show(
       dualtaxi sweep show hyperparameters
       dualtaxi sweep show hyperparameters --best best.yaml
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.progress import stage_line
     from runner.cli.sections import print_sections, require_one_form
     from runner.errors import RunnerError
     from runner.export.places import require_new, write_text_new
@@ -195,7 +196,9 @@ def show(
     folder = recordings_folder(recordings)
     if best is not None:
         require_new(best, force)
-    results = results_of(read_sweep(name, folder), folder)
+    sweep = read_sweep(name, folder)
+    with stage_line("ranking trials"):
+        results = results_of(sweep, folder)
     if as_json:
         print_json(
             {

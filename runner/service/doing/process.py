@@ -67,7 +67,7 @@ def leave_signals() -> None:
 
 def work(pipe: Any, order: Order) -> None:
     """Do a job, and tell of it; a worker process's main function."""
-    from runner.learning.compilation import announced
+    from runner.learning.compilation import MESSAGE, announced
     from runner.service.doing.seeds import do_config
     from runner.service.doing.sweeps import do_sweep
 
@@ -77,7 +77,7 @@ def work(pipe: Any, order: Order) -> None:
     line = Line(pipe)
     signal.signal(signal.SIGTERM, line.end)
     try:
-        with announced(lambda: line.tell("log", {"text": "compiling the learning kernel, this once"})):
+        with announced(lambda: line.tell("log", {"text": MESSAGE})):
             outcome = (do_sweep if order.kind == "sweep" else do_config)(order, line)
     except RunnerError as error:
         told = "\n".join([str(error), *getattr(error, "__notes__", [])])

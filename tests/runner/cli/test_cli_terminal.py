@@ -4,9 +4,13 @@ import os
 import subprocess
 import sys
 
+import numba
 import pytest
 
+from runner.environments import load_mdp
 from runner.learning.compilation import announced
+from runner.learning.model import build_model
+from runner.recording.reader import open_recording
 
 pty = pytest.importorskip("pty", reason="a POSIX terminal", exc_type=ImportError)
 
@@ -91,3 +95,29 @@ def test_what_is_cached_is_not_announced(command, tiny):
     )
     assert "ompil" not in done.stderr
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "stages"),
+    [
+        (["diff", "tiny", "tiny", "--html", "{folder}/diff.html"], ["comparing", "drawing the page"]),
+        (["compare", "tiny", "tiny2"], ["reading runs", "computing intervals"]),
+        (["export", "tensorboard", "tiny", "-o", "{folder}/events"], ["writing events"]),
+        (["qtable", "tiny", "--episode", 5], ["replaying recorded steps"]),
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_may_take_long_shows_what_it_does(command, tiny, tmp_path, words, stages):
+    command("run", tiny)
+    command("run", tiny, "--name", "tiny2", "--set", "discount=0.5")
+    shown = _typed([str(word).format(folder=tmp_path) for word in words], command.recordings)
+    assert [stage for stage in stages if stage not in shown] == []
+
+
+def test_a_kernel_serves_a_fresh_environment_and_a_recorded_one(recorded_run):
+    with open_recording(recorded_run.recording) as recording:
+        fresh = load_mdp(
+            recording.config["env"]["id"], recording.config["env"]["kwargs"], recording.config["rewards"]
+        )
+        kinds = [numba.typeof(build_model(mdp, "per_agent")) for mdp in (fresh, recording.mdp)]
+    assert kinds[0] == kinds[1]
