@@ -125,6 +125,7 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
         "made_by": recording.config.get("made_by", ""),
         "last": evaluations[-1] if evaluations else None,
         "last_return": _return_of(evaluations[-1]) if evaluations else None,
+        "random": _random_policy(recording),
         "steps": has_steps(recording),
         "evaluations": evaluations,
         "event_names": [_heading(name) for name in environment["event_names"]],
@@ -163,6 +164,14 @@ def _return_of(evaluation: Mapping[str, Any]) -> float | None:
     """Return the mean return of an evaluation, summed over agents; None if one is not finite."""
     returns = list(evaluation["mean_returns"].values())
     return None if None in returns else sum(returns)
+
+
+def _random_policy(recording: Recording) -> str:
+    """Return what a random policy gets in the recording's environment, as a sentence; empty if unknown."""
+    from runner.planning import random_baseline
+
+    baseline = random_baseline(recording.mdp) if recording.kind == "job" else None
+    return baseline.sentence if baseline else ""
 
 
 def _facts(recording: Recording) -> dict[str, str]:

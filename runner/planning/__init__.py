@@ -5,6 +5,7 @@ outcome = evaluate_policy(mdp, policy, learners, 0.9)   what a policy gets, from
 best_response(mdp, policy, learner, learners, 0.9)      the most that one agent gets while the others stay
 """
 
+from runner.planning.baseline import RandomBaseline, random_baseline
 from runner.planning.evaluation import (
     Cycle,
     Outcome,
@@ -23,6 +24,7 @@ from runner.planning.yardstick import Yardstick
 __all__ = [
     "Cycle",
     "Outcome",
+    "RandomBaseline",
     "Yardstick",
     "best_response",
     "best_response_to_stochastic",
@@ -30,5 +32,6 @@ __all__ = [
     "evaluate_stochastic_policy",
     "greedy_policy",
     "optimal_values",
+    "random_baseline",
     "random_policy",
 ]

@@ -56,6 +56,15 @@ def part(path: Path, which: tuple[int, ...], start: int, steps: int) -> bytes:
         return json.dumps(told, separators=(",", ":"), ensure_ascii=False).encode()
 
 
+def random_policy(path: Path) -> bytes:
+    """Return what a random policy gets in a recording's environment, as a sentence; empty if unknown."""
+    from runner.planning import random_baseline
+
+    with open_recording(path) as recording:
+        baseline = random_baseline(recording.mdp) if recording.kind == "job" else None
+    return baseline.sentence.encode() if baseline else b""
+
+
 def typical(path: Path) -> bytes:
     """Return the address of the episode that is most worth looking at: `eval/3000/17`, or `train/0`."""
     from runner.export.report_replay import last_episode, last_whole_evaluation, typical_trial

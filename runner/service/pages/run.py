@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
+from starlette.concurrency import run_in_threadpool
 
 from runner import amounts
 from runner.errors import RecordingError, RunnerError
@@ -41,6 +42,8 @@ from runner.service.pages.rendering import page
 from runner.words import event_in_words
 
 if TYPE_CHECKING:
+    from runner.service.kept import Kept
+    from runner.service.processes import ProcessPool
     from runner.service.settings import Settings
     from runner.service.work import Jobs
 
@@ -57,9 +60,12 @@ _LEVELS: Final = {1: "debug", 2: "info", 3: "warning", 4: "error", 5: "fatal"}
 
 
 @router.get("")
-def overview(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) -> Response:
+async def overview(
+    request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf, kept: KeptOf, apart: ApartOf
+) -> Response:
     """Show how a run stands, and its metrics."""
-    return _overview(request, run, jobs, settings)
+    random = await _random_policy(run, kept, apart)
+    return await run_in_threadpool(_overview, request, run, jobs, settings, random=random)
 
 
 @router.post("/labels")
@@ -152,11 +158,25 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
 # --- inside -------------------------------------------------------------------------------------------
 
 
-def _overview(request: Request, run: Run, jobs: Jobs, settings: Settings, problem: str = "") -> Response:
+async def _random_policy(run: Run, kept: Kept, apart: ProcessPool) -> str:
+    """Return what a random policy gets in a run's environment, as a sentence; empty if that is unknown."""
+    try:
+        key = ("random_policy", await run_in_threadpool(state_of, run))
+        sentence = await kept.awaited(key, lambda: apart(played.random_policy, run.recording), LONG)
+    except (OSError, RunnerError):
+        return ""  # the page itself says what is wrong with the recording
+    return sentence.decode()
+
+
+def _overview(
+    request: Request, run: Run, jobs: Jobs, settings: Settings, problem: str = "", random: str = ""
+) -> Response:
     """Return the first page of a run, with what is wrong with labels that were sent."""
     status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
     shown = framed(run, "") | {"standing": _standing(run, jobs, settings)}
-    return page(request, "run_overview.html", status, **shown, problem=problem, most_note=MAX_NOTE)
+    return page(
+        request, "run_overview.html", status, **shown, problem=problem, most_note=MAX_NOTE, random=random
+    )
 
 
 def _standing(run: Run, jobs: Jobs, settings: Settings) -> dict[str, Any]:

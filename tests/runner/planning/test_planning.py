@@ -20,6 +20,7 @@ from runner.planning import (
     evaluate_stochastic_policy,
     greedy_policy,
     optimal_values,
+    random_baseline,
     random_policy,
 )
 
@@ -249,6 +250,19 @@ def test_random_taxis_deliver_in_five_of_six_episodes():
     outcome = evaluate_stochastic_policy(mdp, random_policy(mdp), 1, DISCOUNT)
     assert outcome.finish_percent == pytest.approx(83.3386, abs=1e-4)
     assert outcome.mean_length == pytest.approx(687.396, abs=1e-3)
+
+
+@pytest.mark.parametrize("rewards", ["team", "individual"])
+def test_the_random_baseline_is_the_same_however_rewards_are_paid(rewards):
+    small = {"map": ["+---+", "|A: |", "| |B|", "+---+"], "max_episode_steps": 90}
+    baseline = random_baseline(load_mdp("dualtaxi:DualTaxi-v1", small, rewards))
+    assert baseline.sentence.startswith("A random policy succeeds in 38.1 %")
+    assert baseline.mean_return == pytest.approx(-784.8587, abs=1e-3)
+
+
+def test_a_baseline_that_would_take_minutes_is_left_out():
+    endless = load_mdp("CliffWalking-v1", {"max_episode_steps": 200_000_000}, None)
+    assert random_baseline(endless) is None
 
 
 @settings(deadline=None, max_examples=40)

@@ -137,6 +137,13 @@ PAGES = (
 )
 
 
+def test_the_page_of_a_run_says_what_a_random_policy_achieves(client):
+    page = page_of(client, "/runs/first")
+    assert re.search(
+        r"A random policy succeeds in [\d.]+ % of episodes within the limit of 1,500 steps", page
+    )
+
+
 def test_every_page_is_well_formed_and_says_nothing_inline(client):
     for address in PAGES:
         page_of(client, address)

@@ -1,0 +1,66 @@
+"""What acting at random achieves: the least that a learned policy is to be compared with."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Final
+
+from blake3 import blake3
+
+from runner.mdp import Mdp
+from runner.planning.evaluation import evaluate_stochastic_policy, random_policy
+
+MAX_WORK: Final = 1_000_000_000
+"""Outcomes of joint actions times the step limit; DualTaxi has a third of it, and takes about a second."""
+_MAX_REMEMBERED: Final = 32
+_remembered: OrderedDict[bytes, RandomBaseline] = OrderedDict()
+
+
+@dataclass(frozen=True)
+class RandomBaseline:
+    """What the policy gets that takes every joint action with the same probability."""
+
+    finish_percent: float
+    """Episodes with a success; nan if the environment does not define success."""
+    mean_length: float
+    mean_return: float
+    """Undiscounted, summed over the agents."""
+    step_limit: int
+
+    @property
+    def sentence(self) -> str:
+        """The baseline as a sentence for people who read a success rate."""
+        took = f"{self.mean_length:,.1f} steps on average"
+        returned = f"{self.mean_return:,.1f}"
+        if math.isnan(self.finish_percent):
+            return (
+                f"A random policy's episodes take {took} and return {returned} "
+                f"(step limit {self.step_limit:,})."
+            )
+        return (
+            f"A random policy succeeds in {self.finish_percent:.1f} % of episodes within the limit of "
+            f"{self.step_limit:,} steps; its episodes take {took} and return {returned}."
+        )
+
+
+def random_baseline(mdp: Mdp) -> RandomBaseline | None:
+    """Return what a random policy gets, exactly; None where that is unknown or takes too long to compute.
+
+    It is unknown without a step limit: some episodes might never end.
+    """
+    if not mdp.step_limit or mdp.next_state.size * mdp.step_limit > MAX_WORK:
+        return None
+    digest = blake3(str((mdp.step_limit, mdp.success_mask)).encode())
+    for name in ("next_state", "probability", "rewards", "terminated", "events", "start"):
+        digest.update(getattr(mdp, name).tobytes())
+    key = digest.digest()
+    if key not in _remembered:
+        outcome = evaluate_stochastic_policy(mdp, random_policy(mdp), mdp.rewards.shape[-1], discount=1.0)
+        _remembered[key] = RandomBaseline(
+            outcome.finish_percent, outcome.mean_length, sum(outcome.mean_returns), mdp.step_limit
+        )
+        if len(_remembered) > _MAX_REMEMBERED:
+            _remembered.popitem(last=False)
+    return _remembered[key]
