@@ -48,7 +48,7 @@ def rerecord(run: Run, report: Report = lambda _: None, stop: Stop = lambda: Fal
     """
     with locked(run) as current:
         if current.status != "finished":
-            from_mapping(current.facts.get("config", {}))  # refuses a loop's run, which nobody can resume
+            from_mapping(current.file.config)  # refuses a loop's run, which nobody can resume
             raise RunnerError(
                 f"run {run.run_id} is {current.status}; `dualtaxi resume {run.run_id}` finishes it first."
             )
@@ -58,7 +58,7 @@ def rerecord(run: Run, report: Report = lambda _: None, stop: Stop = lambda: Fal
 
 
 def _rerecord(run: Run, report: Report, stop: Stop) -> Run:
-    config = from_mapping(run.facts["config"])
+    config = from_mapping(run.file.config)
     config = _with(config, recording=config.to_mapping()["recording"] | {"steps": "all"})
     fresh = run.recording.with_suffix(".rerecording")
     started = time.monotonic()

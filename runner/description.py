@@ -28,10 +28,10 @@ def describe(run: Run, recording: Recording) -> dict[str, Any]:
     return {
         **_identity(run),
         "bytes": recording.size,
-        "content_digest": summary.get("content_digest"),
-        "topic_digests": summary.get("topic_digests"),
+        "content_digest": summary.content_digest,
+        "topic_digests": dict(summary.topic_digests) if "topic_digests" in summary else None,
         **{key: summary.get(key, count) for key, count in recording.done().items()},
-        "seconds": summary.get("seconds"),
+        "seconds": summary.seconds,
         "config": _config(run, recording),
         "provenance": recording.provenance,
         "success_events": recording.environment["success_events"],
@@ -45,7 +45,7 @@ def describe(run: Run, recording: Recording) -> dict[str, Any]:
 
 def _config(run: Run, recording: Recording) -> dict[str, Any]:
     """Return the recording's configuration, in the order of keys in which people read it."""
-    readable: dict[str, Any] = run.facts.get("config", {})
+    readable = dict(run.file.config)
     return readable if readable == recording.config else recording.config
 
 
@@ -55,7 +55,8 @@ def _identity(run: Run) -> dict[str, Any]:
         "name": run.name,
         "seed": run.seed,
         "status": run.status,
-        "created": run.facts["created"],
+        "created": run.created_text,
+        **({"damage": run.problem} if run.problem else {}),
         "path": str(run.recording.absolute()),
     }
 
@@ -66,7 +67,7 @@ def _without_recording(run: Run) -> dict[str, Any]:
     nothing: dict[str, Any] = {"bytes": 0, "provenance": {}}
     nothing |= {part: [] for part in ("tables", "eval", "optimality", "train")} | {"loop": None}
     told = {key: run.summary.get(key) for key in unknown}
-    return {**_identity(run), **told, **nothing, "config": run.facts.get("config", {})}
+    return {**_identity(run), **told, **nothing, "config": dict(run.file.config)}
 
 
 def _tables(recording: Recording) -> list[dict[str, Any]]:

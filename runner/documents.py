@@ -44,12 +44,36 @@ def read_object(path: str | os.PathLike[str], most: int) -> dict[str, Any]:
     if len(data) > most:
         raise ValueError(f"it is longer than {most:,} bytes")
     try:
-        found = json.loads(data, parse_constant=lambda _: None)
+        found = with_plain_texts(json.loads(data, parse_constant=lambda _: None), data)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
     if not isinstance(found, dict):
         raise ValueError("it holds no JSON object")
     return found
+
+
+def with_plain_texts(found: Any, data: str | bytes) -> Any:
+    r"""Return what was parsed from JSON, with texts that UTF-8 can hold.
+
+    An escape such as `\ud800` gives half a character, which no page, file or terminal can show; it is
+    replaced by a question mark.
+
+    Args:
+        found: what was parsed.
+        data: what from.
+    """
+    escape = b"\\ud" if isinstance(data, bytes) else "\\ud"
+    return _replaced(found) if escape in data.lower() else found  # type: ignore[operator]
+
+
+def _replaced(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode(errors="replace").decode()
+    if isinstance(value, list):
+        return [_replaced(item) for item in value]
+    if isinstance(value, dict):
+        return {_replaced(key): _replaced(item) for key, item in value.items()}
+    return value
 
 
 def write_whole(path: Path, value: dict[str, Any], mode: int = 0o666) -> None:

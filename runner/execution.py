@@ -360,9 +360,7 @@ def describe(
         StorageError: the disk is full or failing.
     """
     events = len(learner.mdp.event_names)
-    facts = run_facts(
-        run.run_id, run.name, job.seed, job.identity, run.facts["created"], learner.agents, events
-    )
+    facts = run_facts(run.run_id, run.name, job.seed, job.identity, run.created_text, learner.agents, events)
     config, environment = job.config.to_mapping(), _environment(learner.mdp)
     write_description(file, facts, config, made_by or provenance(), environment)
 

@@ -256,9 +256,8 @@ def _last_logged(recording: Recording) -> dict[str, float | None]:
     """Return the last value logged under each name, from the result if that carries them."""
     from runner.recording import schema
 
-    logged = recording.result.get("logged")
-    if isinstance(logged, dict) and all(value is None or type(value) is float for value in logged.values()):
-        return logged
+    if "logged" in recording.result:
+        return dict(recording.result.logged)
     return {
         scalar["name"]: scalar["value"] if math.isfinite(scalar["value"]) else None
         for scalar in recording.decoded(schema.SCALAR_TOPIC)

@@ -34,7 +34,7 @@ def locked(run: Run, archived: bool = False) -> Iterator[Run]:
         if not run.stands_alone:
             run = run_at(run.folder)
         if run.status == "running":
-            owner = run.facts.get("owner", {})
+            owner = run.file.owner
             raise RunnerError(
                 f"run {run.run_id} is running (process {owner.get('pid')} on {owner.get('host')}); let it."
             )

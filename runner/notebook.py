@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from html import escape
 from typing import Any, Final
 
@@ -122,7 +122,7 @@ def rerun_view(
 
 def facts_html(run: Run) -> str:
     """Return what `run.json` says of a run, as a small table."""
-    evaluation = run.summary.get("last_evaluation") or {}
+    evaluation = asdict(run.summary.last_evaluation) if run.summary.last_evaluation else {}
     facts = {
         "run": f"{run.run_id}, {run.status}",
         "name": f"{run.name}, seed {run.seed}",

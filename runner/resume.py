@@ -146,7 +146,7 @@ def _mark_failed(run: Run, error: BaseException) -> None:
     """Say that a run failed, if `execute`, which says so itself, was not come to."""
     with contextlib.suppress(RunnerError):
         now = run_at(run.folder)
-        if now.facts["status"] == "running":
+        if now.file.status == "running":
             now.update(status="failed", summary={"error": kept_message(error)})
 
 
@@ -173,7 +173,7 @@ def _job(run: Run) -> tuple[Job, bool]:
     Raises:
         Diverged: the recording says that it is of another job than it describes.
     """
-    told = Job(from_mapping(run.facts.get("config", {})), run.seed)
+    told = Job(from_mapping(run.file.config), run.seed)
     try:
         with open_recording(run.recording) as recording:
             recorded = Job(from_mapping(recording.config), int(recording.run["seed"]))
@@ -188,8 +188,8 @@ def _job(run: Run) -> tuple[Job, bool]:
 def _proof(run: Run) -> str | None:
     """Return the content digest that the run had when it was finished, if it ever was."""
     if run.status == "finished":
-        return run.summary.get("content_digest")
-    proof = run.facts.get("proof")
+        return run.summary.content_digest
+    proof = run.file.proof
     return str(proof) if proof else None
 
 
@@ -238,7 +238,7 @@ def _put_in_place(run: Run, path: Path) -> Run:
     Raises:
         Diverged: it is another; the damaged recording stays.
     """
-    found, expected = run.summary["content_digest"], run.facts.get("proof")
+    found, expected = run.summary["content_digest"], run.file.proof
     if expected and found != expected:
         run.update(status="interrupted")
         raise Diverged("the recording made anew", "content digest", found, expected)

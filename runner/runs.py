@@ -26,6 +26,7 @@ from runner.documents import read_object, write_whole
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.labels import Labels, change_labels, read_labels
 from runner.owner import lives, owner
+from runner.run_file import RUN_ID, ArchiveReference, RunFile, Summary, parse_run_file
 
 if TYPE_CHECKING:  # listing runs is to be quick
     from runner.config import ExperimentConfig
@@ -39,7 +40,6 @@ RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"
 
 _ALPHABET: Final = "abcdefghjkmnpqrstvwxyz23456789"
 _ID_LENGTH: Final = 8
-_RUN_ID: Final = re.compile(r"[\w.-]{1,100}")
 
 
 @dataclass(frozen=True)
@@ -52,15 +52,37 @@ class Run:
     restored: Path | None = None
     """Where its recording was restored to, if it is in an archive alone."""
 
+    @cached_property
+    def file(self) -> RunFile:
+        """The contents of `run.json`, checked."""
+        return parse_run_file(self.facts)
+
+    @property
+    def problem(self) -> str:
+        """What of `run.json` does not fit, and what to do; empty if all does."""
+        if not self.file.problems:
+            return ""
+        return (
+            f"run {self.run_id} is damaged, as says {self.folder / RUN_FILE}: "
+            f"{'; '.join(self.file.problems)}. Correct that file, or remove the run by "
+            f"`dualtaxi rm {self.run_id}`."
+        )
+
     @property
     def run_id(self) -> str:
         """Its id, unique."""
-        return str(self.facts["run_id"])
+        return self.file.run_id
 
     @property
     def name(self) -> str:
         """What it is called now, not unique."""
-        return self.labels.name or str(self.facts["name"])
+        return self.labels.name or self.file.name
+
+    @property
+    def file_stem(self) -> str:
+        """What files made from it are called by default: its first name and its id."""
+        name = re.sub(r"[^\w.+=@ -]", "_", self.file.name)
+        return f"{name}-{self.run_id}"
 
     @property
     def tags(self) -> tuple[str, ...]:
@@ -80,46 +102,59 @@ class Run:
     @property
     def seed(self) -> int:
         """Its job's seed."""
-        return int(self.facts["seed"])
+        return self.file.seed or 0
 
     @property
     def recording(self) -> Path:
         """The MCAP file."""
-        return self.restored or self.folder / Path(str(self.facts.get("recording", RECORDING_FILE))).name
+        return self.restored or self.folder / Path(self.file.recording or RECORDING_FILE).name
 
     @property
     def stands_alone(self) -> bool:
         """Whether it is a recording by itself, not one in a folder of its own."""
-        return str(self.facts.get("recording", RECORDING_FILE)) != RECORDING_FILE
+        return (self.file.recording or RECORDING_FILE) != RECORDING_FILE
 
     @property
     def created(self) -> datetime:
-        """When it began, in UTC."""
-        return datetime.fromisoformat(self.facts["created"]).astimezone(UTC)
+        """When it began, in UTC; if its file does not say, when its folder was last changed."""
+        return self.file.created or _folder_time(self.folder)
 
     @property
-    def summary(self) -> dict[str, Any]:
-        """What its owner said at the end; empty before."""
-        return dict(self.facts.get("summary", {}))
+    def created_text(self) -> str:
+        """When it began, in ISO 8601, as recordings have it."""
+        return self.created.isoformat(timespec="milliseconds")
+
+    @property
+    def summary(self) -> Summary:
+        """What its owner wrote at the end; empty before."""
+        return self.file.summary
 
     @property
     def status(self) -> str:
         """`running`, `finished`, `interrupted` or `failed`; a dead owner's run is interrupted.
 
-        `archived` if its recording is in an archive alone, and not at hand.
+        `damaged` if its file holds what cannot be, and `archived` if its recording is in an archive alone,
+        and not at hand.
         """
-        said = str(self.facts["status"])
-        if said == "running" and lives(self.facts.get("owner", {}), self.folder / RUN_FILE):
+        said = self.file.status
+        if said == "running" and lives(self.file.owner, self.folder / RUN_FILE):
             return said
+        if self.file.problems:
+            return "damaged"
         if self.archive and not self.recording.exists():
             return "archived"
         return "interrupted" if said == "running" else said
 
     @property
-    def archive(self) -> dict[str, Any]:
-        """Where else its recording is kept; empty if nowhere."""
-        said = self.facts.get("archive")
-        return dict(said) if isinstance(said, dict) else {}
+    def episodes_to_do(self) -> int | None:
+        """The training episodes that its configuration asks for; None if it is not a job's."""
+        episodes = self.file.config.get("episodes")
+        return episodes if type(episodes) is int and 0 < episodes < 2**62 else None
+
+    @property
+    def archive(self) -> ArchiveReference:
+        """Where else its recording is kept; false if nowhere."""
+        return self.file.archive
 
     def _repr_html_(self) -> str:
         """Return how the run shows itself in a notebook."""
@@ -274,7 +309,7 @@ def run_at(path: Path) -> Run:
 
 def run_of_id(run_id: str, recordings: Path) -> Run | None:
     """Return the run in the folder called like this id; None if there is none, or the text is no id."""
-    if not _RUN_ID.fullmatch(run_id) or not run_id.strip("."):
+    if not RUN_ID.fullmatch(run_id) or not run_id.strip("."):
         return None
     return next((run for run in runs_in(recordings / run_id) if run.run_id == run_id), None)
 
@@ -307,15 +342,16 @@ def relabel(run: Run, change: Callable[[Labels], Labels]) -> Labels:
 
 
 def _is_run(facts: dict[str, Any]) -> bool:
-    """Return whether these are the facts of a run: a file may hold anything."""
-    kinds = {"run_id": str, "name": str, "seed": int, "status": str, "created": str}
-    sound = all(isinstance(facts.get(key), kind) for key, kind in kinds.items())
-    parts = all(isinstance(facts.get(key, {}), dict) for key in ("owner", "config", "summary"))
-    if not (sound and parts and _RUN_ID.fullmatch(facts["run_id"]) and 0 <= facts["seed"] < 2**64):
-        return False
-    with contextlib.suppress(OverflowError):  # of a date at the end of time
-        return bool(datetime.fromisoformat(facts["created"]).astimezone(UTC))
-    return False
+    """Return whether these are the facts of a run: with an id, they are, however damaged."""
+    run_id = facts.get("run_id")
+    return isinstance(run_id, str) and RUN_ID.fullmatch(run_id) is not None and run_id.strip(".") != ""
+
+
+def _folder_time(folder: Path) -> datetime:
+    """Return when a folder was last changed; the beginning of 1970 if it is gone."""
+    with contextlib.suppress(OSError):
+        return datetime.fromtimestamp(folder.stat().st_mtime, UTC)
+    return datetime.fromtimestamp(0, UTC)
 
 
 def _from_recording(path: Path) -> Run:

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 ORDER = """
     amounts errors hashing
-    cache compiled documents extras
+    cache compiled documents extras run_file
     config owner labels
     job toy_text scene estimate
     mdp

@@ -40,7 +40,7 @@ def read_series(recording: Recording) -> RunSeries:
             for record in evaluations
         ],
         training=sorted(training, key=lambda entry: entry[0]),
-        content_digest=recording.result.get("content_digest", ""),
+        content_digest=recording.result.content_digest or "",
     )
 
 
@@ -69,7 +69,7 @@ def loop_series(recording: Recording) -> RunSeries:
         config=_without_seed(recording.config, int(recording.run["seed"])),
         evaluation=[(record["episode"], _loop_readings(record)) for record in evaluations],
         training=sorted(training.items()),
-        content_digest=recording.result.get("content_digest", ""),
+        content_digest=recording.result.content_digest or "",
         not_finite=dict(not_finite),
     )
 

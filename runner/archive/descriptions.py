@@ -41,7 +41,7 @@ def run_table(recording: Recording) -> pa.Table:
         "environments": (pa.int32(), recording.environments),
         "spaces": (pa.string(), recording.run.get("spaces")),
         "config": (pa.string(), json.dumps(config)),
-        "result": (pa.string(), json.dumps(recording.result)),
+        "result": (pa.string(), json.dumps(recording.raw_result)),
         "provenance": (pa.string(), json.dumps(recording.provenance)),
     }
     try:

@@ -46,7 +46,7 @@ def at_hand(run: Run, tell: Tell = lambda _: None, report: Report = lambda _: No
         return run
     from filelock import FileLock, Timeout
 
-    digest = str(run.archive.get("digest", ""))
+    digest = run.archive.digest
     if len(digest) != 64 or not digest.isalnum():
         raise RecordingError(f"{run.folder / RUN_FILE}: found archive digest {digest!r}, expected a BLAKE3.")
     kept = cache_folder() / RESTORED / f"{run.run_id}-{digest[:16]}.mcap"
@@ -54,7 +54,7 @@ def at_hand(run: Run, tell: Tell = lambda _: None, report: Report = lambda _: No
         kept.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(kept.with_suffix(".lock"), timeout=LOCK_SECONDS):
             if not kept.is_file():
-                tell(f"Run {run.run_id} is archived; restoring it from {run.archive.get('target')}.")
+                tell(f"Run {run.run_id} is archived; restoring it from {run.archive.target}.")
                 _restore_kept(run, kept, digest, report)
             kept.touch()
     except Timeout as error:
@@ -118,7 +118,7 @@ def archive_place(run: Run) -> str | None:
 def _places(run: Run) -> list[str]:
     """Return where the archive of a run may be: where it was put, or beside recordings that moved with it."""
     beside = f"{default_target(run.folder.absolute().parent)}/{run.run_id}"
-    return list(dict.fromkeys((str(run.archive.get("target", "")), beside)))
+    return list(dict.fromkeys((run.archive.target, beside)))
 
 
 def restore_to(folder: Path, path: Path, digest: Any, report: Report) -> None:

@@ -68,7 +68,7 @@ def archive_run(
     target = target_of(to)
     with locked(run, archived=True) as current:
         if current.status == "archived":
-            raise RunnerError(f"run {run.run_id} is archived already, in {current.archive.get('target')}.")
+            raise RunnerError(f"run {run.run_id} is archived already, in {current.archive.target}.")
         return _Archiving(current, target, report).do(remove, dry_run)
 
 
@@ -117,7 +117,7 @@ class _Archiving:
 
 def _holds(manifest: Manifest, recording: Recording) -> bool:
     """Return whether an archive has a recording's content; of a killed run, that of its whole chunks."""
-    stated = recording.result.get("content_digest")
+    stated = recording.result.content_digest
     if manifest.run.get("content_digest") != stated:
         return False
     return stated is not None or manifest.digest == content_of(recording.path)
@@ -165,7 +165,7 @@ def restore_run(run: Run, report: Report = lambda _: None) -> Run:
             raise RunnerError(f"run {run.run_id} is not archived: its recording is {current.recording}.")
         fresh = current.recording.with_suffix(".restoring")
         with archive_of(current) as folder:
-            restore_to(folder, fresh, current.archive.get("digest"), report)
+            restore_to(folder, fresh, current.archive.digest, report)
         fresh.replace(current.recording)
         facts = {key: value for key, value in current.facts.items() if key != "archive"}
         return Run(current.folder, facts).update()

@@ -139,14 +139,14 @@ class _Writing:
     def _manifest(self, topics: dict[str, Entry]) -> Manifest:
         facts = self._recording.run_facts()
         run = {key: facts[key] for key in ("run_id", "name", "seed", "created", "status")}
-        run |= {"content_digest": self._recording.result.get("content_digest"), "lost": self._recording.lost}
+        run |= {"content_digest": self._recording.result.content_digest, "lost": self._recording.lost}
         return Manifest(run, topics, entries_of(self._folder))
 
     def _compare(self, topics: dict[str, Entry]) -> None:
         """Compare what was read with what the recording says it holds."""
         result = self._recording.result
-        stated = result.get("topic_digests") or {}
-        left_out = set() if result.get("steps_recorded", True) else {"/train/step", "/eval/step"}
+        stated = result.topic_digests
+        left_out = set() if result.steps_recorded else {"/train/step", "/eval/step"}
         compared = (stated.keys() | topics.keys()) & schema.DIGESTED - left_out if stated else set()
         for name in sorted(compared):
             found = topics[name].blake3 if name in topics else "nothing"

@@ -10,7 +10,7 @@ from runner.errors import RunnerError, nearest
 
 SETTING: Final = "config."
 """What the path of a configuration's value begins with, as a field."""
-STATUSES: Final = ("running", "finished", "interrupted", "failed", "archived")
+STATUSES: Final = ("running", "finished", "interrupted", "failed", "archived", "damaged")
 
 
 class Kind(enum.Enum):

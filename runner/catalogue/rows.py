@@ -12,6 +12,7 @@ from typing import Any, Final
 from peewee import BigIntegerField, BooleanField, CompositeKey, Field, FloatField, Model, TextField
 
 from runner.errors import RecordingError
+from runner.run_file import EvaluationMetrics, Summary
 from runner.runs import Run
 
 SEEDS: Final = 2**64
@@ -40,7 +41,7 @@ class SeedField(Field):
 
 
 class Row(Model):
-    """A run's folder as it was last read; a folder without a readable run has a `problem` and no `id`."""
+    """A run's folder as it was last read; a damaged run has a `problem`; what is no run has no `id`."""
 
     root = TextField()
     """The recordings folder, absolute."""
@@ -106,38 +107,40 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         run: as its folder says now.
         size: bytes of its recording; None if there is none.
     """
-    facts, config = run.facts, run.facts.get("config", {})
-    summary = run.summary if "episodes" in run.summary else {**_recorded(run), **run.summary}
-    last = _mapping(summary.get("last_evaluation"))
-    made_by = _mapping(facts.get("provenance"))
-    train, evaluation = whole(summary.get("train_steps")), whole(summary.get("eval_steps"))
+    config, summary = run.file.config, run.summary
+    last = summary.last_evaluation or EvaluationMetrics()
+    done = summary if summary.episodes is not None else {**_recorded(run), **summary}
+    episodes, train, evaluation = (done.get(key) for key in ("episodes", "train_steps", "eval_steps"))
     called = text(config.get("name"))
     return {
         "id": run.run_id,
         "name": text(run.name),
         "config": called,
-        "seed": run.seed,
+        "problem": text(run.problem) or None,
+        "seed": run.file.seed,
         "status": text(run.status),
         "tags": "\n".join(run.tags),
         "note": text(run.note),
         "words": text("\n".join([run.run_id, run.name, called or "", *run.tags, run.note]), 3 * _TEXT),
         "created": math.floor(run.created.timestamp() * 1000),
-        "episodes": whole(summary.get("episodes")),
-        "episodes_to_do": whole(config.get("episodes")),
+        "episodes": episodes,
+        "episodes_to_do": run.episodes_to_do,
         "steps": None if train is None or evaluation is None else train + evaluation,
         "train_steps": train,
         "eval_steps": evaluation,
-        **{key: number(last.get(key)) for key in ("finish_percent", "mean_length", "mean_penalties")},
+        "finish_percent": last.finish_percent,
+        "mean_length": last.mean_length,
+        "mean_penalties": last.mean_penalties,
         "mean_return": _mean_return(summary),
         "logged": json.dumps(_logged(summary)),
-        "seconds": number(summary.get("seconds")),
+        "seconds": summary.seconds,
         "bytes": size,
-        "digest": text(summary.get("content_digest")),
+        "digest": summary.content_digest,
         "mode": _mode(config),
         "environment": text(_mapping(config.get("env")).get("id")),
-        "host": text(made_by.get("host") or _mapping(facts.get("owner")).get("host")),
-        "git": text(made_by.get("git")),
-        "archive": text(run.archive.get("target")),
+        "host": text(run.file.provenance.get("host") or run.file.owner.get("host")),
+        "git": text(run.file.provenance.get("git")),
+        "archive": text(run.archive.target or None),
         "settings": json.dumps(dict(_flat(config))),
     }
 
@@ -147,25 +150,23 @@ def _recorded(run: Run) -> Mapping[str, Any]:
     from runner.recording.reader import open_recording
 
     if run.status == "archived":
-        return _mapping(run.archive.get("done"))
+        return run.archive.done
     if run.status in ("interrupted", "failed") and run.recording.exists():
         with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
             return recording.done()
     return {}
 
 
-def _mean_return(summary: Mapping[str, Any]) -> float | None:
+def _mean_return(summary: Summary) -> float | None:
     """Return the mean return of a loop's last evaluation; of its last training episodes without one."""
-    last, recent = (_mapping(summary.get(key)) for key in ("last_evaluation", "recent_training"))
-    return number((last or recent).get("mean_return"))
+    last = summary.last_evaluation or summary.recent_training
+    return last.mean_return if last else None
 
 
-def _logged(summary: Mapping[str, Any]) -> dict[str, float | None]:
+def _logged(summary: Summary) -> dict[str, float | None]:
     """Return the last logged values of a loop by name."""
     return {
-        name: number(value)
-        for name, value in islice(_mapping(summary.get("logged")).items(), _LOGGED)
-        if text(name, _NAME) == name
+        name: value for name, value in islice(summary.logged.items(), _LOGGED) if text(name, _NAME) == name
     }
 
 
@@ -174,11 +175,6 @@ def text(value: Any, most: int = _TEXT) -> str | None:
     if not isinstance(value, str):
         return None
     return value[:most].encode(errors="replace").decode()
-
-
-def whole(value: Any) -> int | None:
-    """Return a whole number that SQLite can hold; None if it is none."""
-    return value if type(value) is int and abs(value) <= _LARGEST // 2 else None
 
 
 def number(value: Any) -> float | None:

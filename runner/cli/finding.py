@@ -60,7 +60,7 @@ def _without_recording(run: Run) -> str:
     """Return what can be done about a run whose recording is missing."""
     if run.status == "running":
         return f"run {run.run_id} has no recording yet: it has just begun."
-    if "made_by" in run.facts.get("config", {}):
+    if "made_by" in run.file.config:
         return f"run {run.run_id} has no recording, and only the loop that it was made by can make another."
     return (
         f"run {run.run_id} has no recording: {run.recording} is missing. `{suggested(run, 'resume')}` does "

@@ -77,7 +77,7 @@ def _as_json(removals: Sequence[Removal], kept: dict[str, str], dry_run: bool) -
         {
             "run_id": removal.run.run_id,
             "name": removal.run.name,
-            "status": removal.run.status if dry_run else removal.run.facts["status"],
+            "status": removal.run.status if dry_run else removal.run.file.status,
             "path": str(removal.run.folder.absolute()),
             "bytes": removal.freed,
         }
@@ -95,13 +95,13 @@ def _draw(removals: Sequence[Removal]) -> None:
     now = datetime.now(UTC)
     for removal in removals:
         run = removal.run
-        last = run.summary.get("last_evaluation") or {}
+        last = run.summary.last_evaluation
         drawn.add_row(
             run.run_id,
             run.name,
             str(run.seed),
             run.status,
-            number(last.get("finish_percent")) if last else UNKNOWN,
+            number(last.finish_percent) if last else UNKNOWN,
             age((now - run.created).total_seconds()),
             size(removal.freed),
         )
@@ -115,7 +115,7 @@ def _archive_in_words(run: Run) -> str:
     """Return what is left of a run in its archive. Object storage is not asked: that may take minutes."""
     from runner.archive.places import archive_place
 
-    said = str(run.archive.get("target", ""))
+    said = run.archive.target
     if "://" in said:
         return f"The archive of {run.run_id} at {said} is left alone."
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -96,17 +96,17 @@ def run_in_words(run: Run) -> dict[str, str]:
     }
 
 
-def _told(run: Run) -> dict[str, Any]:
+def _told(run: Run) -> Mapping[str, Any]:
     """Return what a run said at its end; of one that was killed, how far it came by its recording."""
     from runner.recording.reader import open_recording
 
-    if "train_steps" in run.summary:
+    if run.summary.train_steps is not None and run.summary.eval_steps is not None:
         return run.summary
     with open_recording(run.recording) as recording:
         return {**recording.done(), **run.summary}
 
 
-def _steps_in_words(summary: dict[str, Any]) -> str:
+def _steps_in_words(summary: Mapping[str, Any]) -> str:
     return f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation"
 
 

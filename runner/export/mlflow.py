@@ -167,7 +167,7 @@ def _short(name: str) -> str:
 
 
 def _digest(recording: Recording) -> str:
-    return str(recording.result.get("content_digest", ""))
+    return recording.result.content_digest or ""
 
 
 def _tags(recording: Recording) -> dict[str, str]:

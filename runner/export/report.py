@@ -176,7 +176,7 @@ def _random_policy(recording: Recording) -> str:
 
 def _facts(recording: Recording) -> dict[str, str]:
     """Return what identifies a run and how much of it there is."""
-    digest = recording.result.get("content_digest")
+    digest = recording.result.content_digest
     counts = {
         topic: recording.count(topic) for topic in (schema.TRAIN_EPISODE, schema.TRAIN_STEP, schema.EVAL_STEP)
     }
@@ -208,7 +208,7 @@ def _loop_facts(recording: Recording, counts: Mapping[schema.Topic, int]) -> dic
         "Training": f"{counts[schema.TRAIN_EPISODE]:,} episodes, {counts[schema.TRAIN_STEP]:,} steps",
         "Evaluation": f"{counts[schema.EVAL_STEP]:,} steps",
         "Begun": recording.run["created"],
-        "Content digest": recording.result.get("content_digest") or "none: it was interrupted",
+        "Content digest": recording.result.content_digest or "none: it was interrupted",
     }
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from runner.packing.unpacking import workplace
 from runner.recording.integrity import is_merely_cut_off
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
+from runner.run_file import parse_run_file
 from runner.runs import MADE_BY, RECORDING_FILE, RUN_FILE, Run, run_at
 
 
@@ -85,12 +85,16 @@ def _checked_facts(recording: Recording, said: Mapping[str, Any]) -> dict[str, A
     """
     try:
         facts = run_facts(recording, said)
-        datetime.fromisoformat(facts["created"])
+        problems = parse_run_file(facts).problems
         made_by = recording.provenance
     except (ValueError, TypeError, KeyError) as error:
         raise RecordingError(
             f"{recording.path}: what it says of its run makes no sense ({error})."
         ) from error
+    if problems:
+        raise RecordingError(
+            f"{recording.path}: what it says of its run makes no sense ({'; '.join(problems)})."
+        )
     named = all(re.fullmatch(NAME_PATTERN, facts[key]) for key in ("run_id", "name"))
     if not named or not 0 <= facts["seed"] < 1 << 64:
         raise RecordingError(

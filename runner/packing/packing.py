@@ -64,7 +64,7 @@ def pack(run: Run, target: Path | None = None, anonymous: bool = False, force: b
         raise RunnerError(f"run {run.run_id} is running; wait for its end, or interrupt it.")
     if run.status == "archived":
         raise RunnerError(f"run {run.run_id} is in an archive alone; bring its recording back first.")
-    path = target or Path(f"{run.facts['name']}-{run.run_id}{SUFFIX}")
+    path = target or Path(f"{run.file_stem}{SUFFIX}")
     if path.is_dir() or not path.absolute().parent.is_dir():
         raise RunnerError(f"{path}: found no place for a file; choose another by -o.")
     with _sources(run, path, anonymous) as sources:

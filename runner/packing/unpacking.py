@@ -9,7 +9,6 @@ import secrets
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from runner.packing.present import Occupied, known, met, settled
 from runner.recording.facts import json_object
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of, rewrite
+from runner.run_file import parse_run_file
 from runner.runs import RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at
 
 
@@ -151,7 +151,8 @@ def _check(path: Path, folder: Path, manifest: Manifest) -> None:
         said = (facts["run_id"], facts["name"], facts["seed"], facts["status"])
         if said != (manifest.run_id, manifest.name, manifest.seed, manifest.status):
             raise PackError(f"{path}: found the run {said} in it, expected the one that the manifest says.")
-        datetime.fromisoformat(facts["created"])
+        if problems := parse_run_file(facts).problems:
+            raise PackError(f"{path}: its {RUN_FILE} makes no sense ({'; '.join(problems)}).")
         if content_of(folder / RECORDING_FILE) != manifest.content_digest:
             raise PackError(f"{path}: its recording has another content digest than the manifest says.")
         if (folder / LABELS_FILE).exists():

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
+from runner.documents import with_plain_texts
 from runner.errors import RecordingError
 from runner.mdp import MAX_AGENTS, MAX_ARRAYS_BYTES, MAX_EVENTS, Mdp, from_parts
 from runner.recording import schema
@@ -17,6 +18,7 @@ from runner.recording.contents import MAX_METADATA_BYTES
 from runner.recording.index import Index
 from runner.recording.schema import Topic
 from runner.recording.spaces import dtype_of, leaves_of
+from runner.run_file import MAX_DEPTH, is_too_deep
 
 _FACTS: Final = {
     **dict.fromkeys(("run_id", "name", "job", "created", "agents")),
@@ -135,7 +137,10 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, Any]:
     try:
         if text is None or len(text) > MAX_METADATA_BYTES:
             raise ValueError("none, or too long")
-        return dict(json.loads(text))
+        found = dict(with_plain_texts(json.loads(text), text))
+        if is_too_deep(found):
+            raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
+        return found
     except (TypeError, ValueError, RecursionError) as error:
         raise RecordingError(f"{what} holds no JSON object ({error}).") from error
 

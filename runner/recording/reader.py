@@ -45,6 +45,7 @@ from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
 from runner.recording.store import RecordStore
 from runner.recording.topic_chunks import TopicChunks, chunks_by_topic
+from runner.run_file import Summary, parse_summary
 
 MAX_EPISODE_BYTES: Final = 128 << 20
 """The most that `episode_steps` gives as one array: some 1.5 million steps."""
@@ -135,20 +136,37 @@ class Recording:
         return self.metadata("provenance")
 
     @cached_property
-    def result(self) -> dict[str, Any]:
-        """What the recorder said at the end: status, digest, counts; empty if it never came to that."""
+    def raw_result(self) -> dict[str, Any]:
+        """The result as it was written, unchecked; empty if the recorder never came to that.
+
+        Raises:
+            RecordingError: it is no JSON object.
+        """
         if "result" not in self._index.metadata:
             return {}
         return self._json("result")
 
+    @cached_property
+    def result(self) -> Summary:
+        """What the recorder wrote at the end: status, digest, counts; empty if it never came to that.
+
+        Raises:
+            RecordingError: it holds what cannot be.
+        """
+        problems: list[str] = []
+        found = parse_summary(self.raw_result, "", problems)
+        if problems:
+            raise RecordingError(f"{self.path}: its result is damaged: {'; '.join(problems)}.")
+        return found
+
     @property
     def status(self) -> str:
         """How the run ended: `finished`, `failed`, or `interrupted`, also if it could not say so."""
-        return str(self.result.get("status", "interrupted"))
+        return self.result.status or "interrupted"
 
     def run_facts(self) -> dict[str, Any]:
-        """Return what `run.json` says, from the recording alone."""
-        result = self.result
+        """Return what `run.json` says, from the recording alone; the result in it is unchecked."""
+        result = self.raw_result
         return {
             "run_id": self.run["run_id"],
             "name": self.run["name"],
@@ -160,14 +178,15 @@ class Recording:
         }
 
     def done(self) -> dict[str, int]:
-        """Return how many training episodes and steps of each phase were done: as told, else as counted."""
-        counted = {
-            "episodes": schema.TRAIN_EPISODE,
-            "train_steps": schema.TRAIN_STEP,
-            "eval_steps": schema.EVAL_STEP,
+        """Return how many training episodes and steps of each phase were done: as written, else counted."""
+        result = self.result
+        return {
+            "episodes": self.count(schema.TRAIN_EPISODE) if result.episodes is None else result.episodes,
+            "train_steps": self.count(schema.TRAIN_STEP)
+            if result.train_steps is None
+            else result.train_steps,
+            "eval_steps": self.count(schema.EVAL_STEP) if result.eval_steps is None else result.eval_steps,
         }
-        told = self.result
-        return {key: told[key] if key in told else self.count(topic) for key, topic in counted.items()}
 
     def metadata(self, name: str) -> dict[str, str]:
         """Return a metadata record's entries.

@@ -6,7 +6,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -29,6 +29,7 @@ from runner.recording.integrity import check_integrity, places
 from runner.recording.reader import open_recording
 from runner.recording.schema import KINDS, STEP, TOPIC_OF, TOPICS, Topic
 from runner.recording.writer import RecordingFile
+from runner.run_file import Summary
 
 Times = NDArray[np.uint64]
 Change = Callable[[str, dict[str, str]], dict[str, str]]
@@ -107,7 +108,7 @@ def content_of(path: Path) -> str:
         seen.update(topic, records)
     with open_recording(path) as recording:
         result = recording.result
-    return _stated(result, seen.topics(), path) if "content_digest" in result else seen.content()
+    return seen.content() if result.content_digest is None else _stated(result, seen.topics(), path)
 
 
 def continues(path: Path, earlier: Path) -> bool:
@@ -163,15 +164,14 @@ def _whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
         raise RecordingError(f"{path}: a record of it cannot be read; `dualtaxi repair` mends it.") from error
 
 
-def _stated(result: dict[str, Any], seen: dict[str, str], path: Path) -> str:
+def _stated(result: Summary, seen: dict[str, str], path: Path) -> str:
     """Return the digest that a result states, if it is that of the messages."""
-    topics = result.get("topic_digests")
-    stated = dict(topics) if isinstance(topics, dict) else {}
-    if not result.get("steps_recorded", True):
+    stated = dict(result.topic_digests)
+    if not result.steps_recorded:
         steps = {topic.name for topic in TOPICS if topic.message is STEP}
         seen = seen | {name: digest for name, digest in stated.items() if name in steps}
-    if stated != seen or combine(seen) != result["content_digest"]:
+    if stated != seen or combine(seen) != result.content_digest:
         raise RecordingError(
             f"{path}: found messages of other content than the digest it states; it was altered."
         )
-    return str(result["content_digest"])
+    return combine(seen)

@@ -112,4 +112,4 @@ def state_of(run: Run) -> tuple[str, int, int]:
 
 def timed_state_of(run: Run) -> tuple[str, int, int, str]:
     """Return the same with how long the run took, which only `run.json` says, at times later."""
-    return *state_of(run), str(run.summary.get("seconds"))
+    return *state_of(run), str(run.summary.seconds)

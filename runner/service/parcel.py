@@ -34,7 +34,7 @@ class Parcel:
                 f"run {run.run_id} is {run.status}; only one that is over and here can be pushed."
             )
         summary, labels = run.summary, run.labels
-        told = {"name": str(run.facts["name"]), "status": run.status, "proof": run.facts.get("proof")}
+        told = {"name": run.file.name, "status": run.status, "proof": run.file.proof}
         told |= {key: summary.get(key) for key in ("seconds", "error")}
         return cls(
             run.recording,

@@ -159,7 +159,7 @@ def held(name: str, recordings: Path) -> Iterator[None]:
 
 def is_over(run: Run) -> bool:
     """Return whether there is nothing left to do for a run of a sweep; it may be archived."""
-    return run.facts["status"] == "finished" or PRUNED in run.tags
+    return run.file.status == "finished" or PRUNED in run.tags
 
 
 def runs_of(name: str, recordings: Path) -> dict[str, Run]:
@@ -167,7 +167,7 @@ def runs_of(name: str, recordings: Path) -> dict[str, Run]:
     found: dict[str, Run] = {}
     for run in list_runs(recordings):
         if tag_of(name) in run.tags:
-            identity = identity_of(run.facts["config"], run.seed)
+            identity = identity_of(run.file.config, run.seed)
             if identity not in found or (is_over(run) and not is_over(found[identity])):
                 found[identity] = run
     return found

@@ -137,9 +137,9 @@ def result_of(run: Run, objective: Objective) -> Result:
         "pruned" if PRUNED in run.tags else "finished",
         run.run_id,
         curve,
-        str(run.summary.get("content_digest", "")),
+        run.summary.content_digest or "",
         size,
-        float(run.summary.get("seconds", 0.0)),
+        run.summary.seconds or 0.0,
     )
 
 

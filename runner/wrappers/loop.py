@@ -125,7 +125,7 @@ class Loop(Generic[R]):
             run.name,
             self.plan.seed,
             job=blake3(job.encode()).hexdigest()[:32],
-            created=run.facts["created"],
+            created=run.created_text,
             agents=described.agents,
             events=len(mdp.event_names) if mdp else 0,
         ) | {

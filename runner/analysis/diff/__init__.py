@@ -113,7 +113,7 @@ def diff(
     """
     if not a.kind == b.kind == "job":
         return _diff_of_loops(a, b)
-    digests = [recording.result.get("content_digest") for recording in (a, b)]
+    digests = [recording.result.content_digest for recording in (a, b)]
     same = digests[0] is not None and digests[0] == digests[1]
     notes = _notes(a, b)
     facts: dict[str, Any] = {
@@ -147,7 +147,7 @@ def diff(
 
 def _diff_of_loops(a: Recording, b: Recording) -> RunDiff:
     """Return in what two runs differ of which one is somebody's own loop."""
-    digests = [recording.result.get("content_digest") for recording in (a, b)]
+    digests = [recording.result.content_digest for recording in (a, b)]
     same = digests[0] is not None and digests[0] == digests[1]
     notes = ["recorded from a loop: what it learned is not known, so no cause and no tables are told"]
     alike = comparable(a, b)
@@ -204,10 +204,10 @@ def _settings(recording: Recording) -> dict[str, Any]:
 
 def _costs(recording: Recording) -> dict[str, Any]:
     """Return steps taken, whether recorded or not, episodes, and the size of the file."""
-    done = recording.result
+    done = recording.done()
     return {
-        "train_steps": done.get("train_steps", recording.count(schema.TRAIN_STEP)),
-        "eval_steps": done.get("eval_steps", recording.count(schema.EVAL_STEP)),
+        "train_steps": done["train_steps"],
+        "eval_steps": done["eval_steps"],
         "episodes": recording.count(schema.TRAIN_EPISODE),
         "bytes": recording.size,
     }

@@ -186,7 +186,7 @@ def _message_parting(a: Recording, b: Recording, phase: str) -> Parting | None:
 
 def parted_topics(a: Recording, b: Recording) -> list[str]:
     """Return the topics whose content differs, as both recordings' digests say, if they have them."""
-    left, right = (recording.result.get("topic_digests") for recording in (a, b))
+    left, right = (recording.result.topic_digests for recording in (a, b))
     if not left or not right:
         return []
     return sorted(name for name in left.keys() | right.keys() if left.get(name) != right.get(name))

@@ -73,7 +73,7 @@ def _to_do(runs: list[Run]) -> list[Run]:
         return runs
     for run in runs:
         if run not in left:
-            say(f"Run {run.run_id} is archived already, in {run.archive.get('target')}.")
+            say(f"Run {run.run_id} is archived already, in {run.archive.target}.")
     return left
 
 

@@ -80,7 +80,7 @@ def command(
         run = evaluate(
             source, folder, step, count, "random" if start is None else start, seed, report, interrupt
         )
-    origin = run.facts["config"]["initial_q"]
+    origin = run.file.config["initial_q"]
     if as_json:
         print_json(run_as_json(run) | {"origin": origin}, indent=None)
     elif run.status == "finished":

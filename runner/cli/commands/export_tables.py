@@ -76,11 +76,11 @@ def _export(
     from runner.recording.reader import open_recording
 
     run = find_recorded(run_name, recordings)
-    path = output or Path(f"{run.facts['name']}-{run.run_id}-{form}")
+    path = output or Path(f"{run.file_stem}-{form}")
     choice = Choice(phase or ("train" if episodes else ""), episodes or ())
     with open_recording(run.recording) as recording:
         require_steps(recording, "export")
-        total = int(recording.result.get("train_steps", 0)) + int(recording.result.get("eval_steps", 0))
+        total = (recording.result.train_steps or 0) + (recording.result.eval_steps or 0)
         with new_folder(path, force, OURS) as folder, counting("steps", total) as report:
             rows = write_tables(recording, folder, form, choice, gz, report)
         for shortcoming in shortcomings(recording):

@@ -41,7 +41,7 @@ def command(run_name: str, output: Path | None, force: bool, recordings: Path | 
 
     require_packages()
     run = find_recorded(run_name, recordings)
-    path = output or Path("tensorboard", f"{run.facts['name']}-{run.run_id}")
+    path = output or Path("tensorboard", run.file_stem)
     with open_recording(run.recording) as recording:
         with new_folder(path, force, OURS) as folder, stage_line("writing events"):
             count = write_events(recording, folder)

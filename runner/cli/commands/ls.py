@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from runner.catalogue.filters import Filter
     from runner.catalogue.index import Index
 
+MAX_PROBLEMS: Final = 5
+"""Damaged runs whose problems are printed."""
 ON_A_TERMINAL: Final = 50
 """Runs that are listed there unless it is said how many."""
 
@@ -92,6 +94,7 @@ def command(
     elif rows:
         usual = listing.usual_columns(rows, len(recordings))
         listing.print_table(rows, shown or listing.fitting(rows, usual))
+    _report_damage(rows)
     _tell_the_rest(rows, total, offset, chosen, recordings)
 
 
@@ -109,6 +112,15 @@ def _found(
         return with_originals(rows, index), total
 
     return look(recordings, work, say)
+
+
+def _report_damage(rows: list[dict[str, Any]]) -> None:
+    """Print what is wrong with the damaged runs among those that are shown."""
+    problems = [row["problem"] for row in rows if row["problem"]]
+    for problem in problems[:MAX_PROBLEMS]:
+        say(f"{problem[:1].upper()}{problem[1:]}")
+    if len(problems) > MAX_PROBLEMS:
+        say(f"{len(problems) - MAX_PROBLEMS:,} more runs are damaged: `dualtaxi ls status:damaged`.")
 
 
 def _tell_the_rest(

@@ -35,7 +35,7 @@ def command(run_name: str, name: str | None, original: bool, recordings: Path | 
         raise click.UsageError("expected a NAME, or --original.")
     called = checked_name(name) or ""
     run = find(run_name, recordings)
-    before, first = run.name, str(run.facts["name"])
+    before, first = run.name, run.file.name
     labels = relabel(run, lambda was: replace(was, name="" if called == first else called))
     now = labels.name or first
     if as_json:

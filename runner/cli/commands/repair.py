@@ -85,7 +85,7 @@ def _kept(run: Run | None) -> contextlib.AbstractContextManager[Any]:
 def _tell_run(run: Run) -> None:
     """Note that a run's recording is not whole any more; the digest it had proves it when it is resumed."""
     if run.status == "finished":
-        run.update(status="interrupted", proof=run.summary.get("content_digest"))
+        run.update(status="interrupted", proof=run.summary.content_digest)
 
 
 def _in_words(done: Repair, run: Run | None) -> dict[str, str]:
@@ -109,7 +109,7 @@ def _in_words(done: Repair, run: Run | None) -> dict[str, str]:
 
 def _next(done: Repair, run: Run | None) -> dict[str, str]:
     """Return what brings back what was lost, if anything does: a loop cannot be done again here."""
-    if run is None or done.lossless or "made_by" in run.facts.get("config", {}):
+    if run is None or done.lossless or "made_by" in run.file.config:
         return {}
     return {"next": suggested(run, "resume")}
 

@@ -33,7 +33,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     run = find(run_name, recordings)
     refuse_running(run)
     nothing_to_do = run.status == "finished" and holds_steps(run)
-    with at_work("", run.facts.get("config", {}).get("episodes", 0)) as (report, interrupt):
+    with at_work("", run.episodes_to_do or 0) as (report, interrupt):
         run = rerecord(run, report, interrupt)
     if as_json:
         print_json(run_as_json(run), indent=None)

@@ -45,7 +45,7 @@ def command(
 
     run = find(run_name, recordings)
     nothing_to_do = is_finished(run)
-    with at_work("", run.facts.get("config", {}).get("episodes", 0)) as (report, interrupt):
+    with at_work("", run.episodes_to_do or 0) as (report, interrupt):
         run = resume(run, accept_changes, report, interrupt)
     if as_json:
         print_json(run_as_json(run), indent=None)

@@ -87,9 +87,11 @@ def _head(run: Run, told: dict[str, Any]) -> dict[str, str]:
         "status": f"{told['status']}, begun {ago} ago"
         + (f", took {duration(told['seconds'])}" if told["seconds"] is not None else ""),
     }
-    if run.summary.get("error"):
-        head["error"] = run.summary["error"]
-    if told["train_steps"] is not None:
+    if "damage" in told:
+        head["damage"] = told["damage"]
+    if run.summary.error:
+        head["error"] = run.summary.error
+    if None not in (told["train_steps"], told["episodes"], told["eval_steps"]):
         head["steps"] = (
             f"{told['train_steps']:,} of training in {told['episodes']:,} episodes, "
             f"{told['eval_steps']:,} of evaluation"

@@ -43,7 +43,7 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
 
     path, run = recording_of(run_name, recordings)
     refuse_running(run)
-    episodes = run.facts.get("config", {}).get("episodes", 0) if run else 0
+    episodes = (run.episodes_to_do or 0) if run else 0
     with at_work("verifying", episodes) as (report, _):
         found = verify(path, rerun, report)
     if as_json:

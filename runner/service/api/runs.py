@@ -130,7 +130,7 @@ def one_run(run: FoundRun, settings: SettingsOf) -> Response:
 def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
     """Return all about a run but its series; what `run.json` says if its recording cannot be read."""
     problems: list[str] = []
-    error = run.summary.get("error")
+    error = run.summary.error
     told = described(run, problems.append)
     series = {name: told.pop(name) for name in ("eval", "train", "optimality")}
     del told["path"]
@@ -163,7 +163,7 @@ def relabelled(run: Run, labels: Labels, catalogue: Catalogue) -> dict[str, Any]
         RunnerError: a tag cannot be one, or there are too many.
         StorageError: the run's folder cannot be written.
     """
-    first = str(run.facts["name"])
+    first = run.file.name
     name = checked_name(labels.name) if labels.name else labels.name
 
     def change(was: Said) -> Said:

@@ -73,7 +73,7 @@ def wait_for_others(runs: Iterable[Run], stop: Callable[[], bool]) -> None:
     for run in runs:
         while run.status == "running" and not stop():
             if time.monotonic() > deadline:
-                owner = run.facts.get("owner", {})
+                owner = run.file.owner
                 raise RunnerError(
                     f"run {run.run_id} is still running (process {owner.get('pid')} on {owner.get('host')}); "
                     "resume the job when that has come to its end."

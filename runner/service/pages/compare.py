@@ -173,30 +173,30 @@ def _letter(number: int) -> str:
 
 
 def _flat(run: Run) -> dict[str, str]:
-    return {key: str(value) for key, value in flat_config(run.facts.get("config", {}))}
+    return {key: str(value) for key, value in flat_config(run.file.config)}
 
 
 def _results(found: list[Run]) -> list[tuple[str, list[str]]]:
     """Return what came of runs, a row a measure."""
     last = [last_evaluation(each) for each in found]
-    returns = [amounts.number(each.get("mean_return")) for each in last]
+    returns = [amounts.number(each.mean_return) for each in last]
     return [
         ("Status", [each.status for each in found]),
         *([("Mean return in the last evaluation", returns)] if any(map(is_loop, found)) else []),
-        ("Success in the last evaluation, %", [amounts.number(each.get("finish_percent")) for each in last]),
-        ("Mean length of its trials", [amounts.number(each.get("mean_length")) for each in last]),
-        ("Penalties a trial", [amounts.number(each.get("mean_penalties")) for each in last]),
-        ("Training episodes", [amounts.number(each.summary.get("episodes"), 0) for each in found]),
-        ("Steps of training", [amounts.number(each.summary.get("train_steps"), 0) for each in found]),
+        ("Success in the last evaluation, %", [amounts.number(each.finish_percent) for each in last]),
+        ("Mean length of its trials", [amounts.number(each.mean_length) for each in last]),
+        ("Penalties a trial", [amounts.number(each.mean_penalties) for each in last]),
+        ("Training episodes", [amounts.number(each.summary.episodes, 0) for each in found]),
+        ("Steps of training", [amounts.number(each.summary.train_steps, 0) for each in found]),
         (
             "Content digest",
-            [str(each.summary.get("content_digest") or amounts.UNKNOWN)[:16] for each in found],
+            [str(each.summary.content_digest or amounts.UNKNOWN)[:16] for each in found],
         ),
     ]
 
 
 def _same_content(found: list[Run]) -> bool:
-    digests = {each.summary.get("content_digest") for each in found}
+    digests = {each.summary.content_digest for each in found}
     return len(digests) == 1 and None not in digests
 
 

@@ -7,6 +7,7 @@ from typing import Any, Final
 from runner.errors import RecordingError
 from runner.frames import loop_summary
 from runner.recording.reader import open_recording
+from runner.run_file import EvaluationMetrics
 from runner.runs import Run
 
 TABS: Final = (
@@ -40,7 +41,7 @@ def head_of(run: Run) -> dict[str, Any]:
 
 def is_loop(run: Run) -> bool:
     """Return whether a run was recorded from a loop."""
-    return "made_by" in run.facts.get("config", {})
+    return "made_by" in run.file.config
 
 
 def loop_results(run: Run) -> dict[str, Any]:
@@ -53,7 +54,8 @@ def loop_results(run: Run) -> dict[str, Any]:
         return {"last_evaluation": None, "recent_training": recent, "logged": {}}
 
 
-def last_evaluation(run: Run) -> dict[str, Any]:
-    """Return the measures of the last evaluation of a run by name; empty without one."""
-    found = loop_results(run)["last_evaluation"] if is_loop(run) else run.summary.get("last_evaluation")
-    return found or {}
+def last_evaluation(run: Run) -> EvaluationMetrics:
+    """Return the measures of the last evaluation of a run; all unknown without one."""
+    if is_loop(run):
+        return EvaluationMetrics(**(loop_results(run)["last_evaluation"] or {}))
+    return run.summary.last_evaluation or EvaluationMetrics()

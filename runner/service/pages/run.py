@@ -148,7 +148,7 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
         request,
         "run_config.html",
         **framed(run, "config"),
-        yaml=write_yaml(run.facts.get("config", {})),
+        yaml=write_yaml(run.file.config),
         facts=facts,
         provenance=provenance,
         log=log,
@@ -185,7 +185,7 @@ def _standing(run: Run, jobs: Jobs, settings: Settings) -> dict[str, Any]:
     summary = progress or run.summary
     last = summary.get("last_evaluation") or {}
     done = summary.get("episode", summary.get("episodes"))
-    to_do = run.facts.get("config", {}).get("episodes")
+    to_do = run.episodes_to_do
     facts = _results(run, last) | {
         "Training episodes": amounts.UNKNOWN if done is None else f"{done:,}",
         "Steps of training": amounts.number(summary.get("train_steps"), 0),
@@ -193,12 +193,14 @@ def _standing(run: Run, jobs: Jobs, settings: Settings) -> dict[str, Any]:
         "Time": _seconds(run),
         "Recording": amounts.size(summary["bytes"]) if summary.get("bytes") else amounts.UNKNOWN,
     }
-    running = run.status == "running" and bool(to_do) and done is not None
+    share, said = None, ""
+    if run.status == "running" and to_do is not None and done is not None:
+        share, said = min(1.0, done / to_do), f"{done:,} of {to_do:,} training episodes"
     return {
         "facts": list(facts.items()),
-        "share": min(1.0, done / to_do) if running else None,
-        "said": f"{done:,} of {to_do:,} training episodes" if running else "",
-        "error": settings.without_folders(str(run.summary.get("error") or "")),
+        "share": share,
+        "said": said,
+        "error": settings.without_folders(run.problem or run.summary.error or ""),
         "job": number,
         "is_live": run.status == "running" or (number is not None and run.status != "finished"),
     }
@@ -242,7 +244,7 @@ def _job_of(run: Run, jobs: Jobs) -> tuple[int | None, dict[str, Any]]:
 def _seconds(run: Run) -> str:
     if run.status == "running":
         return f"{amounts.duration((datetime.now(UTC) - run.created).total_seconds())} so far"
-    seconds = run.summary.get("seconds")
+    seconds = run.summary.seconds
     return amounts.UNKNOWN if seconds is None else amounts.duration(seconds)
 
 
@@ -257,7 +259,7 @@ def _recorded_facts(
     facts = {
         "Run": run.run_id,
         "Begun": f"{run.created:%Y-%m-%d %H:%M:%S} UTC",
-        "Content digest": run.summary.get("content_digest") or "none: told when a run ends properly",
+        "Content digest": run.summary.content_digest or "none: told when a run ends properly",
         "Steps": f"{amounts.number(run.summary.get('train_steps'), 0)} of training, "
         f"{amounts.number(run.summary.get('eval_steps'), 0)} of evaluation",
     }

@@ -61,7 +61,7 @@ def form(
     """Show the form, with a configuration to begin with."""
     text = SWEEP if sweep else FIRST
     if origin:
-        text = write_yaml(catalogue.find(origin).facts.get("config", {}))
+        text = write_yaml(catalogue.find(origin).file.config)
     return _form(request, text)
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from runner.errors import RunNotFound, StorageError
+from runner.run_file import Summary
 from runner.runs import run_of_id
 from runner.service.logs import LOG
 from runner.service.receiving.appending import Appending
@@ -246,11 +247,11 @@ class Uploads:
 
     def _stored_as(self, announced: Announcement) -> str:
         """Return the id of the run that has the announced content, if it is there already."""
-        facts = self._run(announced.run_id)
-        there = facts and facts.get("content_digest")
+        summary = self._run(announced.run_id)
+        there = summary and summary.content_digest
         return announced.run_id if there and there == announced.content_digest else ""
 
-    def _run(self, run_id: str) -> dict[str, Any] | None:
+    def _run(self, run_id: str) -> Summary | None:
         """Return the summary of a run, None if there is none."""
         run = run_of_id(run_id, self._recordings)
         return None if run is None else run.summary

@@ -57,7 +57,7 @@ def test_archived_and_removed_a_run_is_listed_and_restored_the_same(run, recordi
     done(command("restore", run.run_id))
     back = find_run(run.run_id, recordings)
     assert back.status == "finished"
-    assert back.archive == {}
+    assert not back.archive
     assert (place / layout.MANIFEST).exists()
     assert command("verify", run.run_id).exit_code == 0
     assert command("diff", run.run_id, run.recording).exit_code == 0

@@ -113,9 +113,9 @@ def test_a_change_within_the_same_moment_is_not_missed(folder):
     ids(folder)
     text = (run.folder / RUN_FILE).read_text()
     before = (run.folder / RUN_FILE).stat()
-    (run.folder / RUN_FILE).write_text(text.replace("finished", "failed!!"))
+    (run.folder / RUN_FILE).write_text(text.replace('"finished"', '"failed"  '))
     os.utime(run.folder / RUN_FILE, ns=(before.st_atime_ns, before.st_mtime_ns))
-    assert rows(folder)[0][0]["status"] == "failed!!"
+    assert rows(folder)[0][0]["status"] == "failed"
 
 
 def test_a_run_whose_process_dies_is_interrupted_without_a_word(folder):
@@ -209,9 +209,7 @@ def test_several_folders_and_the_same_content_in_them(folder, recorded, tmp_path
         b"",
         b"{}",
         b"[" * 100_000,
-        b'{"run_id": "a", "name": "a", "seed": -1, "status": "x", "created": "2026-01-01"}',
         b'{"run_id": "../a", "name": "a", "seed": 1, "status": "x", "created": "2026-01-01"}',
-        b'{"run_id": "a", "name": "a", "seed": 1, "status": "x", "created": "0001-01-01T00:00:00+14:00"}',
         b" " * (9 << 20),
     ],
 )
@@ -221,6 +219,21 @@ def test_what_is_no_run_is_left_out(folder, content):
     (folder / "hostile" / RUN_FILE).write_bytes(content)
     assert ids(folder) == [run.run_id]
     assert [each.run_id for each in list_runs(folder)] == [run.run_id]
+    assert look([folder], lambda index: len(index.problems())) == 1
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b'{"run_id": "a", "name": "a", "seed": -1, "status": "x", "created": "2026-01-01"}',
+        b'{"run_id": "a", "name": "a", "seed": 1, "status": "x", "created": "0001-01-01T00:00:00+14:00"}',
+        b'{"run_id": "a"}',
+    ],
+)
+def test_a_run_of_which_little_is_known_is_listed_as_damaged(folder, content):
+    (folder / "a").mkdir(parents=True)
+    (folder / "a" / RUN_FILE).write_bytes(content)
+    assert [(row["id"], row["status"]) for row in rows(folder)[0]] == [("a", "damaged")]
     assert look([folder], lambda index: len(index.problems())) == 1
 
 

@@ -64,11 +64,12 @@ def test_what_is_no_run_is_left_alone(command, tiny, content):
     assert command.json("ls") == []
 
 
-def test_values_of_the_wrong_kind_make_no_run(command, tiny):
+def test_values_of_the_wrong_kind_make_a_damaged_run(command, tiny):
     run = create_run(command.recordings, experiment_of(tiny), 3)
     for key, wrong in (("created", "soon"), ("seed", "x"), ("summary", []), ("config", 3), ("owner", "me")):
-        (run.folder / RUN_FILE).write_text(json.dumps(run.facts | {key: wrong}))
-        assert command.json("ls") == []
+        (run.folder / RUN_FILE).write_text(json.dumps(run.facts | {"status": "finished", key: wrong}))
+        (told,) = command.json("ls")
+        assert (told["run_id"], told["status"]) == (run.run_id, "damaged"), key
 
 
 def test_the_folder_may_be_given(recorded, recorded_run, command):

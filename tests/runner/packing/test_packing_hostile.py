@@ -275,7 +275,7 @@ def test_a_created_time_that_is_none(lake, members, tmp_path):
     facts["summary"]["bytes"] = other.stat().st_size
     said = json.dumps(facts, indent=1, ensure_ascii=False).encode() + b"\n"
     made = with_data(members, **{"recording.mcap": other.read_bytes(), "run.json": said})
-    refused(tar_of(tmp_path / "x", made), tmp_path, "creation")
+    refused(tar_of(tmp_path / "x", made), tmp_path, "created: found")
 
 
 def test_nothing_else_in_the_folder_is_touched(packed, tmp_path, lake):

@@ -1,0 +1,331 @@
+"""What `run.json` and a recording's result say of a run, parsed once into typed records.
+
+Anyone may have written either of them. What does not fit is left out of the record and named in a
+problem, so that nothing after this has to doubt a type.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Final, NamedTuple
+
+STATED_STATUSES: Final = ("running", "finished", "interrupted", "failed")
+"""The statuses that a run's owner writes."""
+MAX_DEPTH: Final = 100
+"""How deep the values of either file may be nested."""
+RUN_ID: Final = re.compile(r"[\w.-]{1,100}")
+
+_LARGEST: Final = 2**62
+_QUOTED: Final = 60
+"""Characters of a wrong value that a problem quotes."""
+
+
+class Check(NamedTuple):
+    """What a value must be."""
+
+    fits: Callable[[Any], bool]
+    expected: str
+
+
+@dataclass(frozen=True)
+class EvaluationMetrics:
+    """The figures of an evaluation that people quote; None if it does not know one."""
+
+    episode: int | None = None
+    """Training episodes before it."""
+    finish_percent: float | None = None
+    mean_length: float | None = None
+    mean_penalties: float | None = None
+    mean_return: float | None = None
+    """Summed over agents; known of loops."""
+    trials: int | None = None
+
+
+@dataclass(frozen=True)
+class RecentTraining:
+    """The figures of a loop's last training episodes; None if they are unknown."""
+
+    episodes: int | None = None
+    mean_length: float | None = None
+    mean_return: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Summary(Mapping[str, Any]):
+    """How a run ended, as its owner wrote it; also a mapping of the JSON values that were there and fit."""
+
+    status: str | None = None
+    """In a recording's result only."""
+    content_digest: str | None = None
+    topic_digests: Mapping[str, str] = field(default_factory=dict)
+    """Topic to digest."""
+    train_steps: int | None = None
+    eval_steps: int | None = None
+    episodes: int | None = None
+    """Training episodes."""
+    messages: Mapping[str, int] = field(default_factory=dict)
+    """Topic to number of messages."""
+    steps_recorded: bool = True
+    last_evaluation: EvaluationMetrics | None = None
+    recent_training: RecentTraining | None = None
+    logged: Mapping[str, float | None] = field(default_factory=dict)
+    """Name to the value that a loop logged last under it."""
+    seconds: float | None = None
+    bytes: int | None = None
+    """Size of the recording."""
+    error: str | None = None
+    values_by_key: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    def __getitem__(self, key: str) -> Any:
+        return self.values_by_key[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_by_key)
+
+    def __len__(self) -> int:
+        return len(self.values_by_key)
+
+
+@dataclass(frozen=True)
+class ArchiveReference:
+    """Where an archived run's recording is."""
+
+    target: str = ""
+    """Path or URL of the archive; empty if the run was never archived."""
+    digest: str = ""
+    done: Summary = field(default_factory=Summary)
+    """How far the run came, if it did not come to its end."""
+
+    def __bool__(self) -> bool:
+        return bool(self.target)
+
+
+@dataclass(frozen=True)
+class RunFile:
+    """The contents of `run.json`."""
+
+    run_id: str
+    name: str
+    seed: int | None
+    status: str
+    """One of `STATED_STATUSES`; `interrupted` if the file states none of them."""
+    created: datetime | None
+    """In UTC."""
+    owner: Mapping[str, Any]
+    config: Mapping[str, Any]
+    """As it was written: nothing but its depth is checked."""
+    summary: Summary
+    archive: ArchiveReference
+    provenance: Mapping[str, str]
+    proof: str | None
+    """The content digest that the run must come to again."""
+    recording: str | None
+    """The name of the recording, if that stands alone."""
+    problems: tuple[str, ...] = ()
+    """What does not fit, a sentence each without its full stop."""
+
+
+def parse_run_file(stated: Mapping[str, Any]) -> RunFile:
+    """Return the contents of a `run.json`; what does not fit is named in `problems`.
+
+    Args:
+        stated: the JSON object; its `run_id` must be one.
+    """
+    problems: list[str] = []
+    if is_too_deep(stated):
+        problems.append(f"found values nested more than {MAX_DEPTH} deep")
+        stated = {key: value for key, value in stated.items() if not is_too_deep(value, 1)}
+    known = _fitting(stated, _RUN, "", problems)
+    problems += [f"{key} is missing" for key in _NEEDED if key not in stated]
+    return RunFile(
+        run_id=stated["run_id"],
+        name=known.get("name", stated["run_id"]),
+        seed=known.get("seed"),
+        status=known.get("status", "interrupted"),
+        created=_moment(known["created"]) if "created" in known else None,
+        owner=known.get("owner", {}),
+        config=known.get("config", {}),
+        summary=parse_summary(known.get("summary", {}), "summary.", problems),
+        archive=_archive(known.get("archive") or {}, problems),
+        provenance=known.get("provenance", {}),
+        proof=known.get("proof"),
+        recording=known.get("recording"),
+        problems=tuple(problems),
+    )
+
+
+def parse_summary(stated: Mapping[str, Any], where: str, problems: list[str]) -> Summary:
+    """Return a summary, or a recording's result; what does not fit is left out.
+
+    Args:
+        stated: the JSON object.
+        where: what its keys are within, for problems: `summary.`.
+        problems: gets a line for each value that does not fit.
+    """
+    if not where and is_too_deep(stated):
+        problems.append(f"found values nested more than {MAX_DEPTH} deep")
+        stated = {key: value for key, value in stated.items() if not is_too_deep(value, 1)}
+    known = _fitting(stated, _SUMMARY, where, problems)
+    fields = {key: known[key] for key in _SUMMARY if known.get(key) is not None}
+    for key, record, checks in _RECORDS:
+        if key in fields:
+            known[key] = figures = _fitting(fields[key], checks, f"{where}{key}.", problems)
+            fields[key] = record(**{name: figures.get(name) for name in checks})
+    return Summary(**fields, values_by_key=known)
+
+
+def is_too_deep(value: Any, depth: int = 0) -> bool:
+    """Return whether a JSON value is nested more than `MAX_DEPTH` deep, counted from `depth`."""
+    level = [value]
+    while level:
+        if depth > MAX_DEPTH:
+            return True
+        inner: list[Any] = []
+        for item in level:
+            if isinstance(item, Mapping):
+                inner += item.values()
+            elif isinstance(item, list):
+                inner += item
+        level, depth = [item for item in inner if isinstance(item, Mapping | list)], depth + 1
+    return False
+
+
+def _fitting(
+    stated: Mapping[str, Any], checks: Mapping[str, Check], where: str, problems: list[str]
+) -> dict[str, Any]:
+    """Return the values that fit, and those that there is no check for; name the others."""
+    known = {}
+    for key, value in stated.items():
+        check = checks.get(key)
+        if check is None or check.fits(value):
+            known[key] = value
+        else:
+            problems.append(f"{where}{key}: found {_quoted(value)}, expected {check.expected}")
+    return known
+
+
+def _archive(stated: Mapping[str, Any], problems: list[str]) -> ArchiveReference:
+    known = _fitting(stated, _ARCHIVE, "archive.", problems)
+    done = parse_summary(known.get("done") or {}, "archive.done.", problems)
+    return ArchiveReference(known.get("target", ""), known.get("digest") or "", done)
+
+
+def _quoted(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "an object"
+    if isinstance(value, list):
+        return "a list"
+    with contextlib.suppress(ValueError):  # of a number with too many digits to be shown
+        text = repr(value)
+        return text if len(text) <= _QUOTED else f"{text[: _QUOTED - 1]}…"
+    return "a number of many digits"
+
+
+def _moment(text: str) -> datetime:
+    return datetime.fromisoformat(text).astimezone(UTC)
+
+
+def _is_moment(value: Any) -> bool:
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError, OverflowError):  # the latter of a date at the end of time
+            return bool(_moment(value))
+    return False
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < _LARGEST
+
+
+def _is_number(value: Any) -> bool:
+    if type(value) not in (int, float):
+        return False
+    with contextlib.suppress(OverflowError):
+        return math.isfinite(value)
+    return False
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_object(value: Any) -> bool:
+    return isinstance(value, Mapping)
+
+
+def _maps_to(fits: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, Mapping) and all(map(fits, value.values()))
+
+
+def _optional(check: Check) -> Check:
+    return Check(lambda value: value is None or check.fits(value), f"{check.expected} or null")
+
+
+_DIGEST: Final = Check(
+    lambda value: _is_text(value) and re.fullmatch(r"[0-9A-Za-z]{1,128}", value) is not None, "a digest"
+)
+_COUNT: Final = Check(_is_count, "a whole number from 0 up")
+_TEXT: Final = Check(_is_text, "a text")
+_OBJECT: Final = Check(_is_object, "an object")
+_NUMBER: Final = Check(_is_number, "a finite number")
+_LENGTH: Final = Check(lambda value: _is_number(value) and value >= 0, "a finite number from 0 up")
+_STATUS: Final = Check(lambda value: value in STATED_STATUSES, f"one of {', '.join(STATED_STATUSES)}")
+
+_EVALUATION: Final = {
+    "episode": _optional(_COUNT),
+    "finish_percent": _optional(
+        Check(lambda value: _is_number(value) and 0 <= value <= 100, "a number from 0 to 100")
+    ),
+    "mean_length": _optional(_LENGTH),
+    "mean_penalties": _optional(_LENGTH),
+    "mean_return": _optional(_NUMBER),
+    "trials": _optional(_COUNT),
+}
+_RECENT: Final = {
+    "episodes": _optional(_COUNT),
+    "mean_length": _optional(_LENGTH),
+    "mean_return": _optional(_NUMBER),
+}
+_RECORDS: Final = (
+    ("last_evaluation", EvaluationMetrics, _EVALUATION),
+    ("recent_training", RecentTraining, _RECENT),
+)
+_SUMMARY: Final = {
+    "status": Check(lambda value: value in STATED_STATUSES[1:], f"one of {', '.join(STATED_STATUSES[1:])}"),
+    "content_digest": _optional(_DIGEST),
+    "topic_digests": Check(_maps_to(_is_text), "an object of texts"),
+    "train_steps": _COUNT,
+    "eval_steps": _COUNT,
+    "episodes": _COUNT,
+    "messages": Check(_maps_to(_is_count), "an object of whole numbers from 0 up"),
+    "steps_recorded": Check(lambda value: isinstance(value, bool), "true or false"),
+    "last_evaluation": _optional(_OBJECT),
+    "recent_training": _optional(_OBJECT),
+    "logged": Check(
+        _maps_to(lambda value: value is None or _is_number(value)), "an object of finite numbers or nulls"
+    ),
+    "seconds": _optional(_LENGTH),
+    "bytes": _COUNT,
+    "error": _optional(_TEXT),
+}
+_ARCHIVE: Final = {"target": _TEXT, "digest": _optional(_TEXT), "done": _optional(_OBJECT)}
+_NEEDED: Final = ("name", "seed", "status", "created")
+_RUN: Final = {
+    "name": Check(
+        lambda value: _is_text(value) and 0 < len(value) <= 1000, "a text of 1 to 1,000 characters"
+    ),
+    "seed": Check(lambda value: type(value) is int and 0 <= value < 2**64, "a whole number of 64 bits"),
+    "status": _STATUS,
+    "created": Check(_is_moment, "a date and time such as 2026-01-31T10:00:00+00:00"),
+    "owner": _OBJECT,
+    "config": _OBJECT,
+    "summary": _OBJECT,
+    "archive": _optional(_OBJECT),
+    "provenance": Check(_maps_to(_is_text), "an object of texts"),
+    "proof": _optional(_DIGEST),
+    "recording": _TEXT,
+}
