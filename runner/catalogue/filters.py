@@ -212,7 +212,8 @@ def _pointed(text: str, at: int, told: str) -> RunnerError:
     """Return an error that shows the place in the filter."""
     start = max(0, at - 60)
     shown = text[start : at + 40].replace("\n", " ").replace("\t", " ")
-    return RunnerError(f"filter: {told}.\n  {shown}\n  {' ' * (at - start)}^")
+    end = "" if told.endswith("?") else "."
+    return RunnerError(f"filter: {told}{end}\n  {shown}\n  {' ' * (at - start)}^")
 
 
 def _joined(how: Callable[[Any, Any], Any], parts: Sequence[Any]) -> Any:

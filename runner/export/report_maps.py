@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,10 @@ class MapRow:
     high: float
 
 
+_HALFWAY: Final = 0.05
+"""How far from half of the episodes a snapshot may be, as a share of all, to be called the middle."""
+
+
 def stages_of(recording: Recording) -> list[Stage]:
     """Return the tables before, in the middle of and after learning; fewer where they are the same.
 
@@ -65,7 +69,9 @@ def stages_of(recording: Recording) -> list[Stage]:
     between = sorted(whole[1:-1], key=lambda stage: abs(stage.episode - half))
     middle = between[0] if between else _replayed(recording, half)
     stages = [first, *([middle] if middle else []), last]
-    titles = ["before learning", "in the middle", "after learning"]
+    titles = ["before learning", "during learning", "after learning"]
+    if middle and abs(middle.episode - half) <= _HALFWAY * (last.episode - first.episode):
+        titles[1] = "in the middle"
     if recording.status != "finished":
         titles[-1] = "at the last snapshot"
     named = zip([titles[0], *([titles[1]] if middle else []), titles[-1]], stages, strict=True)

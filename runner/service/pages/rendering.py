@@ -13,6 +13,7 @@ from urllib.parse import urlencode
 
 import jinja2
 from fastapi import Request, Response
+from markupsafe import Markup
 
 from runner import amounts
 from runner.export.report import code
@@ -44,6 +45,7 @@ def templates() -> jinja2.Environment:
         "duration": amounts.duration,
         "age": _age,
         "code": code,
+        "problem": _problem,
         "count": lambda value: amounts.number(value, 0),
         "sentence": lambda text: f"{text[:1].upper()}{text[1:]}{'' if text[-1:] in '.:' else '.'}",
         "with_name": lambda value, name: (name, value),
@@ -89,6 +91,14 @@ def _source(name: str) -> str | None:
         if (folder / name).is_file():
             return (folder / name).read_text("utf-8")
     return None
+
+
+def _problem(message: str) -> Markup:
+    """Return an error as HTML; what a caret points into is set in a fixed width, so that it points there."""
+    text, _, marked = message.partition("\n")
+    if not marked.rstrip().endswith("^"):
+        return Markup("<p>{}</p>").format(code(message))
+    return Markup("<p>{}</p><pre>{}</pre>").format(code(text), marked)
 
 
 def _age(moment: datetime | str) -> str:

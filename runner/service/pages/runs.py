@@ -37,6 +37,8 @@ USUAL: Final = (
     "bytes",
     "age",
 )
+FOLDED: Final = ("id", "seed", "tag", "episodes")
+"""Columns that a narrow screen leaves out, unless the columns were chosen."""
 ROWS: Final = 50
 _LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
 _FALLING: Final = (Kind.NUMBER, Kind.SIZE, Kind.DATE)
@@ -84,15 +86,21 @@ def _page(catalogue: Catalogue, text: str, sort: str, columns: str, number: int)
 
     rows, total, everything = catalogue.read(work)
     asked = {"filter": text, "sort": sort, "columns": _asked(shown)}
+    folded = FOLDED if list(shown) == list(USUAL) else ()
+    if folded and any(row["mean_return"] is not None for row in rows):
+        shown = [*shown[: shown.index("mean_length")], "mean_return", *shown[shown.index("mean_length") :]]
     return render(
         "/runs",
         "runs.html",
-        **_frame(text, sort, shown),
+        **_frame(text, sort, shown) | {"asked_columns": asked["columns"]},
         problem="",
         total=total,
         everything=everything,
-        heads=[_head(column, asked) for column in shown],
-        rows=[{"id": row["id"], "cells": [_cell(row, column) for column in shown]} for row in rows],
+        heads=[_head(column, asked, column in folded) for column in shown],
+        rows=[
+            {"id": row["id"], "cells": [_cell(row, column, column in folded) for column in shown]}
+            for row in rows
+        ],
         page=number,
         pages=math.ceil(total / ROWS),
         turned=lambda to: link("/runs", asked | {"page": to if to > 1 else ""}),
@@ -118,7 +126,7 @@ def _asked(shown: Sequence[str]) -> str:
     return "" if list(shown) == list(USUAL) else ",".join(shown)
 
 
-def _head(column: str, asked: dict[str, Any]) -> dict[str, Any]:
+def _head(column: str, asked: dict[str, Any], folded: bool) -> dict[str, Any]:
     """Return a heading: what a click on it sorts by, and whether the rows are sorted by it now."""
     setting = column.startswith(SETTING)
     known = setting or column in FIELDS
@@ -129,15 +137,18 @@ def _head(column: str, asked: dict[str, Any]) -> dict[str, Any]:
     return {
         "heading": HEADINGS.get(column, column).replace("_", " "),
         "meaning": "" if setting or not known else field_of(column).meaning,
-        "left": not setting and kind in _LEFT,
+        "kind": _classes(not setting and kind in _LEFT, folded),
         "sorted": {column: "ascending", f"-{column}": "descending"}.get(now),
         "href": link("/runs", asked | {"sort": other if now == first else first}) if known else "",
     }
 
 
-def _cell(row: dict[str, Any], column: str) -> dict[str, Any]:
-    left = column in FIELDS and field_of(column).kind in _LEFT
-    kind = "text" if left else ""
+def _classes(left: bool, folded: bool) -> str:
+    return " ".join(name for name, holds in (("text", left), ("fold", folded)) if holds)
+
+
+def _cell(row: dict[str, Any], column: str, folded: bool) -> dict[str, Any]:
+    kind = _classes(column in FIELDS and field_of(column).kind in _LEFT, folded)
     href = f"/runs/{row['id']}" if column in ("id", "name") else ""
     if column == "same_as" and row["same_as"]:
         href = f"/runs/{row['same_as']}"

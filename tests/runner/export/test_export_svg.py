@@ -12,6 +12,7 @@ from runner.export import svg, svg_maps
 from runner.export.report_maps import maps_of, situation, stages_of
 from runner.export.svg import CELL, MARGIN, Drawing
 from runner.frames import agents_of
+from runner.recording.reader import open_recording
 
 NS = {"s": "http://www.w3.org/2000/svg"}
 
@@ -121,3 +122,9 @@ def test_a_trail_is_the_last_places():
     points = svg.trail_points(places).split()
     assert len(points) == svg.TRAIL
     assert points[-1] == "99,198"
+
+
+def test_only_a_snapshot_near_half_of_the_episodes_is_called_the_middle(pictured):
+    for every, title in ((10, "in the middle: 20 episodes"), (15, "during learning: 15 episodes")):
+        with open_recording(pictured("lake", snapshots={"every": every}).recording) as opened:
+            assert [stage.title for stage in stages_of(opened)][1] == title

@@ -120,6 +120,45 @@ def test_metrics_are_drawn_and_zoomed_and_the_address_says_so(page):
     assert browser.find_element(By.NAME, "to").get_attribute("value") == "40"
 
 
+def test_the_key_of_a_plot_tells_every_line_apart_and_reads_out_values(page):
+    browser = page("/compare?run=first&run=second")
+    wait(browser, lambda: len(browser.find_elements(By.CSS_SELECTOR, ".uplot canvas")) > 3)
+    looks = browser.execute_script(
+        """return [...document.querySelectorAll(".plots figure")].map((figure) =>
+            [...figure.querySelectorAll(".key line")].map((line) =>
+                [line.getAttribute("stroke"), line.getAttribute("stroke-dasharray")].join(" ")))"""
+    )
+    assert max(map(len, looks)) >= 4
+    assert all(len(set(lines)) == len(lines) for lines in looks)
+    assert "--" not in text_of(browser, ".plots")
+    plot = browser.find_element(By.CSS_SELECTOR, ".u-over")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", plot)
+    ActionChains(browser).move_to_element(plot).perform()
+    wait(browser, lambda: re.search(r"episode \d", text_of(browser, ".key")))
+    entry = browser.find_element(By.CSS_SELECTOR, ".key button")
+    entry.click()
+    assert entry.get_attribute("aria-pressed") == "false"
+
+
+def test_a_narrow_screen_shows_the_open_tab_the_results_and_both_sides(page):
+    browser = page("/runs")
+    size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        for address, selector in (
+            ("/runs", "tbody .status"),
+            ("/runs", "thead th:nth-of-type(8)"),
+            ("/runs/first/config", ".tabs [aria-current]"),
+            ("/compare?run=first&run=second", "#results ~ .scroll td:last-child"),
+        ):
+            shown = page(address).find_element(By.CSS_SELECTOR, selector)
+            box = browser.execute_script("return arguments[0].getBoundingClientRect().toJSON()", shown)
+            assert box["width"] > 0, selector
+            assert 0 <= box["left"] < box["right"] <= 390, selector
+    finally:
+        browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
 def test_thinned_curves_say_so_and_are_read_again_where_one_zooms(page, folder):
     runner.run(
         {

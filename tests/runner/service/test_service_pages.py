@@ -47,6 +47,12 @@ def test_runs_are_searched_sorted_and_their_columns_chosen(client):
     assert "first</a>" not in page
 
 
+def test_the_caret_of_a_wrong_filter_stands_under_its_place_in_a_fixed_width(client):
+    page = page_of(client, "/runs?filter=status:finishd", 400)
+    assert "Did you mean &#39;finished&#39;?</p>" in page
+    assert "<pre>  status:finishd\n         ^</pre>" in page
+
+
 def test_that_not_all_evaluations_are_shown_is_said(client, monkeypatch):
     assert "The last" not in page_of(client, "/runs/first/evaluations")
     monkeypatch.setattr("runner.service.pages.run.MOST_EVALUATIONS", 2)

@@ -73,11 +73,12 @@ function plot(metric, panel) {
   if (!one) {
     one = { figure: document.createElement("figure") };
     one.figure.className = metric === SHARES ? "wide" : "";
-    one.figure.append(document.createElement("figcaption"), document.createElement("div"));
+    one.figure.append(...["figcaption", "div", "div"].map((name) => document.createElement(name)));
+    one.figure.children[2].className = "key";
     shown.set(metric, one);
     plots.append(one.figure);
   }
-  const [caption, place] = one.figure.children;
+  const [caption, place, key] = one.figure.children;
   const [title, unit] = [document.createElement("b"), document.createElement("span")];
   title.textContent = panel.title;
   unit.textContent = panel.unit + (panel.lines.some((line) => line.thinned) ? ", thinned" : "")
@@ -87,8 +88,58 @@ function plot(metric, panel) {
   place.setAttribute("aria-label", `${panel.title}, ${panel.unit}: ${panel.lines.map((line) => summary(line, lines)).join("; ")}`);
   const sparse = panel.lines.every((line) => line.episodes.length < 80);
   if (one.chart) one.chart.setData(data);
-  else one.chart = new uPlot(options(panel, lines, labels, place, sparse), data, place);
+  else one.chart = new uPlot(options(panel, lines, labels, place, key, sparse), data, place);
+  if (one.kinds !== kinds) legend(one.chart, key, labels);
   one.kinds = kinds;
+}
+
+// A key of all lines, each as it is drawn; a click hides or shows one. While the cursor is over a plot the
+// key has the episode and the values there.
+function legend(chart, key, labels) {
+  const entries = labels.map((name, i) => {
+    const entry = document.createElement("button"), value = document.createElement("output");
+    const { stroke, dash } = chart.series[i + 1];
+    entry.type = "button";
+    entry.append(sample(stroke(chart, i + 1), dash), name, " ", value);
+    entry.setAttribute("aria-pressed", "true");
+    entry.hidden = labels.length < 2;
+    entry.addEventListener("click", () => {
+      const show = !chart.series[i + 1].show;
+      chart.setSeries(i + 1, { show });
+      entry.setAttribute("aria-pressed", String(show));
+    });
+    return entry;
+  });
+  key.replaceChildren(...entries, document.createElement("output"));
+}
+
+function sample(stroke, dash) {
+  const [picture, line] = ["svg", "line"].map((name) => document.createElementNS("http://www.w3.org/2000/svg", name));
+  const set = (element, values) => Object.entries(values).forEach(([name, value]) => element.setAttribute(name, value));
+  set(picture, { width: 30, height: 10, viewBox: "0 0 30 10", "aria-hidden": "true" });
+  set(line, { x1: 1, x2: 29, y1: 5, y2: 5, stroke, "stroke-width": 2.5, "stroke-dasharray": dash.join(" ") });
+  picture.append(line);
+  return picture;
+}
+
+function readOut(chart, key) {
+  const at = chart.cursor.idx, outputs = key.querySelectorAll("output");
+  if (!outputs.length) return;
+  const there = at !== null && at !== undefined && chart.cursor.left >= 0;
+  const value = (i) => there && chart.data[i][at] !== null && chart.data[i][at] !== undefined ? exact(chart.data[i][at]) : "";
+  chart.series.slice(1).forEach((_, i) => { if (outputs.length > 2) outputs[i].textContent = value(i + 1); });
+  const alone = outputs.length === 2 && value(1) ? `: ${value(1)}` : "";
+  outputs[outputs.length - 1].textContent = there ? `episode ${exact(chart.data[0][at])}${alone}` : "";
+}
+
+const exact = (value) => Number(value.toPrecision(6)).toLocaleString("en", { maximumFractionDigits: 6 });
+
+function tick(value) {
+  const size = Math.abs(value), units = [[1e12, "T"], [1e9, "G"], [1e6, "M"], [1e4, "k"]];
+  if (size >= 1e15 || (size > 0 && size < 1e-4)) return value.toExponential(0);
+  const [, unit] = units.find(([least]) => size >= least) ?? [1, ""];
+  const shown = unit === "k" ? value / 1e3 : unit ? value / units.find(([, name]) => name === unit)[0] : value;
+  return Number(shown.toPrecision(6)).toLocaleString("en", { maximumFractionDigits: 6 }) + unit;
 }
 
 function label(line, lines) {
@@ -103,22 +154,29 @@ function summary(line, lines) {
   return `${label(line, lines)} ends at ${Number(last.toPrecision(4))}, between ${Number(Math.min(...known).toPrecision(4))} and ${Number(Math.max(...known).toPrecision(4))}`;
 }
 
-function options(panel, lines, labels, place, sparse) {
+function options(panel, lines, labels, place, key, sparse) {
   const percent = panel.unit.startsWith("percent");
   const positive = panel.lines.every((line) => line.values.every((value) => value === null || value >= 0));
-  const axis = { stroke: look().getPropertyValue("--soft").trim(), grid: { stroke: look().getPropertyValue("--line").trim(), width: 1 }, ticks: { show: false }, font: "12px system-ui, sans-serif" };
+  const axis = {
+    stroke: look().getPropertyValue("--soft").trim(), grid: { stroke: look().getPropertyValue("--line").trim(), width: 1 },
+    ticks: { show: false }, font: "12px system-ui, sans-serif", values: (_, ticks) => ticks.map(tick),
+  };
   const series = panel.lines.map((line, i) => {
     const at = lines.indexOf(line.line), several = runs.length > 1;
-    return { label: labels[i], stroke: colour(several ? line.run : at), width: 1.8, dash: DASHES[at % DASHES.length], spanGaps: true, points: { show: sparse, size: 4 } };
+    const stroke = colour(several ? line.run : at);
+    return { label: labels[i], stroke, width: 1.8, dash: DASHES[at % DASHES.length], spanGaps: true, points: { show: sparse, size: 4 } };
   });
   return {
-    width: place.clientWidth, height: 200,
+    width: place.clientWidth, height: 216, padding: [8, 22, 0, 0],
     scales: { x: { time: false, range: (_, low, high) => [range.from ?? low ?? 0, range.to ?? high ?? 1] }, y: { range: (_, low, high) => bounds(low, high, percent, positive) } },
     series: [{ label: "episode" }, ...series],
-    axes: [{ ...axis, size: 30 }, { ...axis, size: 52 }],
-    legend: { show: labels.length > 1, live: true },
+    axes: [
+      { ...axis, size: 28, label: "training episodes", labelSize: 18, labelGap: 0, labelFont: axis.font },
+      { ...axis, size: (_, values) => 18 + 7.2 * Math.max(3, ...(values ?? []).map((text) => text.length)) },
+    ],
+    legend: { show: false },
     cursor: { drag: { x: true, y: false, setScale: false }, sync: { key: "metrics", setSeries: false } },
-    hooks: { setSelect: [(chart) => zoom(chart)] },
+    hooks: { setSelect: [(chart) => zoom(chart)], setCursor: [(chart) => readOut(chart, key)] },
   };
 }
 
@@ -161,7 +219,7 @@ let width = plots.clientWidth;
 new ResizeObserver(() => {
   if (plots.clientWidth === width) return;
   width = plots.clientWidth;
-  for (const { chart, figure } of shown.values()) chart?.setSize({ width: figure.children[1].clientWidth, height: 200 });
+  for (const { chart, figure } of shown.values()) chart?.setSize({ width: figure.children[1].clientWidth, height: 216 });
 }).observe(plots);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   for (const one of shown.values()) one.kinds = null;
