@@ -24,7 +24,8 @@ from runner.service.problems import answer_errors, answers
 from runner.service.processes import ProcessPool
 from runner.service.receiving.model import Upload, UploadLimits
 from runner.service.receiving.uploads import Uploads
-from runner.service.security import Access, Tokens
+from runner.service.security import Tokens
+from runner.service.sessions import Sessions
 from runner.service.settings import Settings
 from runner.service.work import Jobs
 
@@ -41,7 +42,8 @@ def create_app(settings: Settings) -> FastAPI:
     Raises:
         RunnerError: it would be reachable from other machines and there is no token.
     """
-    if settings.needs_token and not Tokens(settings.tokens).all():
+    tokens = Tokens(settings.tokens)
+    if settings.needs_token and not tokens.all():
         why = (
             "--require-token" if settings.is_loopback else f"{settings.host}, which other machines can reach,"
         )
@@ -62,8 +64,11 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.catalogue = Catalogue(settings.recordings, LOG.warning)
     app.state.kept = Kept(settings.limits.cache_bytes)
     app.state.stopping = asyncio.Event()
-    app.state.access = Access(settings.tokens, settings.limits)
-    app.add_middleware(Guard, settings=settings, access=app.state.access)
+    app.state.tokens = tokens
+    app.state.sessions = Sessions(tokens)
+    app.add_middleware(
+        Guard, settings=settings, tokens=tokens, sessions=app.state.sessions, refused=pages.refused
+    )
     app.add_middleware(AccessLog)
     answer_errors(app)
     pages.answer_errors(app)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Callable
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
 from typing import TYPE_CHECKING, Any, Final
@@ -11,27 +12,30 @@ from urllib.parse import urlencode
 
 from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from runner.errors import RunnerError
-from runner.service.problems import refusal, status_of, trouble_of
+from runner.service.problems import status_of
 from runner.service.refused import Refused
 from runner.service.security import (
-    COOKIE,
     SAFE_METHODS,
-    WRITE,
-    Access,
+    Token,
+    Tokens,
     is_allowed_host,
     is_embedded_elsewhere,
     is_same_origin,
     unauthorized,
 )
+from runner.service.sessions import COOKIE, Sessions
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
     from runner.service.settings import Settings
 
+Refusal = Callable[[Request, RunnerError], Response]
+"""Returns the answer to a request that is refused."""
 OPEN_PATHS: Final = ("/healthz", "/readyz", "/login", "/logout", "/static/")
 """What needs no token: these, and what is below those that end in a slash."""
 UPLOADS: Final = "/api/v1/uploads"
@@ -56,8 +60,11 @@ _HEADERS: Final = {
 class Guard:
     """Refuses what may not be, before any route is looked for; so no route can forget to."""
 
-    def __init__(self, app: ASGIApp, settings: Settings, access: Access) -> None:
-        self._app, self._settings, self._access = app, settings, access
+    def __init__(
+        self, app: ASGIApp, settings: Settings, tokens: Tokens, sessions: Sessions, refused: Refusal
+    ) -> None:
+        self._app, self._settings = app, settings
+        self._tokens, self._sessions, self._refused = tokens, sessions, refused
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
@@ -92,10 +99,11 @@ class Guard:
             )
         reads = scope["method"] in SAFE_METHODS
         if not is_open(scope["path"]):
-            scopes = self._scopes(scope, headers)
-            if scopes is not None and not reads and WRITE not in scopes:
+            token = self._token(headers)
+            scope["state"] = {**scope.get("state", {}), "token": token}
+            if token is not None and not reads and not token.can_write:
                 raise Refused(HTTPStatus.FORBIDDEN, "token: found one for reading, expected one for writing.")
-            if scopes is None and self._settings.needs_token:
+            if token is None and self._settings.needs_token:
                 raise unauthorized("token: found none, expected `Authorization: Bearer TOKEN`, or a login.")
             if "authorization" in headers:
                 return  # which no page of another site can make a browser send
@@ -110,21 +118,30 @@ class Guard:
                 "A program without one says `Origin: http://HOST:PORT`.",
             )
 
-    def _scopes(self, scope: Scope, headers: dict[str, str]) -> tuple[str, ...] | None:
-        """Return what the request's token allows; None if it has none.
+    def _token(self, headers: dict[str, str]) -> Token | None:
+        """Return the token that a request brings, or that its session stands for; None if it has none.
 
         Raises:
-            Refused: it is a wrong one, or there were too many of them from this address.
+            Refused: it is a wrong one.
         """
         kind, _, secret = headers.get("authorization", "").partition(" ")
-        if kind and (kind.lower() != "bearer" or not secret.strip()):
-            raise unauthorized(f"authorization: found {kind[:20]!r}, expected `Bearer TOKEN`.")
-        if not kind and self._settings.needs_token:
-            secret = _cookie(headers)
-        return self._access.scopes_of(secret.strip(), address_of(scope)) if secret else None
+        if kind:
+            if kind.lower() != "bearer" or not secret.strip():
+                raise unauthorized(f"authorization: found {kind[:20]!r}, expected `Bearer TOKEN`.")
+            token = self._tokens.find(secret.strip())
+            if token is None:
+                raise unauthorized("token: found one that is unknown, or was revoked.")
+            return token
+        session = _cookie(headers) if self._settings.needs_token else ""
+        if not session:
+            return None
+        token = self._sessions.token_of(session)
+        if token is None:
+            raise unauthorized("session: it has ended; log in again.")
+        return token
 
     def _answer(self, error: RunnerError, scope: Scope, headers: dict[str, str]) -> Response:
-        """Return how a request is refused: who reads pages is led to the login."""
+        """Return how a request is refused: a browser that asks for a page is led to the login."""
         status = status_of(error)
         pages = "text/html" in headers.get("accept", "") and not scope["path"].startswith("/api/")
         if pages and status == HTTPStatus.UNAUTHORIZED and scope["method"] == "GET":
@@ -132,13 +149,7 @@ class Guard:
                 f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else ""
             )
             return RedirectResponse(f"/login?{urlencode({'next': asked})}", HTTPStatus.SEE_OTHER)
-        more = error.headers if isinstance(error, Refused) else None
-        return refusal(status, trouble_of(error, self._settings), more)
-
-
-def address_of(scope: Scope) -> str:
-    """Return the address of who asks."""
-    return str((scope.get("client") or ("",))[0])
+        return self._refused(Request(scope), error)
 
 
 def is_open(path: str) -> bool:

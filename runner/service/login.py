@@ -1,50 +1,59 @@
-"""A token, typed once into a page and kept in a cookie that no script can read."""
+"""Logging in: a token, typed once into a page, begins a session of the browser; logging out ends it."""
 
 from __future__ import annotations
 
 from http import HTTPStatus
 from typing import Annotated, Any, Final
-from urllib.parse import parse_qs
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
-from runner.service.guard import address_of
+from runner.service.pages.forms import Form
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page
 from runner.service.problems import status_of
-from runner.service.security import COOKIE, Access
+from runner.service.security import Tokens, unauthorized
+from runner.service.sessions import COOKIE, SESSION_SECONDS, Sessions
 
 router = APIRouter(include_in_schema=False)
-SECONDS: Final = 30 * 86_400
-"""The cookie is kept so long; a token that is revoked is refused at once all the same."""
+TOKEN_COOKIE: Final = "dualtaxi_token"
+"""Held the token itself in earlier versions; browsers are told to forget it."""
 
 
 @router.get("/login")
 def ask(request: Request, next: Annotated[str, Query(max_length=4000)] = "/") -> Response:  # noqa: A002
     """Ask for a token."""
-    return page(request, "login.html", next=next, problem="")
+    answer = page(request, "login.html", next=next, problem="")
+    if TOKEN_COOKIE in request.cookies:
+        answer.delete_cookie(TOKEN_COOKIE, **_cookie_of(request))
+    return answer
 
 
 @router.post("/login")
-async def login(request: Request) -> Response:
-    """Keep a token that is right, and lead to where its owner was going."""
-    form = parse_qs((await request.body()).decode(errors="replace"))
-    secret, where = (form.get(name, [""])[0].strip() for name in ("token", "next"))
-    access: Access = request.app.state.access
+def login(request: Request, sent: Form) -> Response:
+    """Begin a session if the token is right, and lead to where its owner was going."""
+    secret, where = (sent.get(name, "").strip() for name in ("token", "next"))
+    tokens: Tokens = request.app.state.tokens
+    sessions: Sessions = request.app.state.sessions
     try:
-        access.scopes_of(secret, address_of(request.scope))
+        token = tokens.find(secret)
+        if token is None:
+            raise unauthorized("token: found one that is unknown, or was revoked.")
+        session = sessions.begin(token)
     except RunnerError as error:
         return page(request, "login.html", status_of(error), next=where, problem=message_of(error, request))
     answer = RedirectResponse(where if is_local(where) else "/", HTTPStatus.SEE_OTHER)
-    answer.set_cookie(COOKIE, secret, max_age=SECONDS, **_cookie_of(request))
+    answer.set_cookie(COOKIE, session, max_age=SESSION_SECONDS, **_cookie_of(request))
     return answer
 
 
 @router.post("/logout")
 def logout(request: Request) -> Response:
-    """Forget the token."""
+    """End the session."""
+    sessions: Sessions = request.app.state.sessions
+    if session := request.cookies.get(COOKIE):
+        sessions.end(session)
     answer = RedirectResponse("/login", HTTPStatus.SEE_OTHER)
     answer.delete_cookie(COOKIE, **_cookie_of(request))
     return answer

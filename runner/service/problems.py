@@ -118,10 +118,15 @@ def answer_errors(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _unexpected)
 
 
-async def _runner_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, RunnerError)
+def refused(request: Request, error: RunnerError) -> Response:
+    """Return the answer to a request that ends in one of the project's errors."""
     headers = error.headers if isinstance(error, Refused) else None
     return refusal(status_of(error), trouble_of(error, request.app.state.settings), headers)
+
+
+async def _runner_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RunnerError)
+    return refused(request, error)
 
 
 async def _http_error(request: Request, error: Exception) -> Response:

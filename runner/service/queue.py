@@ -251,6 +251,28 @@ class Queue:
                 found.append(Event(place, str(said["event"]), dict(said["data"])))
         return found, place
 
+    def last_events(self, number: int, most: int) -> tuple[list[Event], int]:
+        """Return the last events of a job, read from the end of its file, and the place behind them.
+
+        Args:
+            number: which job.
+            most: how many events are returned; fewer if they are longer than `MAX_READ_BYTES`.
+
+        Raises:
+            NoSuchJob: there is none.
+        """
+        self.job(number)
+        try:
+            with (self.folder_of(number) / EVENTS_FILE).open("rb") as stream:
+                place = max(0, stream.seek(0, os.SEEK_END) - MAX_READ_BYTES)
+                if not _is_start(stream, place):
+                    stream.seek(place)
+                    place += len(stream.readline())
+        except FileNotFoundError:
+            return [], 0
+        found, place = self.events(number, place)
+        return found[-most:], place
+
     def runs_of(self, number: int) -> dict[int, str]:
         """Return the ids of the runs of a job that is no sweep, by seed, as far as they were begun."""
         return runs_in(self.folder_of(number))

@@ -48,9 +48,6 @@ class Limits:
     keep_alive_seconds: int = 15
     stop_seconds: int = 20
     """Until what is under way is cut off when the service stops."""
-    failures: int = 10
-    """Wrong tokens from one address in `failure_seconds`, before it must wait so long."""
-    failure_seconds: float = 60.0
     jobs: int = 1000
     """That are not over."""
     page_runs: int = 1000

@@ -230,12 +230,13 @@ async def watch(
     jobs: JobsOf,
     number: Number,
     last_event_id: Annotated[str, Header(description="The id of the last event that was seen.")] = "",
+    after: Annotated[int, Query(ge=0, lt=2**53, description="The same, for a first connection.")] = 0,
 ) -> Response:
-    """Send a job's events from the first on, or behind `Last-Event-ID`, until it is over.
+    """Send a job's events from the first on, or behind `Last-Event-ID` or `after`, until it is over.
 
     `state`, `run` and `log` have ids; `progress` has none, as only the latest counts.
     """
-    place = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 16 else 0
+    place = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 16 else after
     if jobs.queue.job(number).is_over and place and not jobs.queue.events(number, place)[0]:
         return Response(status_code=HTTPStatus.NO_CONTENT)  # which ends a browser's coming again
     if jobs.watchers >= MOST_WATCHERS:

@@ -21,7 +21,7 @@ from runner.service.receiving.appending import Appending
 from runner.service.receiving.model import Announcement, Completion, State, Upload
 from runner.service.receiving.uploads import Uploads
 from runner.service.refused import Refused
-from runner.service.security import COOKIE
+from runner.service.security import Token
 
 router = APIRouter(tags=["uploads"])
 
@@ -67,10 +67,9 @@ def uploads_of(request: Request) -> Uploads:
 
 
 def owner_of(request: Request) -> str:
-    """Return who asks: what its token was, hashed once more; nothing of those that have none."""
-    said = request.headers.get("authorization", "").partition(" ")[2].strip()
-    secret = said or request.cookies.get(COOKIE, "")
-    return hashlib.sha256(b"owner of uploads " + secret.encode()).hexdigest() if secret else ""
+    """Return whose uploads a request may continue: the hash of its token, hashed once more, or nothing."""
+    token: Token | None = request.state.token
+    return hashlib.sha256(b"owner of uploads " + token.sha256.encode()).hexdigest() if token else ""
 
 
 UploadsOf = Annotated[Uploads, Depends(uploads_of)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from datetime import datetime
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -62,6 +63,8 @@ def job(request: Request, jobs: JobsOf, number: Number) -> Response:
         place=place,
         submitted=jobs.queue.submitted(number),
         runs=_runs(found, jobs),
+        is_over=found.is_over,
+        seconds=_seconds(found),
     )
 
 
@@ -124,13 +127,15 @@ def _said(job: Job, progress: dict[str, Any]) -> str:
 
 def _log(jobs: Jobs, number: int) -> tuple[list[dict[str, Any]], int]:
     """Return the last events of a job, and the place behind them."""
-    lines: list[dict[str, Any]] = []
-    place = 0
-    while True:
-        found, place = jobs.queue.events(number, place)
-        if not found:
-            return lines[-MOST_LINES:], place
-        lines += [{"kind": event.kind, **event.data} for event in found]
+    found, place = jobs.queue.last_events(number, MOST_LINES)
+    return [{"kind": event.kind, **event.data} for event in found], place
+
+
+def _seconds(job: Job) -> float | None:
+    """Return how long a job took, from its first start; None if it is not over, or never started."""
+    if not job.is_over or not job.started or not job.ended:
+        return None
+    return (datetime.fromisoformat(job.ended) - datetime.fromisoformat(job.started)).total_seconds()
 
 
 def _runs(job: Job, jobs: Jobs) -> list[dict[str, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import functools
 from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from importlib.resources import files
@@ -65,12 +66,30 @@ def page(request: Request, template: str, status: HTTPStatus = HTTPStatus.OK, **
         status: of the answer.
         context: what the template asks for.
     """
-    return Response(render(request.url.path, template, **context), status, media_type="text/html")
+    body = render(request.url.path, template, viewer=viewer_of(request), **context)
+    return Response(body, status, media_type="text/html")
 
 
-def render(path: str, template: str, **context: Any) -> bytes:
+@dataclass(frozen=True)
+class Viewer:
+    """Who looks at a page, and so what it offers."""
+
+    name: str
+    """Of the token; empty where none is needed."""
+    can_write: bool
+
+
+def viewer_of(request: Request) -> Viewer:
+    """Return who looks at a page."""
+    token = getattr(request.state, "token", None)
+    if token is None:
+        return Viewer("", not request.app.state.settings.needs_token)
+    return Viewer(token.name, token.can_write)
+
+
+def render(path: str, template: str, viewer: Viewer, **context: Any) -> bytes:
     """Return the HTML of a page at a path."""
-    return templates().get_template(template).render(path=path, **context).encode()
+    return templates().get_template(template).render(path=path, viewer=viewer, **context).encode()
 
 
 def link(path: str, values: Mapping[str, Any]) -> str:

@@ -13,12 +13,12 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from runner.analysis.step_reference import parse_step_reference
 from runner.cache import cache_folder
-from runner.errors import RunnerError, StorageError
+from runner.errors import StorageError
 from runner.service import played
 from runner.service.api.replay import LONG
 from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
@@ -71,7 +71,7 @@ async def frame(
         request,
         "rerun_frame.html",
         title=f"{run.name}, {run.run_id}",
-        viewer=f"/static/rerun/{version()}",
+        files=f"/static/rerun/{version()}",
         recording=link(f"/api/v1/runs/{run.run_id}/replay.rrd", asked),
         step=int(step),
     )
@@ -83,7 +83,7 @@ async def frame(
 def viewer_file(number: str, name: str) -> Response:
     """Return a file of the viewer."""
     if name not in FILES or number != version():
-        raise RunnerError(f"there is no file {name!r} of a viewer {number!r}.")
+        raise HTTPException(HTTPStatus.NOT_FOUND)
     return FileResponse(viewer_files() / name, media_type=FILES[name], headers={"cache-control": _FOREVER})
 
 

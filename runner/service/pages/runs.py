@@ -17,7 +17,7 @@ from runner.catalogue.index import order_of
 from runner.errors import RunnerError
 from runner.service.dependencies import CatalogueOf, KeptOf
 from runner.service.pages.problems import message_of
-from runner.service.pages.rendering import link, render
+from runner.service.pages.rendering import Viewer, link, render, viewer_of
 
 if TYPE_CHECKING:
     from runner.catalogue.index import Index
@@ -64,19 +64,21 @@ async def runs(
     """Show the runs that fit a filter."""
     status = HTTPStatus.OK
 
+    viewer = viewer_of(request)
+
     def make() -> bytes:
-        return _page(catalogue, filter, sort, ",".join(columns or ()), page)
+        return _page(catalogue, filter, sort, ",".join(columns or ()), page, viewer)
 
     try:
-        body = await kept.answer(("runs page", catalogue.version(), request.url.query), make)
+        body = await kept.answer(("runs page", catalogue.version(), request.url.query, viewer), make)
     except RunnerError as error:
         status = HTTPStatus.BAD_REQUEST
         told = _frame(filter, "", USUAL) | {"problem": message_of(error, request), "rows": [], "total": None}
-        body = render("/runs", "runs.html", **told)
+        body = render("/runs", "runs.html", viewer, **told)
     return Response(body, status, media_type="text/html")
 
 
-def _page(catalogue: Catalogue, text: str, sort: str, columns: str, number: int) -> bytes:
+def _page(catalogue: Catalogue, text: str, sort: str, columns: str, number: int, viewer: Viewer) -> bytes:
     chosen, order = parse(text), order_of(sort)
     shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
 
@@ -92,6 +94,7 @@ def _page(catalogue: Catalogue, text: str, sort: str, columns: str, number: int)
     return render(
         "/runs",
         "runs.html",
+        viewer,
         **_frame(text, sort, shown) | {"asked_columns": asked["columns"]},
         problem="",
         total=total,

@@ -11,12 +11,12 @@ import gzip
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from http import HTTPStatus
 from importlib.resources import files
 from typing import Final
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, HTTPException, Request, Response
 
-from runner.errors import RunnerError
 from runner.export import svg, svg_maps
 
 router = APIRouter(include_in_schema=False)
@@ -33,7 +33,17 @@ _TYPES: Final = {
 }
 _FOREVER: Final = "public, max-age=31536000, immutable"
 _OWN: Final = (
-    *("asked.js", "charts.js", "episode.js", "job.js", "live.js", "parts.js", "rerun.css", "rerun.js"),
+    *(
+        "ages.js",
+        "asked.js",
+        "charts.js",
+        "episode.js",
+        "job.js",
+        "live.js",
+        "parts.js",
+        "rerun.css",
+        "rerun.js",
+    ),
     *("stepping.js", "submit.js", "table.js"),
 )
 _OTHERS: Final = ("icon.svg", f"{UPLOT}/uPlot.iife.min.js", f"{UPLOT}/LICENSE")
@@ -85,7 +95,7 @@ def static(digest: str, name: str, request: Request) -> Response:
     """Return a file of the pages."""
     asset = assets().get(name)
     if asset is None:
-        raise RunnerError(f"there is no file {name!r}.")
+        raise HTTPException(HTTPStatus.NOT_FOUND)
     packed = "gzip" in request.headers.get("accept-encoding", "")
     headers = {"vary": "accept-encoding", "cache-control": _FOREVER if digest == version() else "no-cache"}
     return Response(

@@ -18,8 +18,9 @@ from runner.errors import RunnerError
 from runner.service.checking import SWEEP_KEYS, Checked
 from runner.service.dependencies import CatalogueOf, JobsOf
 from runner.service.pages.forms import Form
-from runner.service.pages.rendering import page
+from runner.service.pages.rendering import page, viewer_of
 from runner.service.problems import trouble_of
+from runner.service.refused import Refused
 
 router = APIRouter(prefix="/submit", include_in_schema=False)
 
@@ -59,6 +60,10 @@ def form(
     sweep: Annotated[bool, Query()] = False,
 ) -> Response:
     """Show the form, with a configuration to begin with."""
+    if not viewer_of(request).can_write:
+        raise Refused(
+            HTTPStatus.FORBIDDEN, "token: found one for reading, expected one for writing: log in with that."
+        )
     text = SWEEP if sweep else FIRST
     if origin:
         text = write_yaml(catalogue.find(origin).file.config)

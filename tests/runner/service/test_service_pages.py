@@ -8,12 +8,14 @@ import json
 import re
 
 import pytest
+from submitted import ICY
 
 from runner.finding import find_run
 from runner.recording import reader
 from runner.recording.reader import open_recording
 from runner.words import states_in_words
 from tests.runner.export.outline import Outline
+from tests.waiting import until
 
 SAYS_HTML = {"Accept": "text/html"}
 
@@ -104,6 +106,8 @@ def test_files_are_kept_for_ever_and_compressed(client):
     assert answer.headers["content-encoding"] == "gzip"
     assert client.get("/static/older/style.css").headers["cache-control"] == "no-cache"
     assert client.get("/static/x/../../app.py").status_code >= 400
+    for missing in ("/static/x/missing.js", "/static/rerun/0.0.0/re_viewer.js", "/nothing"):
+        assert client.get(missing).status_code == 404
 
 
 def test_a_runs_name_cannot_break_out(client, recordings):
@@ -303,3 +307,21 @@ def test_no_recording_is_read_by_the_event_loop(client, monkeypatch, address):
     monkeypatch.setattr("runner.service.pages.replay.open_recording", opened)
     assert client.get(address).status_code == 200
     assert read_by_loop == []
+
+
+def test_some_of_the_runs_are_counted_in_the_plural(client):
+    assert "1 of 2 runs" in page_of(client, "/runs?filter=name:first")
+
+
+def test_the_page_of_a_finished_job_leads_to_its_run_and_asks_for_no_events(client):
+    number = client.post("/api/v1/jobs", content=json.dumps(ICY | {"seeds": [0]})).json()["number"]
+    job = until(lambda job: job["state"] == "finished", lambda: client.get(f"/api/v1/jobs/{number}").json())
+    page = page_of(client, f"/queue/{number}")
+    run_id = job["begun"][0]["run_id"]
+    assert f'href="/runs/{run_id}">The run</a>' in page
+    assert f'run <a href="/runs/{run_id}">{run_id}</a> begins' in page
+    assert "begun</small>" not in page
+    assert "data-active" not in page
+    assert re.search(r"ago, finished <time[^>]* data-age>[^<]+</time> ago, took [\d.]+ s<", page)
+    place = re.search(r'data-place="(\d+)"', page)[1]
+    assert client.get(f"/api/v1/jobs/{number}/events?after={place}").status_code == 204

@@ -148,3 +148,17 @@ def test_a_job_that_cannot_be_written_is_not_in_the_queue(queue, monkeypatch):
         added(queue)
     assert queue.jobs() == []
     assert not queue.folder_of(1).exists()
+
+
+def test_the_last_events_are_read_from_the_end_of_the_file(queue, monkeypatch):
+    monkeypatch.setattr(queues, "MAX_READ_BYTES", 1000)
+    job = added(queue)
+    assert [event.kind for event in queue.last_events(job.number, 10)[0]] == ["state"]
+    for number in range(100):
+        queue.note(job.number, "log", {"text": f"line {number}"})
+    found, place = queue.last_events(job.number, 10)
+    assert [event.data["text"] for event in found] == [f"line {number}" for number in range(90, 100)]
+    assert queue.events(job.number, place) == ([], place)
+    assert 10 < len(queue.last_events(job.number, 100)[0]) < 30, "no more than are read at once"
+    with pytest.raises(NoSuchJob):
+        queue.last_events(9, 10)

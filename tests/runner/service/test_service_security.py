@@ -15,6 +15,7 @@ import httpx2
 import pytest
 from click.testing import CliRunner
 from served import Served
+from starlette.testclient import TestClient
 
 from runner.cli import cli
 from runner.errors import RunnerError
@@ -81,15 +82,12 @@ def test_a_revoked_token_is_refused_at_once(connect, open_to_others, tokens):
     assert client.get(RUNS, headers=_bearer(secret)).status_code == 401
 
 
-def test_guessing_is_slowed_down(connect, open_to_others, tokens):
+def test_wrong_tokens_lock_nobody_out(connect, open_to_others, tokens):
     _, secret = tokens.create("laptop", (READ,))
-    limits = Limits(failures=3, failure_seconds=60)
-    client = connect(dataclasses.replace(open_to_others, limits=limits))
-    for _ in range(3):
+    client = connect(open_to_others)
+    for _ in range(30):
         assert client.get(RUNS, headers=_bearer("guess")).status_code == 401
-    answer = client.get(RUNS, headers=_bearer(secret))
-    assert answer.status_code == 429
-    assert 1 <= int(answer.headers["retry-after"]) <= 60
+    assert client.get(RUNS, headers=_bearer(secret)).status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -164,11 +162,63 @@ def test_a_login_is_kept_in_a_cookie_that_cannot_write_from_elsewhere(connect, o
     cookie = entered.headers["set-cookie"]
     assert "HttpOnly" in cookie
     assert "SameSite=lax" in cookie
+    assert secret not in cookie
     assert client.get(RUNS).status_code == 200
     assert client.patch(RUN, json={"note": "x"}, headers={"Origin": "http://evil.example"}).status_code == 403
     assert client.patch(RUN, json={"note": "x"}, headers=OWN).status_code == 200
-    client.post("/logout", headers=OWN)
+    session = client.cookies["dualtaxi_session"]
+    assert client.post("/logout", headers=OWN, follow_redirects=False).status_code == 303
     assert client.get(RUNS).status_code == 401
+    assert client.get(RUNS, headers={"Cookie": f"dualtaxi_session={session}"}).status_code == 401
+
+
+def test_a_session_survives_a_restart_and_ends_with_its_token_or_its_time(
+    connect, open_to_others, tokens, monkeypatch
+):
+    _, secret = tokens.create("laptop", (READ,))
+    tokens.create("other", (READ,))
+    entered = connect(open_to_others).post("/login", data={"token": secret}, follow_redirects=False)
+    session = entered.cookies["dualtaxi_session"]
+    path = tokens.path.with_name("sessions.json")
+    assert session not in path.read_text()
+    assert secret not in path.read_text()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+    restarted = create_app(open_to_others)
+    cookie = {"Cookie": f"dualtaxi_session={session}"}
+
+    def status():
+        return TestClient(restarted, base_url="http://localhost", headers=cookie).get("/docs").status_code
+
+    assert status() == 404, "logged in: there is no such page"
+    with monkeypatch.context() as later:
+        now = time.time()
+        later.setattr("runner.service.sessions.time.time", lambda: now + 8 * 86_400)
+        assert status() == 401
+    tokens.revoke("laptop")
+    assert status() == 401
+
+
+def test_a_token_for_reading_is_offered_nothing_that_it_may_not_do(connect, open_to_others, tokens):
+    _, reads = tokens.create("reader", (READ,))
+    _, writes = tokens.create("writer", (READ, WRITE))
+    client = connect(open_to_others, **OWN, accept="text/html")
+    client.post("/login", data={"token": reads})
+    for address in ("/runs", "/runs/first", "/runs/first/config", "/queue", "/sweeps"):
+        page = client.get(address).text
+        assert "reader, may only read" in page
+        assert 'action="/logout"' in page
+        assert "/submit" not in page
+        assert "Save labels" not in page
+    for refused in (client.get("/submit"), client.post("/runs/first/labels", data={"name": "x"})):
+        assert refused.status_code == 403
+        assert refused.headers["content-type"].startswith("text/html")
+        assert "found one for reading, expected one for writing" in refused.text
+    client.post("/login", data={"token": writes})
+    page = client.get("/runs/first").text
+    assert "writer" in page
+    assert "may only read" not in page
+    assert "Save labels" in page
 
 
 @pytest.mark.parametrize("where", ["//evil.example", "https://evil.example", "/\\evil.example", ""])
@@ -291,14 +341,14 @@ def test_tokens_are_made_listed_and_revoked_by_the_command(monkeypatch, tmp_path
     secret = said("create", "laptop").stdout.strip()
     writes = json.loads(said("create", "pusher", "--scope", "write", "--json").stdout)
     kept = Tokens(tokens_file())
-    assert kept.scopes_of(secret) == (READ,)
-    assert kept.scopes_of(writes["token"]) == (READ, WRITE)
+    assert kept.find(secret).scopes == (READ,)
+    assert kept.find(writes["token"]).scopes == (READ, WRITE)
     listed = json.loads(said("ls", "--json").stdout)
     assert [token["name"] for token in listed] == ["laptop", "pusher"]
     assert secret not in said("ls").stdout
     assert said("revoke", "nobody").exit_code == 2
     assert said("revoke", "laptop").exit_code == 0
-    assert kept.scopes_of(secret) is None
+    assert kept.find(secret) is None
 
 
 def test_a_proxy_that_is_believed_tells_who_asks_and_how(recordings, tmp_path, monkeypatch):
@@ -311,9 +361,6 @@ def test_a_proxy_that_is_believed_tells_who_asks_and_how(recordings, tmp_path, m
     with Served(recordings, *words) as served:
         assert httpx2.get(f"{served.url}/api/v1/runs").status_code == 401
         entered = httpx2.post(f"{served.url}/login", data={"token": secret}, headers=said)
-        for _ in range(10):
-            httpx2.get(f"{served.url}/api/v1/runs", headers=said | _bearer("wrong"))
-        assert httpx2.get(f"{served.url}/api/v1/runs", headers=said | _bearer(secret)).status_code == 429
         assert httpx2.get(f"{served.url}/api/v1/runs", headers=_bearer(secret)).status_code == 200
     assert entered.status_code == 303
     assert "Secure" in entered.headers["set-cookie"]

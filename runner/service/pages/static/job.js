@@ -1,18 +1,24 @@
-// A job under way: its events as the server sends them.
+// A job: its log is shown from its end; while the job is not over, its events are added as they come.
 const head = document.querySelector("[data-job]");
 const [state, progress, runs, log] = ["state", "progress", "runs", "log"].map((name) => document.querySelector(`[data-${name}]`));
 const count = (number) => number.toLocaleString("en");
-let seen = Number(head.dataset.place);
 log.scrollTop = log.scrollHeight;
 
-function line(time, text) {
+function line(time, ...content) {
   const item = document.createElement("li"), when = document.createElement("time");
   when.dateTime = time ?? "";
   when.textContent = (time ?? "").slice(11, 19);
-  item.append(when, " ", text);
+  item.append(when, " ", ...content);
   const isAtEnd = log.scrollHeight - log.scrollTop - log.clientHeight < 40;
   log.append(item);
   if (isAtEnd) log.scrollTop = log.scrollHeight;
+}
+
+function linked(id) {
+  const link = document.createElement("a");
+  link.href = `/runs/${id}`;
+  link.textContent = id;
+  return link;
 }
 
 function said(data) {
@@ -21,34 +27,30 @@ function said(data) {
   return [(data.run - 1 + data.episode / Math.max(1, data.episodes)) / data.runs, `${count(data.episode)} of ${count(data.episodes)} episodes${run}`];
 }
 
-// What the page says already was rendered by the server; only what came after it is added.
-function heard(kind, tell) {
-  source.addEventListener(kind, (event) => {
-    const fresh = !event.lastEventId || Number(event.lastEventId) > seen;
-    if (fresh) tell(JSON.parse(event.data));
+function watch() {
+  // The server rendered what came before; a connection that breaks goes on where it was by itself.
+  const source = new EventSource(`${head.dataset.job}/events?after=${head.dataset.place}`);
+  const on = (kind, show) => source.addEventListener(kind, (event) => show(JSON.parse(event.data)));
+  on("progress", (data) => {
+    const [share, words] = said(data);
+    progress.hidden = false;
+    progress.querySelector("progress").value = share;
+    progress.querySelector("span").textContent = words;
+  });
+  on("run", (data) => {
+    line(data.time, "run ", linked(data.run_id), " begins");
+    if (!runs) return;
+    const item = document.createElement("li");
+    item.append(linked(data.run_id), `, seed ${data.seed}`);
+    runs.append(item);
+  });
+  on("log", (data) => line(data.time, data.text));
+  on("state", (data) => {
+    line(data.time, data.state + (data.error ? `: ${data.error}` : ""));
+    state.textContent = data.state;
+    state.className = `status ${data.state}`;
+    if (!["queued", "running"].includes(data.state)) { source.close(); location.reload(); }
   });
 }
 
-const source = new EventSource(`${head.dataset.job}/events`);
-heard("progress", (data) => {
-  const [share, words] = said(data);
-  progress.hidden = false;
-  progress.querySelector("progress").value = share;
-  progress.querySelector("span").textContent = words;
-});
-heard("run", (data) => {
-  line(data.time, `run ${data.run_id} begins`);
-  if (!runs) return;
-  const item = document.createElement("li"), link = document.createElement("a");
-  link.href = `/runs/${data.run_id}`;
-  link.textContent = data.run_id;
-  item.append(link, `, seed ${data.seed}`);
-  runs.append(item);
-});
-heard("log", (data) => line(data.time, data.text));
-heard("state", (data) => {
-  line(data.time, data.state + (data.error ? `: ${data.error}` : ""));
-  state.textContent = data.state;
-  state.className = `status ${data.state}`;
-  if (!["queued", "running"].includes(data.state)) { source.close(); location.reload(); }
-});
+if ("active" in head.dataset) watch();
