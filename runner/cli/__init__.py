@@ -9,14 +9,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib
+import json
 import os
 import sys
+from collections.abc import Sequence
 from typing import Any, Final
 
 import click
 
 from runner import __version__
-from runner.errors import RunnerError, StorageError, nearest
+from runner.errors import ConfigError, Located, RunnerError, StorageError, nearest
 
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Do": {
@@ -83,6 +85,20 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
 INTERRUPTED: Final = 130
 _DISK_FULL: Final = tuple(getattr(errno, name) for name in ("ENOSPC", "EDQUOT") if hasattr(errno, name))
 
+_WRONG_PLACE: Final = (
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EISDIR,
+    errno.EEXIST,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.ENAMETOOLONG,
+    errno.ELOOP,
+)
+"""Of errors in writing: the place was the wrong one, not the disk full or broken."""
+_AS_JSON: Final = "runner.as_json"
+
 _EPILOG = """\b
 First steps:
   dualtaxi run quick        learn for a second, recording every step
@@ -97,25 +113,66 @@ A RUN is named by its id, a prefix of it, its name, a path, or @latest
 
 \b
 Results go to stdout, everything else to stderr; NO_COLOR is respected.
+With --json an error is an object in the last line of stderr:
+  {"error": {"message": "...", "exit_code": 2, "problems": [...]}}
 Exit codes:
   0    fine
-  1    something differs or was found; the disk is full
+  1    something differs or was found; a disk is full; a server does not answer
   2    wrong usage or input
   130  interrupted
 """
 
 
 class Failure(click.ClickException):
-    """A `RunnerError`, told without a traceback."""
+    """A `RunnerError`, printed without a traceback."""
 
     def __init__(self, error: RunnerError) -> None:
-        told = str(error) if "\n" in str(error) else f"Error: {error}"
-        super().__init__("\n".join([told, *getattr(error, "__notes__", [])]))
-        self.exit_code = error.exit_code  # type: ignore[misc]  # Click's own classes do so
+        super().__init__("\n".join([str(error), *getattr(error, "__notes__", [])]))
+        self.exit_code = exit_code_of(error)  # type: ignore[misc]  # Click's own classes do so
+        self.problems = error.problems if isinstance(error, ConfigError) else ()
 
     def show(self, file: Any = None) -> None:
-        """Print the message; problems of which each has a line begin at the margin, with their places."""
-        click.echo(self.message, file=file or sys.stderr)
+        """Print the message; of several problems each has a line, which begins with its place."""
+        lines = self.message.count("\n") + 1
+        head = f"{lines} problems\n" if self.problems and lines > 1 else ""
+        click.echo(f"Error: {head}{self.message}", file=file or sys.stderr)
+
+
+def exit_code_of(error: RunnerError) -> int:
+    """Return the exit code for an error: 2 if a place that the user named cannot be written."""
+    cause = error.__cause__
+    if isinstance(error, StorageError) and isinstance(cause, OSError) and cause.errno in _WRONG_PLACE:
+        return RunnerError.exit_code
+    return error.exit_code
+
+
+class JsonFailure(click.ClickException):
+    """An error of a command with --json: one line of JSON on stderr."""
+
+    def __init__(self, error: click.ClickException) -> None:
+        super().__init__(error.format_message())
+        self.exit_code = error.exit_code  # type: ignore[misc]  # Click's own classes do so
+        self.problems = getattr(error, "problems", ())
+
+    def show(self, file: Any = None) -> None:
+        """Print the object."""
+        click.echo(error_as_json(self.message, self.exit_code, self.problems), file=file or sys.stderr)
+
+
+def error_as_json(message: str, exit_code: int, problems: Sequence[Located] = (), **more: str) -> str:
+    """Return an error as a line of JSON, in the form of the service's API.
+
+    Args:
+        message: as it is printed without --json.
+        exit_code: of the command.
+        problems: of a configuration, one by one.
+        more: what else is known of it.
+    """
+    located = [
+        {"path": each.path, "line": each.line, "column": each.column, "message": each.message}
+        for each in problems
+    ]
+    return json.dumps({"error": {"message": message, "exit_code": exit_code, **more, "problems": located}})
 
 
 class LazyGroup(click.Group):
@@ -152,10 +209,8 @@ class LazyGroup(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; what a user can mend, or wanted, is no traceback."""
         try:
-            result = super().invoke(ctx)
+            result = self._invoke(ctx)
             sys.stdout.flush()
-        except RunnerError as error:
-            raise Failure(error) from error
         except (KeyboardInterrupt, click.Abort):
             raise click.exceptions.Exit(INTERRUPTED) from None
         except BrokenPipeError:
@@ -166,6 +221,23 @@ class LazyGroup(click.Group):
                 raise
             raise Failure(StorageError(f"{error.filename or 'stdout'}: {error.strerror}.")) from error
         return result
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Remember whether the command is to print JSON, before anything of it is parsed."""
+        ctx.meta[_AS_JSON] = "--json" in args
+        return super().parse_args(ctx, args)
+
+    def _invoke(self, ctx: click.Context) -> Any:
+        """Run the command; raise its errors as they are to be printed."""
+        try:
+            try:
+                return super().invoke(ctx)
+            except RunnerError as error:
+                raise Failure(error) from error
+        except click.exceptions.NoArgsIsHelpError:
+            raise
+        except click.ClickException as error:
+            raise (JsonFailure(error) if ctx.meta[_AS_JSON] else error) from error
 
 
 def _forget_stdout() -> None:

@@ -158,6 +158,19 @@ class NumberList(_Numbers):
         return tuple(_number(part.strip()) for part in text.split(","))
 
 
+class PictureSize(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+    """`WxH`, the width and height of a picture in pixels."""
+
+    name = "WxH"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the size as the viewer takes it."""
+        width, _, height = str(value).partition("x")
+        if not (width.isdecimal() and height.isdecimal() and 1 <= int(width) <= 8192 >= int(height) >= 1):
+            self.fail(f"found {value!r}, expected WIDTHxHEIGHT up to 8192x8192, such as 1600x900", param, ctx)
+        return str(value)
+
+
 class StepReference(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
     """A step of an episode: `EPISODE:T`, or `eval:N:TRIAL:T`."""
 

@@ -24,6 +24,7 @@ def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
     require_new(path, force)
     fresh = path.with_name(f".{secrets.token_hex(4)}.{path.name}")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         write(fresh)
         fresh.replace(path)
     except OSError as error:

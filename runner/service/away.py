@@ -14,6 +14,10 @@ TOLD_PAUSE: Final = 1.0
 """What is waited for is told before a pause as long as this."""
 
 
+_MAY_PASS: Final = (408, 425, 429)
+"""Refusals that say nothing against the request: too slow, too early, too many."""
+
+
 class ServerError(RunnerError):
     """A server refuses what was asked of it; its own words stand in the message.
 
@@ -27,6 +31,8 @@ class ServerError(RunnerError):
 
     def __init__(self, message: str, status: int = 0, retry_seconds: float = 0.0) -> None:
         super().__init__(message)
+        if 400 <= status < 500 and status not in _MAY_PASS:
+            self.exit_code = RunnerError.exit_code  # the request was wrong, not the server
         self.status, self.retry_seconds = status, retry_seconds
 
 

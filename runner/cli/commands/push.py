@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from runner.cli import error_as_json, exit_code_of
 from runner.cli.finding import find_recorded
 from runner.cli.options import (
     json_option,
@@ -69,14 +70,21 @@ def command(
         raise click.UsageError("expected either runs or --outbox.")
     secret = found_token(token, token_file)
     pushes = _outbox(server, secret) if outbox else _runs(names, required(server), secret, recordings)
-    results = [_outcome(name, push) for name, push in pushes]
-    stored = [result for result in results if result is not None]
+    stored: list[dict[str, Any]] = []
+    codes: list[int] = []
+    for name, push in pushes:
+        try:
+            stored.append(_outcome(name, push))
+        except RunnerError as error:
+            codes.append(exit_code_of(error))
+            message = f"{name}: {error}"
+            say(error_as_json(message, codes[-1], run=name) if as_json else f"Error: {message}")
     if as_json:
         print_json(stored)
     else:
         _draw(stored)
-    if len(stored) < len(results):
-        raise click.exceptions.Exit(1)
+    if codes:
+        raise click.exceptions.Exit(max(codes))
 
 
 def _runs(
@@ -115,16 +123,12 @@ def _outbox(server: str | None, token: str | None) -> Iterator[tuple[str, Push]]
         yield run.run_id, partial(push, run, server or url)
 
 
-def _outcome(name: str, push: Push) -> dict[str, Any] | None:
-    """Push, and return what came of it; None if it failed, which is said."""
+def _outcome(name: str, push: Push) -> dict[str, Any]:
+    """Push, and return what became of it."""
     from runner.cli.progress import bytes_line
 
-    try:
-        with bytes_line(f"pushing {name}") as report:
-            sent, called, bytes_ = push(report)
-    except RunnerError as error:
-        say(f"Error: {name}: {error}")
-        return None
+    with bytes_line(f"pushing {name}") as report:
+        sent, called, bytes_ = push(report)
     return {"run_id": sent.run_id, "name": called, "bytes": bytes_, "already": sent.already}
 
 

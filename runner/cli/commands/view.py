@@ -13,7 +13,7 @@ from runner.cli.choosing import choice_options, request_of, tell
 from runner.cli.finding import find_recorded
 from runner.cli.options import recordings_option
 from runner.cli.output import say
-from runner.cli.parameters import RunName, StepReference
+from runner.cli.parameters import PictureSize, RunName, StepReference
 
 if TYPE_CHECKING:
     from runner.export.rerun.spots import Spot
@@ -45,7 +45,13 @@ if TYPE_CHECKING:
     help="Draw one frame into a file; needs no screen.",
 )
 @click.option(
-    "--size", "picture_size", default="1600x900", show_default=True, metavar="WxH", help="Of the screenshot."
+    "--size",
+    "picture_size",
+    type=PictureSize(),
+    default="1600x900",
+    show_default=True,
+    metavar="WxH",
+    help="Size of the screenshot in pixels.",
 )
 @click.option("--force", is_flag=True, help="Replace the screenshot if it exists.")
 @choice_options

@@ -80,7 +80,7 @@ def test_a_folder_that_is_none(command, tmp_path):
     command.recordings = tmp_path / "file"
     command.recordings.write_text("")
     result = command("ls")
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "cannot be read" in result.stderr
 
 

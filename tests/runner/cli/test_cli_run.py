@@ -144,7 +144,7 @@ def test_a_name_that_cannot_be_one_is_refused(command, tiny):
 def test_a_folder_that_cannot_be_written(command, tiny, tmp_path):
     command.recordings = tmp_path / "tiny.yaml"
     result = command("run", tiny)
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "cannot be written" in result.stderr
     assert "--recordings" in result.stderr
 

@@ -124,14 +124,14 @@ def test_a_packed_run_is_pushed_as_it_is(server, recordings, tmp_path):
 
 def test_what_cannot_be_pushed_is_said_and_the_others_are_pushed(server, run, recordings):
     result = dualtaxi("push", "nosuch", run.run_id, "--recordings", recordings, "--server", server.url)
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "nosuch" in result.stderr
     assert run.run_id in result.stdout
     assert dualtaxi("push", run.run_id, "--recordings", recordings).exit_code == 2
     assert dualtaxi("push", "--server", server.url).exit_code == 2
     assert dualtaxi("pull", "x", "--server", "ftp://there").exit_code == 2
     missing = dualtaxi("pull", "nosuch", "--server", server.url, "--recordings", recordings)
-    assert (missing.exit_code, "nosuch" in missing.stderr) == (1, True)
+    assert (missing.exit_code, "nosuch" in missing.stderr) == (2, True)
 
 
 def test_a_refused_run_is_said_to_be(server, run, tmp_path):
@@ -149,7 +149,7 @@ def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recor
     own_server.start()
     push = ("push", run.run_id, "--recordings", recordings, "--server", own_server.url)
     refused = dualtaxi(*push, "--token", "dualtaxi_wrong")
-    assert (refused.exit_code, "token" in refused.stderr) == (1, True)
+    assert (refused.exit_code, "token" in refused.stderr) == (2, True)
     (tmp_path / "token").write_text(token + "\n")
     taken = dualtaxi(*push, "--token-file", tmp_path / "token")
     assert taken.exit_code == 0, taken.stderr

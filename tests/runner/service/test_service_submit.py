@@ -37,7 +37,7 @@ def test_a_file_is_done_by_a_server_and_watched(file, tmp_path):
         assert "seed 1: finished" in result.stderr
         file.write_text("episodes: many\n")
         refused = CliRunner().invoke(cli, words)
-    assert refused.exit_code == 1
+    assert refused.exit_code == 2
     assert "icy.yaml:1:1: episodes: found 'many'" in refused.stderr
 
 

@@ -1,0 +1,80 @@
+"""Errors begin with "Error:", have the documented exit code, and are JSON for programs that read JSON."""
+
+from __future__ import annotations
+
+import errno
+import json
+
+import pytest
+
+from runner.cli import exit_code_of
+from runner.errors import StorageError
+
+BAD = "episodes: -1\nfoo: 2\n"
+
+
+@pytest.fixture
+def bad(tmp_path):
+    """A configuration with two mistakes."""
+    path = tmp_path / "bad.yaml"
+    path.write_text(BAD)
+    return path
+
+
+def test_several_problems_follow_the_word_error(command, bad):
+    done = command("run", bad)
+    first, *problems = done.stderr.splitlines()
+    assert (done.exit_code, first) == (2, "Error: 2 problems")
+    assert [line.startswith(f"{bad}:") for line in problems] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["show", "nosuch"], "no run 'nosuch'"),
+        (["ls", "status:::"], "unexpected ':'"),
+        (["ls", "--nope"], "--nope"),
+        (["shwo"], "Did you mean 'show'?"),
+        (["view", "x", "--size", "foo"], "1600x900"),
+    ],
+    ids=lambda words: " ".join(words) if isinstance(words, list) else "",
+)
+def test_an_error_is_said_to_be_one_in_words_and_as_json(command, words, said):
+    plain = command(*words)
+    assert plain.exit_code == 2
+    assert "Error: " in plain.stderr
+    assert said in plain.stderr
+    if words[0] == "view":
+        return  # has nothing to print as JSON
+    error = json.loads(command(*words, "--json").stderr.splitlines()[-1])["error"]
+    assert said in error["message"]
+    assert (error["exit_code"], error["problems"]) == (2, [])
+
+
+def test_problems_of_a_configuration_are_listed_as_json(command, bad):
+    done = command("config", "check", bad, "--json")
+    (line,) = done.stderr.splitlines()
+    problems = json.loads(line)["error"]["problems"]
+    assert [(each["path"], each["line"]) for each in problems] == [("episodes", 1), ("foo", 2)]
+    assert done.stdout == ""
+
+
+def test_runs_that_cannot_be_pushed_are_errors_too(command):
+    words = ["push", "nosuch", "--server", "http://127.0.0.1:9"]
+    assert command(*words).exit_code == 2
+    assert json.loads(command(*words, "--json").stderr)["error"]["run"] == "nosuch"
+
+
+def test_a_place_that_cannot_be_written_is_wrong_input_and_a_full_disk_is_not():
+    for number, code in ((errno.ENOENT, 2), (errno.EACCES, 2), (errno.ENOSPC, 1), (errno.EIO, 1)):
+        error = StorageError("cannot be written")
+        error.__cause__ = OSError(number, "x")
+        assert exit_code_of(error) == code
+
+
+def test_the_folders_of_a_new_file_are_made(recorded, tmp_path):
+    path = tmp_path / "none" / "deep" / "plot.svg"
+    assert recorded("plot", "tiny", "-o", path).exit_code == 0
+    assert path.is_file()
+    (tmp_path / "file").touch()
+    assert recorded("plot", "tiny", "-o", tmp_path / "file" / "plot.svg").exit_code == 2
