@@ -48,7 +48,7 @@ def groups_of(series: Sequence[RunSeries]) -> list[Group]:
     flat = [dict(flat_config(runs[0].config)) for runs in found.values()]
     names = [runs[0].name for runs in found.values()]
     labels = [label_of(i, names, flat) for i in range(len(names))]
-    once = [each_once(runs, _sameness) for runs in found.values()]
+    once = [each_once(runs, sameness) for runs in found.values()]
     return [
         Group(label, tuple(kept), tuple(run.run_id for run in runs if run not in kept))
         for label, kept, runs in zip(labels, once, found.values(), strict=True)
@@ -71,7 +71,11 @@ def left_out(groups: Sequence[Group]) -> list[str]:
     return [f"left out, as the same run is there: {listed(twice)}"] if twice else []
 
 
-def _sameness(run: RunSeries) -> Hashable:
+def sameness(run: RunSeries) -> Hashable:
+    """Return what is equal for two runs of one configuration only if one repeats the other.
+
+    A job follows from its seed. Of loops only the content tells: workers of one training share a seed.
+    """
     return run.content_digest or run.run_id if is_loop(run) else run.seed
 
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final
+from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 
@@ -23,6 +23,8 @@ from runner.analysis.groups import Group
 from runner.analysis.series import is_loop, points_of, title_of
 
 THRESHOLDS: Final = 101
+Measured = dict[int, tuple[list[str], float]]
+"""Seed to the ids of its runs and their value."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,9 @@ class GroupResult:
     label: str
     seeds: list[int]
     run_ids: list[str]
+    """In the order of the seeds, which may have several runs each."""
     values: list[float]
-    """In the order of the seeds; infinite for a level never reached."""
+    """In the order of the seeds, the mean over the runs of each; infinite for a level never reached."""
     median: float
     iqm: Estimate
     profile: list[float]
@@ -43,7 +46,7 @@ class GroupResult:
 
     @property
     def n(self) -> int:
-        """How many runs."""
+        """How many seeds."""
         return len(self.values)
 
 
@@ -61,12 +64,19 @@ class PairResult:
     """Of the differences A - B, seed by seed; nan without a common seed."""
     iqm: Estimate
     """Of the same differences."""
+    simultaneous: Estimate
+    """The same IQM, with an interval that holds together with those of all pairs and metrics compared.
+
+    Without an interval where there is one pair of one metric only.
+    """
     improvement: Estimate
     """Probability that a run of A is better than one of B; higher, where nobody can say what is better."""
     wins: int
     ties: int
     losses: int
     """At how many seeds A is better than B, equal, worse."""
+    differences: list[float]
+    """A - B in the order of the seeds."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +126,39 @@ def compare(
         MissingExtra: SciPy is not installed.
     """
     statistics.require_scipy()
+    results = [_metric(groups, metric, line, moment) for metric, line in metrics]
     return Comparison(
         moment=moment.described,
         groups={group.label: [run.run_id for run in group.runs] for group in groups},
-        metrics=[_metric(groups, metric, line, moment) for metric, line in metrics],
-        notes=[*notes, *_worlds(groups), *_untested(metrics), *_few(groups)],
+        metrics=_with_simultaneous_intervals(results),
+        notes=[*notes, *_worlds(groups), *_untested(metrics), *_identical(groups), *_few(groups)],
     )
+
+
+def _with_simultaneous_intervals(metrics: list[MetricResult]) -> list[MetricResult]:
+    """Return the metrics with the intervals of all their pairs widened to hold together; one needs none."""
+    pairs = [pair for metric in metrics for pair in metric.pairs]
+    if len(pairs) < 2:
+        return metrics
+    widened = iter(statistics.simultaneous([pair.differences for pair in pairs]))
+    return [
+        replace(metric, pairs=[replace(pair, simultaneous=next(widened)) for pair in metric.pairs])
+        for metric in metrics
+    ]
+
+
+def _identical(groups: Sequence[Group]) -> list[str]:
+    """Return a note for each two groups whose runs have the same content."""
+    digests = {
+        group.label: sorted((run.seed, run.content_digest) for run in group.runs)
+        for group in groups
+        if all(run.content_digest for run in group.runs)
+    }
+    return [
+        f"{a} and {b} are identical: their runs have the same content, seed by seed"
+        for a, b in itertools.combinations(digests, 2)
+        if digests[a] == digests[b]
+    ]
 
 
 def _worlds(groups: Sequence[Group]) -> list[str]:
@@ -141,13 +178,17 @@ def _untested(metrics: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def _few(groups: Sequence[Group]) -> list[str]:
-    few = [group for group in groups if len(group.runs) < statistics.FEW_SEEDS]
+    seeds = {group.label: len({run.seed for run in group.runs}) for group in groups}
+    few = [group for group in groups if seeds[group.label] < statistics.FEW_SEEDS]
     if not few:
         return []
-    told = ", ".join(f"{group.label} ({len(group.runs)})" for group in few)
+    told = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
     loops = all(is_loop(run) for group in few for run in group.runs)
     more = "record more, each with a seed of its own" if loops else "`--set 'seeds={count: 10}'` runs ten"
-    return [f"fewer than {statistics.FEW_SEEDS} seeds in {told}: take the intervals as a hint; {more}"]
+    return [
+        f"fewer than {statistics.FEW_SEEDS} seeds in {told}: bootstrap intervals of so few are too narrow "
+        f"(at 4 seeds one of 95 % covers 86 % of the time), so take them as a hint; {more}"
+    ]
 
 
 def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> MetricResult:
@@ -175,18 +216,26 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
 
 def _values(
     group: Group, metric: str, line: str, moment: Moment, groups: Sequence[Group], notes: list[str]
-) -> dict[int, tuple[str, float]]:
-    """Return seed to run id and value of a group; says in `notes` which runs are left out."""
-    values: dict[int, tuple[str, float]] = {}
+) -> Measured:
+    """Return the values of a group; says in `notes` which runs are left out."""
+    found: dict[int, list[tuple[str, float]]] = {}
     without: dict[str, list[str]] = {}
     for run in group.runs:
         value, reason = value_of(run, metric, line, moment, groups)
         if value is None:
             without.setdefault(reason, []).append(run.run_id)
         else:
-            values[run.seed] = run.run_id, value
+            found.setdefault(run.seed, []).append((run.run_id, value))
     notes += [f"{group.label}, left out: {listed(runs)} ({reason})" for reason, runs in without.items()]
-    return dict(sorted(values.items()))
+    if any(len(runs) > 1 for runs in found.values()):
+        count = sum(map(len, found.values()))
+        notes.append(
+            f"{group.label}: {count} runs of {len(found)} seeds, each seed with the mean of its runs"
+        )
+    return {
+        seed: ([run_id for run_id, _ in runs], float(np.mean([value for _, value in runs])))
+        for seed, runs in sorted(found.items())
+    }
 
 
 def _ends(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> list[str]:
@@ -209,14 +258,14 @@ def _ends(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> li
     return [f"the last {last} is {ends}{again}"]
 
 
-def _reached(present: Sequence[tuple[str, dict[int, tuple[str, float]]]], moment: Moment) -> list[str]:
+def _reached(present: Sequence[tuple[str, Measured]], moment: Moment) -> list[str]:
     """Return how many runs of each group reach the level, if it is about one."""
     if moment.level is None:
         return []
     counts = {
         label: sum(value < statistics.NEVER for _, value in values.values()) for label, values in present
     }
-    return [f"{label}: {counts[label]} of {len(values)} runs reach it" for label, values in present]
+    return [f"{label}: {counts[label]} of {len(values)} seeds reach it" for label, values in present]
 
 
 def _thresholds(values: Sequence[float], sign: float) -> Values:
@@ -228,7 +277,7 @@ def _thresholds(values: Sequence[float], sign: float) -> Values:
     return levels[:: int(sign)]
 
 
-def _group(label: str, values: dict[int, tuple[str, float]], thresholds: Values, sign: float) -> GroupResult:
+def _group(label: str, values: Measured, thresholds: Values, sign: float) -> GroupResult:
     own = np.array([value for _, value in values.values()])
     share, low, high = (
         column.tolist() for column in statistics.share_at_least(sign * own, sign * thresholds)
@@ -236,7 +285,7 @@ def _group(label: str, values: dict[int, tuple[str, float]], thresholds: Values,
     return GroupResult(
         label,
         list(values),
-        [run_id for run_id, _ in values.values()],
+        [run_id for run_ids, _ in values.values() for run_id in run_ids],
         [statistics.bounded(value) for value in own.tolist()],
         statistics.median(own),
         statistics.interquartile_mean(own),
@@ -246,7 +295,7 @@ def _group(label: str, values: dict[int, tuple[str, float]], thresholds: Values,
     )
 
 
-def _pair(a: str, ours: dict[int, Any], b: str, theirs: dict[int, Any], sign: float) -> PairResult:
+def _pair(a: str, ours: Measured, b: str, theirs: Measured, sign: float) -> PairResult:
     seeds = sorted(ours.keys() & theirs.keys())
     left, right = (np.array([values[seed][1] for seed in seeds]) for values in (ours, theirs))
     difference = left - right
@@ -259,8 +308,10 @@ def _pair(a: str, ours: dict[int, Any], b: str, theirs: dict[int, Any], sign: fl
         sorted(theirs.keys() - ours.keys()),
         statistics.median(difference) if seeds else np.nan,
         statistics.interquartile_mean(difference),
+        none,
         statistics.improvement(sign * left, sign * right) if seeds else none,
         int((sign * difference > 0).sum()),
         int((difference == 0).sum()),
         int((sign * difference < 0).sum()),
+        difference.tolist(),
     )

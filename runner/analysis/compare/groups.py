@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from runner.analysis.groups import Group, each_once, flat_config, label_of
+from runner.analysis.groups import Group, each_once, flat_config, label_of, sameness
 from runner.analysis.series import SHARES, RunSeries
 from runner.errors import RunnerError, nearest
 
@@ -20,8 +20,9 @@ def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Gr
     """Return runs in groups, and what is to be said of them, a sentence each.
 
     Runs belong together whose configurations differ in nothing but the seed, whatever they are called and
-    however they are recorded; or, with `by`, those that have the same value there. Of two runs of a seed
-    in a group of one configuration, which are the same run twice, the finished and then the newer one counts.
+    however they are recorded; or, with `by`, those that have the same value there. Of a job that was run
+    twice the finished and then the newer run counts. Several loops of one configuration and seed, such as the
+    workers of one training, all count: the value of their seed is the mean over them.
 
     Args:
         series: the runs.
@@ -34,13 +35,9 @@ def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Gr
     key = _content if by is None else _value_at(by, series)
     for run in series:
         found.setdefault(key(run), []).append(run)
-    once = {name: each_once(runs, lambda run: (_content(run), run.seed)) for name, runs in found.items()}
+    once = {name: each_once(runs, lambda run: (_content(run), sameness(run))) for name, runs in found.items()}
     twice = [run.run_id for name, runs in found.items() for run in runs if run not in once[name]]
-    notes = (
-        [f"left out, as another run of the same configuration and seed is there: {', '.join(twice)}"]
-        if twice
-        else []
-    )
+    notes = [f"left out, as the same run is there once more: {', '.join(twice)}"] if twice else []
     if by is not None:
         groups = [Group(f"{by} = {name}", tuple(runs)) for name, runs in once.items()]
         notes += [note for group in groups for note in _mixed(group)]
@@ -137,8 +134,8 @@ def _only_one(groups: Sequence[Group], by: str | None) -> str:
     (group,) = groups
     if len(group.runs) == 1:
         return (
-            f"found one run, {group.runs[0].run_id}, expected at least two to compare; of runs of the same "
-            "configuration and seed one counts, and runner.record's `config` tells loops apart."
+            f"found one run, {group.runs[0].run_id}, expected at least two to compare; a job that "
+            "was run twice counts once, and runner.record's `config` tells loops apart."
         )
     if by is not None:
         return f"found {len(group.runs)} runs, all with {group.label}, expected two values at least."

@@ -1,8 +1,9 @@
 """Statistics over few seeds, as Agarwal et al. (2021) advise: never a bare mean, always an interval.
 
 R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville and M. G. Bellemare, "Deep reinforcement learning at
-the edge of the statistical precipice", NeurIPS 2021. Intervals are percentile bootstrap intervals, as
-there; the resampling is seeded, so the same values give the same interval.
+the edge of the statistical precipice", NeurIPS 2021. Intervals of the IQM and of profiles are percentile
+bootstrap intervals, as there; the resampling is seeded, so the same values give the same interval. That of
+the probability of improvement is a score interval, which is right for few seeds too, and never without width.
 
 `NEVER` stands for a level that is not reached: larger than anything, yet finite, so that quantiles
 between it and another value are what they should be, beyond all bounds.
@@ -10,7 +11,7 @@ between it and another value are what they should be, beyond all bounds.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -23,8 +24,8 @@ Values = NDArray[np.float64]
 
 CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 10_000
-FEW_SEEDS: Final = 5
-"""With fewer than this, an interval says little."""
+FEW_SEEDS: Final = 10
+"""With fewer than this, bootstrap intervals are too narrow: at 4 seeds one of 95 % covers 86 %."""
 FEWEST_FOR_IQM: Final = 4
 """With fewer, a quarter of the values is less than one of them."""
 NEVER: Final = 1e100
@@ -65,11 +66,67 @@ def interquartile_mean(values: Values) -> Estimate:
 def improvement(a: Values, b: Values) -> Estimate:
     """Return the probability that a run of A has a higher value than one of B; equal ones count half.
 
+    The interval is the score interval of R. G. Newcombe, "Confidence intervals for an effect size measure
+    based on the Mann-Whitney statistic, part 2", Statistics in Medicine 25 (2006), method 5. It takes the
+    runs of A and B as independent; where runs of one seed are alike it is wider than it need be.
+
     Args:
         a: values of one configuration, one a seed.
-        b: of another, at the same seeds: they are resampled together.
+        b: of another.
     """
-    return _estimate((a, b), _probability, len(a))
+    value = 0.5 + 0.5 * float(np.sign(a[:, np.newaxis] - b).mean())
+    if min(len(a), len(b)) < 2:
+        return Estimate(value, np.nan, np.nan)
+    low = 1.0 - _highest_probability(1.0 - value, len(a), len(b))
+    return Estimate(value, low, _highest_probability(value, len(a), len(b)))
+
+
+def simultaneous(samples: Sequence[Sequence[float]]) -> list[Estimate]:
+    """Return the IQM of each sample with intervals that hold all together with 95 % confidence.
+
+    Each interval is the IQM plus and minus its standard error times one factor, which is the 95 % quantile of
+    the largest studentized deviation of all samples in a resample ("max-T"; P. H. Westfall and S. S. Young,
+    Resampling-based Multiple Testing, 1993). Standard errors are those of a trimmed mean (K. K. Yuen,
+    Biometrika 61, 1974). Samples of the same length are resampled together, so that what they have in common
+    does not widen the intervals. A sample of equal values has an interval without width; one with a level
+    that is never reached, or of fewer than four values, has none.
+
+    Args:
+        samples: of differences, one a seed.
+    """
+    values = [np.array(sample, np.float64) for sample in samples]
+    usable = [len(sample) >= FEWEST_FOR_IQM and bool((abs(sample) < NEVER).all()) for sample in values]
+    deviations = [_studentized(sample) for sample, fit in zip(values, usable, strict=True) if fit]
+    factor = float(np.quantile(np.max(deviations, axis=0), CONFIDENCE)) if deviations else np.nan
+    estimates = []
+    for sample, fit in zip(values, usable, strict=True):
+        value = interquartile_mean(sample).value
+        error = float(_standard_error(sample)) if fit else np.nan
+        estimates.append(Estimate(value, value - factor * error, value + factor * error))
+    return estimates
+
+
+def _studentized(sample: Values) -> Values:
+    """Return how many standard errors the IQM of each resample is away from that of the sample."""
+    rng, iqm, n = np.random.default_rng(_SEED), _iqm(sample, -1), len(sample)
+    deviations = []
+    for start in range(0, RESAMPLES, batch := max(1, _BATCH // n)):
+        resampled = sample[rng.integers(0, n, (min(batch, RESAMPLES - start), n))]
+        error = _standard_error(resampled)
+        away = abs(_iqm(resampled, -1) - iqm)
+        deviations.append(np.divide(away, error, out=np.zeros_like(away), where=error > 0))
+    return np.concatenate(deviations)
+
+
+def _standard_error(values: Values) -> Values:
+    """Return the standard error of the IQM over the last axis, from the winsorized variance."""
+    n = values.shape[-1]
+    cut = n // 4
+    winsorized = np.sort(values, axis=-1)
+    winsorized[..., :cut] = winsorized[..., cut : cut + 1]
+    winsorized[..., n - cut :] = winsorized[..., n - cut - 1 : n - cut]
+    left = n - 2 * cut
+    return np.asarray(winsorized.std(axis=-1, ddof=1) * np.sqrt((n - 1) / (left * (left - 1))))
 
 
 def share_at_least(values: Values, thresholds: Values) -> tuple[Values, Values, Values]:
@@ -92,11 +149,23 @@ def _iqm(values: Values, axis: int) -> Values:
     return trimmed
 
 
-def _probability(a: Values, b: Values, axis: int) -> Values:
-    """Return the share of all pairs in which a is higher, along an axis; equal ones count half."""
-    left, right = np.moveaxis(a, axis, -1), np.moveaxis(b, axis, -1)
-    higher = np.sign(left[..., :, np.newaxis] - right[..., np.newaxis, :])
-    return np.asarray(0.5 + 0.5 * higher.mean(axis=(-2, -1)))
+def _highest_probability(value: float, m: int, n: int) -> float:
+    """Return the highest true probability that an observed one does not contradict, of m and n values."""
+    from scipy.optimize import brentq
+    from scipy.special import ndtri
+
+    quantile = float(ndtri(0.5 + CONFIDENCE / 2))
+    pairs = (m + n) / 2 - 1
+
+    def contradiction(true: float) -> float:
+        share = (1 - true) / (2 - true) + true / (1 + true)
+        variance = true * (1 - true) * (1 + pairs * share) / (m * n)
+        return (true - value) ** 2 - quantile**2 * variance
+
+    if value >= 1.0:
+        return 1.0
+    start = value if value > 0 else 1e-12  # at 0 and 1 themselves the variance is 0
+    return float(brentq(contradiction, start, 1.0)) if contradiction(start) < 0 else 1.0
 
 
 def _estimate(data: tuple[Values, ...], statistic: Callable[..., Values], times: int) -> Estimate:

@@ -83,6 +83,80 @@ def test_the_interval_of_the_iqm_covers_as_often_as_it_says():
     assert sum(inside) >= 33  # 95 % of 40 is 38; a percentile interval of 20 values is a little short
 
 
+@pytest.mark.parametrize(("seeds", "shift"), [(5, 0.0), (5, 1.5), (10, 0.8)])
+def test_the_interval_of_the_probability_of_improvement_covers_as_often_as_it_says(seeds, shift):
+    rng = np.random.default_rng(2)
+    true = 0.5 * (1 + math.erf(shift / 2))  # of normal values, P(X + shift > Y)
+    estimates = [
+        statistics.improvement(rng.normal(shift, 1, seeds), rng.normal(0, 1, seeds)) for _ in range(400)
+    ]
+    covered = np.mean([estimate.low <= true <= estimate.high for estimate in estimates])
+    assert 0.91 <= covered <= 0.99
+
+
+def test_a_probability_of_improvement_of_one_is_not_certain():
+    always = statistics.improvement(np.ones(20), np.zeros(20))
+    assert (always.value, always.high) == (1.0, 1.0)
+    # Newcombe's equation, (1 - p)^2 = z^2 p (1 - p) (1 + 19 ((1 - p) / (2 - p) + p / (1 + p))) / 400
+    assert always.low == pytest.approx(0.898669, abs=1e-6)
+    never = statistics.improvement(np.zeros(20), np.ones(20))
+    assert (never.value, never.low, never.high) == (0.0, 0.0, pytest.approx(1 - always.low))
+    few = statistics.improvement(np.ones(5), np.zeros(5))
+    assert few.low < always.low
+
+
+def test_simultaneous_intervals_hold_all_at_once_as_often_as_they_say():
+    rng = np.random.default_rng(3)
+    together, one_by_one = [], []
+    for _ in range(40):
+        shared = rng.normal(0, 0.5, 20)
+        samples = [shared + rng.normal(0, 1, 20) for _ in range(6)]  # six differences, none of them true
+        together.append(all(e.low <= 0 <= e.high for e in statistics.simultaneous(samples)))
+        one_by_one.append(all(e.low <= 0 <= e.high for e in map(statistics.interquartile_mean, samples)))
+    assert sum(together) >= 35  # 95 % of 40 is 38
+    assert sum(one_by_one) < sum(together)
+
+
+def test_intervals_that_hold_together_are_shown_where_there_are_several():
+    alone = result(two_groups(range(10), range(5, 15)))
+    assert math.isnan(alone.metrics[0].pairs[0].simultaneous.low)
+    assert "together" not in text_of(alone).split("How to read")[0]
+    rng = np.random.default_rng(5)
+    series = [
+        run(seed, [0, value], name=name, discount=discount)
+        for name, discount in (("a", 0.8), ("b", 0.9), ("c", 0.7))
+        for seed, value in enumerate(rng.normal(0, 1, 10))
+    ]
+    several = result(series)
+    for pair in several.metrics[0].pairs:
+        assert pair.simultaneous.value == pair.iqm.value
+        width = pair.simultaneous.high - pair.simultaneous.low
+        assert width > pair.iqm.high - pair.iqm.low
+    assert "together" in text_of(several).split("How to read")[0]
+
+
+def test_workers_of_one_training_are_one_value_of_their_seed():
+    def workers(values, **config):
+        made = [loop(0, [value], **config) for value in values]
+        return [replace(one, run_id=f"w{i}{config}", content_digest=f"d{i}") for i, one in enumerate(made)]
+
+    compared = result([*workers([1, 5], lr=1), *workers([2, 3, 4], lr=2)], metrics=[("mean_return", "")])
+    (metric,) = compared.metrics
+    assert [group.values for group in metric.groups] == [[3.0], [3.0]]
+    assert [len(group.run_ids) for group in metric.groups] == [2, 3]
+    assert "2 runs of 1 seeds, each seed with the mean of its runs" in metric.notes[0]
+    assert "are equal at all 1 seeds" in in_short(compared)[0]
+
+
+def test_identical_groups_are_said_to_be_identical():
+    def digested(runs):
+        return [replace(one, content_digest=f"content{one.seed}") for one in runs]
+
+    same = result(digested(two_groups([10, 20, 30], [10, 20, 30])))
+    assert "are identical: their runs have the same content, seed by seed" in same.notes[0]
+    assert "a and b are equal at all 3 seeds" in in_short(same)[0]
+
+
 def test_equal_values_have_an_interval_of_no_width():
     (metric,) = result(two_groups([100] * 6, [100] * 6)).metrics
     assert (metric.groups[0].iqm.low, metric.groups[0].iqm.high) == (100, 100)
@@ -106,10 +180,10 @@ def test_without_a_common_seed_there_is_no_difference():
 
 def test_few_seeds_are_warned_of_and_have_no_iqm_below_four():
     comparison = result(two_groups([10, 20, 30], [10, 20, 30]))
-    assert "fewer than 5 seeds" in comparison.notes[0]
+    assert "fewer than 10 seeds" in comparison.notes[0]
     assert math.isnan(comparison.metrics[0].groups[0].iqm.value)
     assert "`--set 'seeds={count: 10}'` runs ten" in comparison.notes[0]
-    assert result(two_groups([1] * 5, [2] * 5)).notes == []
+    assert result(two_groups([1] * 10, [2] * 10)).notes == []
     of_loops = result(two_groups([10, 20], [10, 20], made_by="runner.record"))
     assert of_loops.notes[0].endswith("as a hint; record more, each with a seed of its own")
 
@@ -118,12 +192,12 @@ def test_other_environments_are_warned_of():
     lake, cliff = {"id": "FrozenLake-v1", "kwargs": {}}, {"id": "CliffWalking-v1", "kwargs": {}}
     others = [
         run(seed, [0, 1], name=name, env=env)
-        for seed in range(5)
+        for seed in range(10)
         for name, env in zip("ab", (lake, cliff), strict=True)
     ]
     (note,) = result(others).notes
     assert "FrozenLake-v1 in a, CliffWalking-v1 in b" in note
-    assert result(two_groups([1] * 5, [2] * 5, env=lake)).notes == []
+    assert result(two_groups([1] * 10, [2] * 10, env=lake)).notes == []
 
 
 def test_runs_of_one_configuration_are_one_group_whatever_they_are_called():
@@ -235,7 +309,7 @@ def test_the_command_prints_text_json_and_markdown(command):
     told = command("near", "far")
     assert told.exit_code == 0, told.output
     assert "near - far" in told.stdout
-    assert "fewer than 5 seeds" in told.stdout
+    assert "fewer than 10 seeds" in told.stdout
     as_json = json.loads(command("near", "far", "--json", "--metric", "mean_return").stdout)
     assert [metric["line"] for metric in as_json["metrics"]] == ["taxi_1", "taxi_2"]
     assert as_json["metrics"][0]["groups"][0]["seeds"] == [0, 1, 2]
