@@ -119,6 +119,32 @@ class Mdp:
         return {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
 
 
+def step_counts(
+    mdp: Mdp,
+    rewards: NDArray[np.float64],
+    state: NDArray[Any],
+    action: NDArray[Any],
+    next_state: NDArray[Any],
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return events and penalties of steps, [N, events + 1], and which rewards the table excludes, [N].
+
+    A step has the events of the outcome that leads to its next state, of several that with its reward. Its
+    reward is excluded if outcomes lead there and none of them pays it.
+    """
+    likely = mdp.outcomes_to(state, action, next_state)
+    found = likely.any(axis=1)
+    at = np.where(found, state, 0), np.where(found, action, 0)
+    paid = likely & (mdp.rewards[at].sum(axis=-1) == rewards[:, np.newaxis])
+    counts = np.zeros((len(rewards), len(mdp.event_names) + 1), np.int64)
+    counts[:, -1] = rewards < mdp.penalty_below
+    if mdp.event_names:
+        outcome = np.argmax(likely * 2 + paid, axis=1)
+        events = np.where(found, mdp.events[*at, outcome], np.uint32(0))
+        names = np.arange(len(mdp.event_names), dtype=np.uint32)
+        counts[:, :-1] = (events[:, np.newaxis] >> names) & 1
+    return counts, found & ~paid.any(axis=1)
+
+
 def from_parts(description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Mdp:
     """Return the Mdp that `description()` and `arrays()` came from, checked like a new one.
 

@@ -75,6 +75,8 @@ class Summary(Mapping[str, Any]):
     recent_training: RecentTraining | None = None
     logged: Mapping[str, float | None] = field(default_factory=dict)
     """Name to the value that a loop logged last under it."""
+    rewards_off_table: int | None = None
+    """Steps of a loop whose reward its environment's table excludes."""
     seconds: float | None = None
     bytes: int | None = None
     """Size of the recording."""
@@ -308,6 +310,7 @@ _SUMMARY: Final = {
     "logged": Check(
         _maps_to(lambda value: value is None or _is_number(value)), "an object of finite numbers or nulls"
     ),
+    "rewards_off_table": _COUNT,
     "seconds": _optional(_LENGTH),
     "bytes": _COUNT,
     "error": _optional(_TEXT),

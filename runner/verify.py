@@ -9,7 +9,7 @@ steps make them); by the installed environment, whether the run can be reproduce
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -30,6 +30,7 @@ from runner.mdp import Mdp
 from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.blocks import message_record
+from runner.recording.consistency import Findings, Inconsistent, check_phase
 from runner.recording.digest import ContentHash
 from runner.recording.integrity import check_integrity
 from runner.recording.past import Past
@@ -197,39 +198,88 @@ def _compare_loop(recording: Recording) -> Verification:
         eval_steps=recording.count(schema.EVAL_STEP),
         notes=tuple(notes),
     )
-    digest, odd = ContentHash(), 0
+    digest, odd, counts = ContentHash(), 0, {}
     for topic in recording.topics:
-        wrong, others = _check_topic(recording, topic, digest)
+        wrong, others, counts[topic.name] = _check_topic(recording, topic, digest)
         odd += others
         if wrong:
             return replace(found, finding=f"{recording.path}: {wrong}")
     if odd:
         odd_note = f"{odd:,} steps are no outcome of the environment's table: it has rules beside it"
         found = replace(found, notes=(*found.notes, odd_note))
+    try:
+        phases = {phase: check_phase(recording, phase, finished) for phase in ("train", "eval")}
+        notes = [note for phase, findings in phases.items() for note in _unusual(recording, phase, findings)]
+    except Inconsistent as error:
+        return replace(found, finding=f"{recording.path}: {error}")
+    found = replace(found, notes=(*found.notes, *notes))
     if not finished:
         return found
-    return _compare_result(found, recording, {"content_digest": digest.content()})
+    steps, last = found.train_steps + found.eval_steps, max(each.last_time for each in phases.values())
+    if last != steps * schema.STEP_NANOSECONDS:
+        taken = last // schema.STEP_NANOSECONDS
+        return replace(
+            found,
+            finding=f"{recording.path}: found {steps:,} steps, expected {taken:,} by the time of the last",
+        )
+    expected = _loop_result(digest, counts)
+    if recording.result.rewards_off_table is not None:
+        expected["rewards_off_table"] = sum(findings.unpaid for findings in phases.values())
+    return _compare_result(found, recording, expected)
 
 
-def _check_topic(recording: Recording, topic: schema.Topic, digest: ContentHash) -> tuple[str, int]:
-    """Return what is wrong with a topic's messages, and how many steps the environment's table has not.
+def _unusual(recording: Recording, phase: str, findings: Findings) -> Iterator[str]:
+    """Yield what is unusual in a phase of a loop, though its environment may have done it.
+
+    Raises:
+        Inconsistent: its environment cannot have done it.
+    """
+    if findings.unpaid:
+        where = f"/{phase}/step, step {findings.first_unpaid}: rewards"
+        if recording.result.rewards_off_table == 0:
+            raise Inconsistent(f"{where}: found one that the environment's table excludes for this step")
+        yield f"{where}: {findings.unpaid:,} steps have rewards that are not in the environment's table"
+    if findings.begun_without:
+        where = f"/{phase}/step, step {findings.first_without}"
+        if findings.begun_by_reset >= findings.begun_without:
+            raise Inconsistent(f"{where}: found an episode without a reset before it, as others have")
+        yield f"{where}: {findings.begun_without:,} episodes began without a reset"
+
+
+def _loop_result(digest: ContentHash, counts: dict[str, int]) -> dict[str, Any]:
+    """Return what the result of a loop says, by its messages."""
+    return {
+        "topic_digests": digest.topics(),
+        "messages": {name: count for name, count in counts.items() if count},
+        "train_steps": counts["/train/step"],
+        "eval_steps": counts["/eval/step"],
+        "episodes": counts["/train/episode"],
+        "content_digest": digest.content(),
+    }
+
+
+def _check_topic(recording: Recording, topic: schema.Topic, digest: ContentHash) -> tuple[str, int, int]:
+    """Return what is wrong with a topic, its steps that the table lacks, and the number of its messages.
 
     The messages are taken into the digest.
     """
     if topic not in recording.dtypes:
+        count = 0
         for time, payload in recording.messages(topic):
-            digest.update(topic, message_record(topic, time, payload))
-        return "", 0
+            if topic.digested:
+                digest.update(topic, message_record(topic, time, payload))
+            count += 1
+        return "", 0, count
     number, expected, odd = schema.NUMBERED_BY[topic.message], 0, 0
     for block in recording.blocks(topic):
         digest.update(topic, np.ascontiguousarray(block).view(np.uint8).data)
         if (wrong := np.flatnonzero(block[number] != expected + np.arange(len(block)))).size:
             found = block[number][wrong[0]]
-            return f"{topic.name}: found {number} {found}, expected {expected + wrong[0]}", odd
+            return f"{topic.name}: found {number} {found}, expected {expected + wrong[0]}", odd, expected
         if topic.message is schema.STEP:
             odd += _impossible(recording, block)
         expected += len(block)
-    return "", odd
+    return "", odd, expected
 
 
 def _impossible(recording: Recording, steps: NDArray[np.void]) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.mdp import Mdp
+from runner.mdp import Mdp, step_counts
 
 
 class Judge:
@@ -15,6 +15,8 @@ class Judge:
 
     def __init__(self, mdp: Mdp | None) -> None:
         self._mdp = mdp
+        self.off_table = 0
+        """Steps whose reward the environment's table excludes: a wrapper changed it, or a rule of its own."""
         self._counts = np.zeros((1, 1), np.int64)
         """[rows + 1, events + 1]: events and penalties before each row, counted from the first."""
         self._carried = np.zeros(1 + (len(mdp.event_names) if mdp else 0), np.int64)
@@ -32,10 +34,8 @@ class Judge:
         if mdp is None:
             return
         bits = np.zeros((len(rewards) + 1, len(self._carried)), np.int64)
-        bits[1:, -1] = rewards < mdp.penalty_below
-        if mdp.event_names:
-            names = np.arange(len(mdp.event_names), dtype=np.uint32)
-            bits[1:, :-1] = (_events(mdp, rewards, state, action, next_state)[:, np.newaxis] >> names) & 1
+        bits[1:], excluded = step_counts(mdp, rewards, state, action, next_state)
+        self.off_table += int(np.count_nonzero(excluded))
         self._counts = bits.cumsum(axis=0)
 
     def fill(self, episodes: NDArray[np.void], first: NDArray[Any], last: NDArray[Any]) -> None:
@@ -55,19 +55,3 @@ class Judge:
         if self._mdp is not None:
             kept = self._carried if start < 0 else 0
             self._carried = self._counts[-1] - self._counts[max(start, 0)] + kept
-
-
-def _events(
-    mdp: Mdp,
-    rewards: NDArray[np.float64],
-    state: NDArray[Any],
-    action: NDArray[Any],
-    next_state: NDArray[Any],
-) -> NDArray[np.uint32]:
-    """Return the events of steps: those of the outcome that has their next state, and their reward if any."""
-    likely = mdp.outcomes_to(state, action, next_state)
-    found = likely.any(axis=1)
-    at = np.where(found, state, 0), np.where(found, action, 0)
-    paid = mdp.rewards[at].sum(axis=-1) == rewards[:, np.newaxis]
-    outcome = np.argmax(likely * 2 + (likely & paid), axis=1)
-    return np.where(found, mdp.events[*at, outcome], np.uint32(0))

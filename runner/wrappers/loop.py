@@ -51,6 +51,10 @@ class Putting(Protocol):
     def place(self) -> tuple[int, int]:
         """The steps of the phase so far, and the number of the episode that began last."""
 
+    @property
+    def off_table(self) -> int:
+        """Steps so far whose reward the environment's table excludes; 0 without a table."""
+
     def open(self) -> None:
         """Take blocks from the recorder."""
 
@@ -315,6 +319,12 @@ class Loop(Generic[R]):
         with contextlib.suppress(StorageError):
             self.run = self.run.update(status="failed", summary={"error": kept_message(error)})
 
+    def _off_table(self) -> dict[str, int]:
+        """Return how many rewards the environment's table excludes, if it has a table."""
+        if self.described.mdp is None:
+            return {}
+        return {"rewards_off_table": sum(rows.off_table for rows in self._rows.values())}
+
     def _finish(self, status: str, error: str) -> dict[str, Any]:
         for rows in self._rows.values():
             rows.commit()
@@ -326,6 +336,7 @@ class Loop(Generic[R]):
                 "steps_recorded": True,
             }
             | self._outcomes.summary()
+            | self._off_table()
             | ({"error": kept_message(error)} if error else {})
         )
         write_result(self._file, status, result)

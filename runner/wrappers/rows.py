@@ -72,6 +72,11 @@ class Rows:
         self.open()
 
     @property
+    def off_table(self) -> int:
+        """Steps so far whose reward the environment's table excludes; 0 without a table."""
+        return self._judge.off_table
+
+    @property
     def place(self) -> tuple[int, int]:
         """The steps of the phase so far, and the number of the episode that began last; 0 before any."""
         began = self._episode + len(self._begins)

@@ -30,6 +30,7 @@ class StagedRows:
     """
 
     filled = 0
+    off_table = 0
 
     def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
         topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
