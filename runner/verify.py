@@ -32,7 +32,7 @@ from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.consistency import Findings, Inconsistent, check_phase
 from runner.recording.digest import ContentHash
-from runner.recording.integrity import check_integrity
+from runner.recording.integrity import check_integrity, checked_survey, may_be_cut
 from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
 from runner.replay.tables import initially_held
@@ -60,6 +60,9 @@ class Verification:
     """What a reader should know though it is not wrong."""
     provenance: dict[str, tuple[str, str]] = field(default_factory=dict)
     """Where this process and the recording's differ: key to (recording, here)."""
+
+    nothing_yet: bool = False
+    """Whether the run was interrupted before it recorded anything."""
 
     @property
     def sound(self) -> bool:
@@ -90,12 +93,22 @@ def verify(path: Path, rerun: bool = False, report: Report = lambda _: None) -> 
             found = _lost(recording) or _compare(recording, rerun, report)
             damage = damage and damage + _first_unreadable(recording)
     except (RecordingError, ConfigError) as error:
+        if damage and _holds_nothing_yet(path):
+            return Verification(path, nothing_yet=True)
         return Verification(path, finding=_with_place(path, damage or str(error)))
     if not damage:
         return found
+    if _holds_nothing_yet(path):
+        return Verification(path, nothing_yet=True)
     if found.sound:
         return replace(found, finding=damage, content_digest="")
     return replace(found, notes=(*found.notes, damage))
+
+
+def _holds_nothing_yet(path: Path) -> bool:
+    """Return whether a recording is cut off before its first messages, and good as far as it goes."""
+    contents = checked_survey(path)
+    return not contents.chunks and may_be_cut(path, contents)
 
 
 def refuse_foreign(path: Path) -> None:

@@ -197,6 +197,15 @@ def test_cut_off(run, tmp_path):
     assert found.notes == ("the run did not end; verified as far as it got",)
 
 
+def test_a_recording_that_was_cut_off_before_its_first_messages_is_not_wrong(run, tmp_path):
+    data = run.recording.read_bytes()
+    first = survey(run.recording).chunks[0].index.chunk_start_offset
+    for end in (first, first - 1, first + 1, first + 100):
+        (tmp_path / "cut.mcap").write_bytes(data[:end])
+        found = verify(tmp_path / "cut.mcap")
+        assert (found.nothing_yet, found.finding) == (True, ""), end
+
+
 def test_an_interrupted_recording_is_compared_to_its_end(run, tmp_path):
     path, cut = tmp_path / "x.mcap", tmp_path / "cut.mcap"
     cut.write_bytes(run.recording.read_bytes())

@@ -31,6 +31,9 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
     reproduced here, and if not, at which step it diverges and what differs from then: packages,
     processor, code.
 
+    A run that was interrupted before it recorded anything is neither sound nor wrong: there is nothing to
+    verify yet.
+
     Exit code 1 if anything is wrong.
 
     \b
@@ -55,6 +58,8 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
 
 
 def _verdict(found: Verification, rerun: bool) -> str:
+    if found.nothing_yet:
+        return "interrupted, nothing to verify yet"
     if found.sound:
         return "identical" if rerun else "sound"
     return "diverged" if rerun and found.difference is not None else "wrong"
@@ -67,6 +72,8 @@ def _in_words(found: Verification, rerun: bool) -> dict[str, str]:
         "recording": str(found.path),
         "verdict": f"diverged at step {step:,}" if verdict == "diverged" and step is not None else verdict,
     }
+    if found.nothing_yet:
+        return told | {"next": "`dualtaxi resume` does the run from its beginning"}
     if found.sound:
         told["compared"] = f"{found.train_steps:,} steps of training, {found.eval_steps:,} of evaluation"
         told["digest"] = found.content_digest or f"{UNKNOWN} (told when a run ends properly)"
