@@ -11,9 +11,12 @@ from typing import Final, Protocol, TypeVar
 from runner.errors import RunNotFound, nearest
 from runner.runs import Run, list_runs, run_at, run_of_id
 
-_LATEST: Final = "@latest"
+LATEST: Final = "@latest"
+"""What stands for the newest run, after a name for the newest of that name."""
 _TOLD: Final = 20
 """Runs that an error names."""
+_MAX_NEAR: Final = 1000
+"""Runs, the newest, whose names are compared with one that was not found."""
 
 
 class Named(Protocol):
@@ -81,8 +84,8 @@ def the_one(name: str, runs: Sequence[AnyNamed], recordings: Path) -> AnyNamed:
         )
     if not name:
         raise RunNotFound("found an empty name, expected an id, the beginning of one, a name or @latest.")
-    if name.endswith(_LATEST):
-        stem = name.removesuffix(_LATEST)
+    if name.endswith(LATEST):
+        stem = name.removesuffix(LATEST)
         newest = next((run for run in runs if stem in ("", run.name)), None)
         if newest is not None:
             return newest
@@ -102,7 +105,8 @@ def the_one(name: str, runs: Sequence[AnyNamed], recordings: Path) -> AnyNamed:
         raise RunNotFound(
             f"{name!r} answers to {len(found)} runs; name one by its id{or_newest}:\n{several}{more}"
         )
-    hint = nearest(name, {run.name for run in runs} | {run.run_id for run in runs})
+    newest_runs = runs[:_MAX_NEAR]
+    hint = nearest(name, {run.name for run in newest_runs} | {run.run_id for run in newest_runs})
     raise RunNotFound(
         f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {len(runs):,} there are."
     )

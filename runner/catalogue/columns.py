@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -50,14 +50,37 @@ def columns_of(text: str) -> list[str]:
     return [name if name in MADE or name.startswith(SETTING) else field_of(name).name for name in names]
 
 
+def needed_for(columns: Iterable[str]) -> list[str]:
+    """Return the columns of the index that `value` and `with_originals` need for these columns."""
+    needed = ["root", "entry", "id", "problem"]
+    for column in columns:
+        name = _FIELD_OF.get(column, column)
+        if name.startswith(SETTING):
+            needed.append("settings")
+        elif name == "same_as":
+            needed.append("digest")
+        elif name != "path":
+            needed.append(FIELDS[name].column or name)
+    if "episodes" in needed:
+        needed.append("episodes_to_do")  # shown with it where some are missing
+    return list(dict.fromkeys(needed))
+
+
 def with_originals(rows: list[dict[str, Any]], index: Index) -> list[dict[str, Any]]:
     """Return rows with `same_as`: the id of another run that recorded the same content first, or None."""
     originals = index.originals([row["digest"] for row in rows if row["digest"]])
+    return list(with_same_as(rows, originals))
+
+
+def with_same_as(
+    rows: Iterable[dict[str, Any]], originals: Mapping[str, tuple[str, str, str]]
+) -> Iterator[dict[str, Any]]:
+    """Yield rows with `same_as`, by what `Index.originals` returns."""
     for row in rows:
         first = originals.get(row["digest"])
         elsewhere = first is not None and first[:2] != (row["root"], row["entry"])
         row["same_as"] = first[2] if first and elsewhere else None
-    return rows
+        yield row
 
 
 def value(row: dict[str, Any], column: str) -> Any:

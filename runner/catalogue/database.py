@@ -10,7 +10,7 @@ import contextlib
 import os
 import secrets
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -23,7 +23,7 @@ Tell = Callable[[str], None]
 
 INDEX_FILE: Final = "catalogue.sqlite"
 _APPLICATION: Final = 0x44546178  # "DTax"
-_VERSION: Final = zlib.crc32(",".join(["5", *Row._meta.sorted_field_names]).encode()) >> 1
+_VERSION: Final = zlib.crc32(",".join(["6", *Row._meta.sorted_field_names]).encode()) >> 1
 """Of the columns, and of what is put in them (the number before them); another one is thrown away."""
 _HEAD_BYTES: Final = 100
 """Of an SQLite file; at 24 stands how often it was changed."""
@@ -110,3 +110,13 @@ def tuples_of(database: SqliteDatabase, query: Any) -> Iterator[tuple[Any, ...]]
     """Return what a query finds as SQLite has it: many rows, quickly."""
     found: Iterator[tuple[Any, ...]] = database.execute(query)  # type: ignore[no-untyped-call]
     return found
+
+
+def write_rows(database: SqliteDatabase, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Put whole rows in the index, in place of those of the same folders; within a transaction."""
+    fields = Row._meta.sorted_fields
+    columns = ", ".join(f'"{field.column_name}"' for field in fields)
+    places = ", ".join("?" * len(fields))
+    values = [[field.db_value(row[field.name]) for field in fields] for row in rows]
+    statement = f"INSERT OR REPLACE INTO {Row._meta.table_name} ({columns}) VALUES ({places})"
+    database.connection().executemany(statement, values)  # type: ignore[no-untyped-call]

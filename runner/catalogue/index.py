@@ -17,8 +17,8 @@ from peewee import DatabaseError, OperationalError, SqliteDatabase, chunked, fn
 from runner.catalogue.database import Tell, index_path, made, opened, renew, tuples_of, version
 from runner.catalogue.fields import SETTING, Kind, field_of
 from runner.catalogue.filters import Filter, matches, setting_path
-from runner.catalogue.folders import Folders
-from runner.catalogue.rows import Row
+from runner.catalogue.folders import Depth, Folders
+from runner.catalogue.rows import Row, text
 from runner.errors import RunnerError, nearest
 
 Found = TypeVar("Found")
@@ -40,11 +40,27 @@ class Index:
         wrong = Row.select(Row.problem).where(Row.root.in_(self._roots) & Row.problem.is_null(False))
         return [problem for (problem,) in self._tuples(wrong.order_by(Row.root, Row.entry))]
 
-    def select(self, chosen: Filter, *order: Any) -> list[dict[str, Any]]:
+    def select(
+        self, chosen: Filter, *order: Any, columns: Sequence[str] | None = None
+    ) -> list[dict[str, Any]]:
         """Return the rows that pass a filter, by column; the newest first unless another order is given."""
+        return list(self.rows(chosen, *order, columns=columns))
+
+    def rows(
+        self, chosen: Filter, *order: Any, columns: Sequence[str] | None = None
+    ) -> Iterator[dict[str, Any]]:
+        """Yield the rows that `select` returns, one at a time.
+
+        Args:
+            chosen: the filter.
+            order: what the rows are sorted by before their age.
+            columns: the columns of the index that are needed; all unless given.
+        """
         self._check_settings(chosen)
-        query = self._of(chosen).order_by(*order, Row.created.desc(), Row.id, Row.root)
-        return list(query.dicts().bind(self._database))
+        needed = [getattr(Row, name) for name in columns or ()]
+        query = self._of(chosen, *needed).order_by(*order, Row.created.desc(), Row.id, Row.root)
+        found: Any = query.dicts().bind(self._database)
+        return iter(found.iterator())
 
     def count(self, chosen: Filter) -> int:
         """Return how many rows pass a filter."""
@@ -53,36 +69,64 @@ class Index:
         return int(counted[0])
 
     def page(
-        self, chosen: Filter, *order: Any, limit: int | None, offset: int = 0
+        self,
+        chosen: Filter,
+        *order: Any,
+        limit: int | None,
+        offset: int = 0,
+        columns: Sequence[str] | None = None,
     ) -> tuple[list[dict[str, Any]], int]:
-        """Return some of the rows that pass a filter, as `select` does, and how many do, in one pass.
+        """Return some of the rows that pass a filter, as `select` does, and how many do.
 
         Args:
             chosen: the filter.
             order: as for `select`.
             limit: how many rows at most; all if None.
             offset: how many to pass over.
+            columns: as for `rows`.
         """
         if limit is None:
-            every = self.select(chosen, *order)
+            every = self.select(chosen, *order, columns=columns)
             return every[offset:], len(every)
         self._check_settings(chosen)
         known = self._of(chosen, Row.root, Row.entry).order_by(*order, Row.created.desc(), Row.id, Row.root)
-        places = list(self._tuples(known))
-        shown = places[offset : offset + limit]
+        if chosen.condition is None:  # counted in an index, without a look at the rows
+            shown, total = list(self._tuples(known.limit(limit).offset(offset))), self.count(chosen)
+        else:  # a filter may be slow: it is asked once of each row
+            places = list(self._tuples(known))
+            shown, total = places[offset : offset + limit], len(places)
         rows: dict[tuple[str, str], dict[str, Any]] = {}
         for root in {root for root, _ in shown}:
             entries = [entry for there, entry in shown if there == root]
             for some in chunked(entries, 500):
                 found: Any = Row.select().where((Row.root == root) & Row.entry.in_(some)).dicts()
                 rows |= {(root, row["entry"]): row for row in found.bind(self._database)}
-        return [rows[place] for place in shown], len(places)
+        return [rows[place] for place in shown], total
 
-    def names(self) -> list[tuple[Any, ...]]:
-        """Return root, entry, id, name, seed and creation (ms) of every run, the newest first."""
+    def named(self, name: str) -> list[tuple[Any, ...]]:
+        """Return the runs that an id, the beginning of one or a name may stand for, the newest first.
+
+        Each is root, entry, id, name, seed and creation (ms). An empty name stands for all.
+        """
+        return self._names((_begins(Row.id, name) | (Row.name == text(name))) if name else None)
+
+    def ids_from(self, beginning: str) -> list[tuple[str, str, int]]:
+        """Return id, name and seed of runs whose ids begin so, at most the 1,000 newest."""
+        return [found[2:5] for found in self._names(_begins(Row.id, beginning), _FEW)]
+
+    def names_from(self, beginning: str) -> list[tuple[str, int]]:
+        """Return names that begin so, at most 1,000, and how many runs have each."""
+        chosen = self._of(Filter(_begins(Row.name, beginning)), Row.name, fn.COUNT(Row.entry))
+        return [(name, count) for name, count in self._tuples(chosen.group_by(Row.name).limit(_FEW))]
+
+    def newest(self, name: str = "") -> list[tuple[Any, ...]]:
+        """Return the newest run, of a name if one is given, as `named` does; none if there is none."""
+        return self._names(Row.name == text(name) if name else None, 1)
+
+    def _names(self, condition: Any, limit: int | None = None) -> list[tuple[Any, ...]]:
         columns = (Row.root, Row.entry, Row.id, Row.name, Row.seed, Row.created)
-        query = self._of(Filter(None), *columns).order_by(Row.created.desc(), Row.id.desc())
-        return list(query.tuples().bind(self._database))
+        query = self._of(Filter(condition), *columns).order_by(Row.created.desc(), Row.id.desc())
+        return list(query.limit(limit).tuples().bind(self._database))
 
     def originals(self, digests: Sequence[str] | None = None) -> dict[str, tuple[str, str, str]]:
         """Return root, entry and id of the run that was first, for each content recorded twice or more.
@@ -135,6 +179,7 @@ def look(
     tell: Tell = lambda _: None,
     anew: bool = False,
     as_known: bool = False,
+    depth: Depth = Depth.FILES,
 ) -> Found:
     """Return what some work finds in the index of these folders, brought up to date before.
 
@@ -142,8 +187,9 @@ def look(
         roots: recordings folders; one that is missing has no runs.
         work: done once, or once more if the index turns out to be damaged.
         tell: told what a user is to know of the index itself.
-        anew: whether to forget first what is known of these folders.
+        anew: whether to read every run again, changed or not.
         as_known: whether to answer from what is known of them, without looking at them again.
+        depth: which changes of them are looked for.
 
     Raises:
         StorageError: a recordings folder cannot be read.
@@ -157,7 +203,7 @@ def look(
                 if as_known and before is not None and before.file == (version() or before).file:
                     with database.atomic("DEFERRED"):
                         return work(Index(database, places))
-                return _look(database, places, work, anew)
+                return _look(database, places, work, depth, anew)
         except (OperationalError, OSError) as error:
             tell(f"The index {index_path()} cannot be used ({error}); the folders are read without it.")
             break
@@ -166,7 +212,7 @@ def look(
             renew()
             as_known = False
     with contextlib.closing(made(":memory:")) as database:
-        return _look(database, places, work, anew)
+        return _look(database, places, work, depth, anew)
 
 
 def order_of(text: str) -> list[Any]:
@@ -191,18 +237,34 @@ def order_of(text: str) -> list[Any]:
 
 
 def _look(
-    database: SqliteDatabase, roots: Sequence[str], work: Callable[[Index], Found], anew: bool
+    database: SqliteDatabase,
+    roots: Sequence[str],
+    work: Callable[[Index], Found],
+    depth: Depth,
+    anew: bool = False,
 ) -> Found:
     """Return what the work finds in the transaction in which the index was seen to agree with the folders."""
-    folders, index = Folders(database, roots), Index(database, roots)
+    folders, index = Folders(database, roots, depth, anew), Index(database, roots)
     if anew:
-        folders.forget()
-    news = folders.news()
-    if not news:
+        folders.forget_missing()
+    before = _data_version(database)
+    found = folders.differences()
+    if not found:
         with database.atomic("DEFERRED"):
-            if not folders.news():
+            if _data_version(database) == before or not folders.differences():
                 return work(index)
+    folders.take_in(found)
     with database.atomic("IMMEDIATE"):
-        folders.write(news)
-        folders.write(folders.news())  # mostly nothing: what other processes did meanwhile
+        folders.take_in(folders.differences())  # mostly nothing: what other processes did meanwhile
         return work(index)
+
+
+def _begins(column: Any, beginning: str) -> Any:
+    """Return the condition that a text begins so, which SQLite answers from an index."""
+    first = text(beginning) or ""
+    return (column >= first) & (column < first + chr(0x10FFFF))
+
+
+def _data_version(database: SqliteDatabase) -> int:
+    """Return what changes when another connection writes to the index; begins to read it."""
+    return int(database.pragma("data_version"))

@@ -49,6 +49,8 @@ class Row(Model):
     """The run's folder in it."""
     fingerprint = TextField()
     """What tells whether its files changed."""
+    mark = TextField()
+    """What tells whether files in it were made, replaced or removed."""
     settled = BooleanField()
     """Whether they had not changed just before; if they had, they may do so again without a trace."""
     problem = TextField(null=True)
@@ -94,9 +96,9 @@ class Row(Model):
         primary_key = CompositeKey("root", "entry")
         without_rowid = True
         indexes = (
-            (("root", "entry", "fingerprint", "settled", "status"), False),
+            (("root", "entry", "fingerprint", "mark", "settled", "status"), False),
             (("digest",), False),
-            (("root", "created", "id"), False),
+            (("root", "created", "id", "name", "seed"), False),
         )
 
 

@@ -33,13 +33,13 @@ def find_all_recorded(names: Iterable[str], recordings: Path | None) -> list[Run
 
     A name stands for all runs of that name.
     """
-    from runner.runs import list_runs, recordings_folder
+    from runner.catalogue.finding import find_all
+    from runner.cli.output import say
+    from runner.runs import recordings_folder
 
-    known = list_runs(recordings_folder(recordings))
     found: dict[Path, Run] = {}
     for name in names:
-        alike = [run for run in reversed(known) if run.name == name]
-        for run in alike or [find(name, recordings)]:
+        for run in find_all(name, recordings_folder(recordings), say):
             found.setdefault(run.recording.absolute(), run)
     return [recorded(run) for run in found.values()]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import click
@@ -12,6 +12,11 @@ from runner.catalogue.columns import HEADINGS, as_json, in_words
 from runner.catalogue.fields import FIELDS, Kind
 from runner.cli.output import console, draw, table
 
+USUAL: Final = (
+    *("id", "name", "config", "seed", "status", "tag", "episodes", "finish_percent", "mean_return"),
+    *("logged", "bytes", "age", "same_as", "folder"),
+)
+"""The columns that people want to see, where they tell something."""
 _NARROWEST: Final = 14
 """The width at which a shrinking column can still be read."""
 _MISSED: Final = ("config", "logged", "bytes", "episodes", "seed", "folder", "age")
@@ -30,8 +35,8 @@ _SHRINKING: Final = (
 )
 
 
-def print_csv(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
-    """Print rows as CSV on stdout, with a heading.
+def csv_lines(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> Iterator[str]:
+    """Yield rows as lines of CSV, after a heading.
 
     Several tags are separated by blanks, logged values are a JSON object.
     """
@@ -40,11 +45,17 @@ def print_csv(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
 
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
+
+    def line(cells: Iterable[Any]) -> str:
+        text.seek(0)
+        text.truncate()
+        writer.writerow(cells)
+        return text.getvalue()
+
+    yield line(columns)
     for row in rows:
         told = as_json(row, columns).values()
-        writer.writerow([_csv_cell(item) for item in told])
-    click.echo(text.getvalue(), nl=False)
+        yield line(_csv_cell(item) for item in told)
 
 
 def _csv_cell(item: Any) -> Any:
@@ -65,9 +76,7 @@ def usual_columns(rows: Sequence[dict[str, Any]], folders: int) -> list[str]:
         "mean_return": any(row["mean_return"] is not None for row in rows),
         "logged": any(row["logged"] != "{}" for row in rows),
     }
-    identity = ("id", "name", "config", "seed", "status", "tag", "episodes")
-    results = ("finish_percent", "mean_return", "logged", "bytes", "age", "same_as", "folder")
-    return [column for column in (*identity, *results) if telling.get(column, True)]
+    return [column for column in USUAL if telling.get(column, True)]
 
 
 def print_table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -24,6 +24,7 @@ __all__ = [
     "draw",
     "duration",
     "facts",
+    "json_lines",
     "number",
     "print_json",
     "say",
@@ -39,6 +40,21 @@ UNBOUNDED: Final = 1000
 def print_json(value: Any, indent: int | None = 1) -> None:
     """Print a value as JSON on stdout; None for `indent` makes it one line. NaN and infinity become null."""
     click.echo(json.dumps(finite(value), indent=indent, allow_nan=False))
+
+
+def json_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the text of a JSON array of objects in parts, so that it never has to be in memory as a whole.
+
+    Each value stands on a line of its own, as `print_json` has it; values that are lists stand on one.
+    """
+    separator = "["
+    for row in rows:
+        values = (
+            f"{json.dumps(key)}: {json.dumps(finite(value), allow_nan=False)}" for key, value in row.items()
+        )
+        yield separator + "\n {\n  " + ",\n  ".join(values) + "\n }"
+        separator = ","
+    yield "[]\n" if separator == "[" else "\n]\n"
 
 
 def say(text: str) -> None:

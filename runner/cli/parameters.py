@@ -22,24 +22,17 @@ class RunName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # gener
         param: click.Parameter,  # noqa: ARG002
         incomplete: str,
     ) -> list[CompletionItem]:
-        """Return the ids and names that begin so, the newest first; paths, once there is a slash."""
-        from runner.catalogue.finding import candidates
+        """Return ids and names that begin so, the newest first; paths, once there is a slash."""
+        from runner.catalogue.finding import completions
         from runner.runs import recordings_folder
 
         if "/" in incomplete or "\\" in incomplete:
             return [CompletionItem(incomplete, type="file")]
         try:
-            runs = candidates(recordings_folder(ctx.params.get("recordings")))
+            found = completions(incomplete, recordings_folder(ctx.params.get("recordings")))
         except RunnerError:
             return []
-        found = {"@latest": "the newest run"} if runs else {}
-        found |= {run.run_id: f"{run.name}, seed {run.seed}" for run in runs}
-        names = [run.name for run in runs]
-        found |= {name: "the run of this name" for name in names if names.count(name) == 1}
-        found |= {f"{name}@latest": "the newest of this name" for name in names if names.count(name) > 1}
-        return [
-            CompletionItem(name, help=text) for name, text in found.items() if name.startswith(incomplete)
-        ]
+        return [CompletionItem(name, help=text) for name, text in found.items()]
 
 
 class ShippedName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only

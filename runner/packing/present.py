@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from runner.catalogue.finding import candidates
+from runner.catalogue.finding import with_id
 from runner.documents import sync, write_whole
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.labels import MAX_TAGS, Labels, change_labels
@@ -39,7 +39,7 @@ def known(run_id: str, content_digest: str, recordings: Path) -> Run | None:
         Occupied: one of this id and other content is there.
         StorageError: something that is no run has its place.
     """
-    taken = next((run for run in candidates(recordings) if run.run_id == run_id), None)
+    taken = with_id(run_id, recordings)
     found = taken and next(runs_in(Path(taken.root, taken.entry)), None)
     if found is None:
         if os.path.lexists(recordings / run_id):

@@ -104,6 +104,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
     app.state.stopping.clear()
     async with contextlib.AsyncExitStack() as stack:
         stack.callback(app.state.catalogue.close)
+        app.state.catalogue.prepare()
         settings: Settings = app.state.settings
         app.state.jobs = stack.enter_context(
             Jobs(

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from runner.catalogue.database import Version, version
-from runner.catalogue.finding import candidates_in, run_of
+from runner.catalogue.finding import Candidate, all_of_name, answering, run_of
+from runner.catalogue.folders import Depth
 from runner.catalogue.index import look
-from runner.errors import RunNotFound
+from runner.errors import RunnerError, RunNotFound
 from runner.finding import the_one
 from runner.runs import Run, run_of_id
 
@@ -26,6 +28,10 @@ FRESH_SECONDS: Final = 1.0
 SHARE: Final = 20
 """One part in so many of the time is spent on looking."""
 MOST_SECONDS: Final = 5.0
+CLOSE_SECONDS: Final = 60.0
+"""How often a look also finds files that were changed in place, which takes thrice as long."""
+FIRST_SECONDS: Final = 1.0
+"""How long `can_list` waits for the first look."""
 NEVER: Final = float("-inf")
 NOTHING: Final = Version(-1, 0)
 
@@ -39,7 +45,7 @@ class Catalogue:
         self._looker = ThreadPoolExecutor(1, thread_name_prefix="catalogue")
         self._lock = threading.Lock()
         self._look: Future[None] | None = None
-        self._asked = self._changed = self._looked = NEVER
+        self._asked = self._changed = self._looked = self._looked_closely = NEVER
         self._took = 0.0
         self._seen = NOTHING
 
@@ -59,10 +65,13 @@ class Catalogue:
         """Say that a run is not as it was: whoever asks from now on is told of it as it is."""
         self._changed = time.monotonic()
 
-    @property
-    def last_change(self) -> float:
-        """When something was last said to have changed, in seconds of the monotonic clock."""
-        return self._changed
+    def state(self) -> Hashable:
+        """Return what an answer depends on: it may be given again while this is the same."""
+        return self.version() or self._changed
+
+    def prepare(self) -> None:
+        """Begin the first look, so that the first request need not wait for all of it."""
+        self._begin_look()
 
     def read(self, work: Callable[[Index], Found]) -> Found:
         """Return what some work finds in the index.
@@ -73,6 +82,21 @@ class Catalogue:
         if self.version() is None:
             self._begin_look().result()
         return look(self.roots, work, self._tell, as_known=self.version() is not None)
+
+    def can_list(self) -> bool:
+        """Return whether runs can be listed, by what the last look found; waits for none but the first."""
+        if self._looked == NEVER or time.monotonic() - self._asked > CLOSE_SECONDS:
+            self._begin_look()
+        latest = self._look
+        try:
+            if latest is not None and (self._looked == NEVER or latest.done()):
+                latest.result(FIRST_SECONDS)
+            for root in filter(os.path.lexists, self.roots):  # a missing one has no runs
+                with os.scandir(root) as entries:
+                    next(entries, None)
+        except (TimeoutError, OSError, RunnerError):
+            return False
+        return True
 
     def find(self, name: str) -> Run:
         """Return the run that an id, the beginning of one, a name or `@latest` names; no path does.
@@ -85,10 +109,17 @@ class Catalogue:
             known = run_of_id(name, root)
             if known is not None:
                 return known
+
+        def answer(index: Index) -> list[Candidate]:
+            return answering(name, index)
+
+        def answer_or_all(index: Index) -> list[Candidate]:
+            return answering(name, index) or answering("", index)
+
         try:
-            found = the_one(name, self.read(candidates_in), self.roots[0])
+            found = the_one(name, self.read(answer), self.roots[0])
         except RunNotFound:  # it may be newer than the last look
-            found = the_one(name, look(self.roots, candidates_in, self._tell), self.roots[0])
+            found = the_one(name, look(self.roots, answer_or_all, self._tell), self.roots[0])
         return run_of(found, Path(found.root))
 
     def find_all(self, name: str) -> list[Run]:
@@ -98,8 +129,8 @@ class Catalogue:
             RunNotFound: none does, or it is the beginning of several ids.
         """
         _refuse_path(name)
-        alike = [found for found in self.read(candidates_in) if found.name == name]
-        return [run_of(found, Path(found.root)) for found in reversed(alike)] or [self.find(name)]
+        alike = self.read(lambda index: all_of_name(name, index))
+        return [run_of(found, Path(found.root)) for found in alike] or [self.find(name)]
 
     def _is_known(self, now: Version) -> bool:
         """Return whether a look not long ago saw to it that the index agrees with the folders."""
@@ -125,9 +156,14 @@ class Catalogue:
 
     def _do_look(self) -> None:
         began = time.monotonic()
-        look(self.roots, lambda _: None, self._tell)
+        closely = began - self._looked_closely > CLOSE_SECONDS
+        look(self.roots, lambda _: None, self._tell, depth=Depth.FILES if closely else Depth.FOLDERS)
         self._seen = version() or NOTHING
-        self._looked, self._took = began, time.monotonic() - began
+        self._looked = began
+        if closely:
+            self._looked_closely = began
+        else:
+            self._took = time.monotonic() - began
 
 
 def _refuse_path(name: str) -> None:

@@ -12,8 +12,6 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 
-from runner.errors import RunnerError
-from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CatalogueOf, SettingsOf
 
 router = APIRouter(tags=["health"])
@@ -48,7 +46,7 @@ def readyz(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
         "not_stopping": not request.app.state.stopping.is_set(),
         "recordings_can_be_written": _can_be_written(folder),
         "disk_has_room": _has_room(folder),
-        "runs_can_be_listed": _answers(catalogue),
+        "runs_can_be_listed": catalogue.can_list(),
         "jobs_can_be_started": request.app.state.jobs.is_working,
     }
     ready = all(checks.values())
@@ -65,11 +63,3 @@ def _has_room(folder: Path) -> bool:
         return shutil.disk_usage(folder).free > LEAST_FREE
     except OSError:
         return False
-
-
-def _answers(catalogue: Catalogue) -> bool:
-    try:
-        catalogue.read(lambda index: index.names())
-    except RunnerError:
-        return False
-    return True

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from runner.cli.options import filter_argument, folders_option, json_option
-from runner.cli.output import print_json, say
+from runner.cli.output import json_lines, say
 
 if TYPE_CHECKING:
     from runner.catalogue.filters import Filter
@@ -17,8 +20,13 @@ if TYPE_CHECKING:
 
 MAX_PROBLEMS: Final = 5
 """Damaged runs whose problems are printed."""
+Render = Callable[[Iterable[dict[str, Any]], Sequence[str]], Iterator[str]]
+
 ON_A_TERMINAL: Final = 50
 """Runs that are listed there unless it is said how many."""
+_PART: Final = 1 << 20
+_SPOOL_BYTES: Final = 8 << 20
+"""Output up to this size is kept in memory, longer output in a temporary file."""
 
 
 @click.command("ls")
@@ -74,7 +82,6 @@ def command(
       dualtaxi ls --quiet name:quick
     """  # noqa: D301 - Click wants the backspace itself
     from runner.catalogue.columns import PROGRAMS, columns_of
-    from runner.catalogue.columns import as_json as told
     from runner.catalogue.filters import parse
     from runner.cli import listing
 
@@ -84,39 +91,113 @@ def command(
     shown = columns_of(columns) if columns else None
     if limit is None and not (quiet or as_csv or as_json) and sys.stdout.isatty():
         limit = ON_A_TERMINAL
-    rows, total = _found(recordings, chosen, sort, limit, offset)
-    if quiet:
-        click.echo("".join(f"{row['id']}\n" for row in rows), nl=False)
-    elif as_json:
-        print_json([told(row, shown or PROGRAMS) for row in rows])
-    elif as_csv:
-        listing.print_csv(rows, shown or PROGRAMS)
-    elif rows:
-        usual = listing.usual_columns(rows, len(recordings))
-        listing.print_table(rows, shown or listing.fitting(rows, usual))
-    _report_damage(rows)
-    _tell_the_rest(rows, total, offset, chosen, recordings)
+    wanted = _Wanted(chosen, sort, limit or None, offset)
+    if quiet or as_csv or as_json:
+        columns_shown = ["id"] if quiet else shown or list(PROGRAMS)
+        render: Render = listing.csv_lines if as_csv else _ids if quiet else _objects
+        listed, total, problems = _stream(recordings, wanted, columns_shown, render)
+    else:
+        rows, total = _found(recordings, wanted, shown or listing.USUAL)
+        listed, problems = len(rows), [row["problem"] for row in rows if row["problem"]]
+        if rows:
+            shown = shown or listing.fitting(rows, listing.usual_columns(rows, len(recordings)))
+            listing.print_table(rows, shown)
+    _report_damage(problems)
+    _tell_the_rest(listed, total, offset, chosen, recordings)
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """Which runs are listed, in which order."""
+
+    filter: Filter
+    sort: str
+    limit: int | None
+    offset: int
+
+
+def _ids(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> Iterator[str]:  # noqa: ARG001
+    return (f"{row['id']}\n" for row in rows)
+
+
+def _objects(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> Iterator[str]:
+    from runner.catalogue.columns import as_json
+
+    return json_lines(as_json(row, columns) for row in rows)
+
+
+def _stream(
+    recordings: tuple[Path, ...],
+    wanted: _Wanted,
+    columns: Sequence[str],
+    render: Render,
+) -> tuple[int, int, list[str]]:
+    """Print the runs in bounded memory; return how many, how many fit the filter, and what is damaged.
+
+    A file takes the text up first: the index is locked while it is read, and whoever reads the output may
+    take their time.
+    """
+    import tempfile
+
+    from runner.catalogue.columns import needed_for, with_same_as
+    from runner.catalogue.index import look, order_of
+
+    order = order_of(wanted.sort)
+    needed = needed_for([*columns, "same_as"] if "same_as" in columns else columns)
+
+    def work(index: Index) -> int:
+        spool.seek(0)
+        spool.truncate()
+        problems.clear()
+        rows: Iterable[dict[str, Any]]
+        if wanted.limit is None:
+            total = index.count(wanted.filter)
+            rows = islice(index.rows(wanted.filter, *order, columns=needed), wanted.offset, None)
+        else:
+            rows, total = index.page(wanted.filter, *order, limit=wanted.limit, offset=wanted.offset)
+        if "same_as" in columns:
+            rows = with_same_as(rows, index.originals())
+        spool.writelines(render(_noting_problems(rows, problems), columns))
+        return total
+
+    problems: list[str] = []
+    with tempfile.SpooledTemporaryFile(_SPOOL_BYTES, "w+", encoding="utf-8", newline="") as spool:
+        total = look(recordings, work, say)
+        spool.seek(0)
+        while part := spool.read(_PART):
+            click.echo(part, nl=False)
+    left = max(total - wanted.offset, 0)
+    return left if wanted.limit is None else min(left, wanted.limit), total, problems
+
+
+def _noting_problems(rows: Iterable[dict[str, Any]], problems: list[str]) -> Iterator[dict[str, Any]]:
+    """Yield the rows, and add what is wrong with damaged ones to a list."""
+    for row in rows:
+        if row["problem"]:
+            problems.append(row["problem"])
+        yield row
 
 
 def _found(
-    recordings: tuple[Path, ...], chosen: Filter, sort: str, limit: int | None, offset: int
+    recordings: tuple[Path, ...], wanted: _Wanted, columns: Sequence[str]
 ) -> tuple[list[dict[str, Any]], int]:
     """Return the rows to show, and how many fit the filter."""
-    from runner.catalogue.columns import with_originals
+    from runner.catalogue.columns import needed_for, with_originals
     from runner.catalogue.index import look, order_of
 
-    order = order_of(sort)
+    order, needed = order_of(wanted.sort), needed_for([*columns, "same_as"])
 
     def work(index: Index) -> tuple[list[dict[str, Any]], int]:
-        rows, total = index.page(chosen, *order, limit=limit or None, offset=offset)
+        rows, total = index.page(
+            wanted.filter, *order, limit=wanted.limit, offset=wanted.offset, columns=needed
+        )
         return with_originals(rows, index), total
 
     return look(recordings, work, say)
 
 
-def _report_damage(rows: list[dict[str, Any]]) -> None:
+def _report_damage(problems: Sequence[str]) -> None:
     """Print what is wrong with the damaged runs among those that are shown."""
-    problems = [row["problem"] for row in rows if row["problem"]]
     for problem in problems[:MAX_PROBLEMS]:
         say(f"{problem[:1].upper()}{problem[1:]}")
     if len(problems) > MAX_PROBLEMS:
@@ -124,15 +205,15 @@ def _report_damage(rows: list[dict[str, Any]]) -> None:
 
 
 def _tell_the_rest(
-    rows: list[dict[str, Any]], total: int, offset: int, chosen: Filter, recordings: tuple[Path, ...]
+    listed: int, total: int, offset: int, chosen: Filter, recordings: tuple[Path, ...]
 ) -> None:
     """Say what is not shown, and why nothing is."""
     folders = ", ".join(map(str, recordings))
-    if len(rows) < total:
-        behind = offset + len(rows)
-        more = f", --offset {behind} the next" if len(rows) > 0 and behind < total else ""
-        say(f"Shown are {len(rows):,} of {total:,} runs; --limit 0 shows all{more}.")
-    elif not rows and chosen.condition is not None:
+    if listed < total:
+        behind = offset + listed
+        more = f", --offset {behind} the next" if listed > 0 and behind < total else ""
+        say(f"Shown are {listed:,} of {total:,} runs; --limit 0 shows all{more}.")
+    elif not listed and chosen.condition is not None:
         say(f"No run in {folders} fits.")
-    elif not rows:
+    elif not listed:
         say(f"No runs in {folders} yet. `dualtaxi run CONFIG` makes one.")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,15 +55,19 @@ def command(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
 
 
 def _found(index: Index) -> _Found:
-    from runner.catalogue.columns import with_originals
+    from runner.catalogue.columns import with_same_as
     from runner.catalogue.filters import Filter
 
-    rows = with_originals(index.select(Filter(None)), index)
-    statuses = [row["status"] for row in rows]
+    rows = index.rows(Filter(None), columns=("root", "entry", "status", "digest"))
+    statuses: Counter[str] = Counter()
+    copies = 0
+    for row in with_same_as(rows, index.originals()):
+        statuses[row["status"]] += 1
+        copies += row["same_as"] is not None
     return _Found(
-        runs=len(rows),
-        copies=sum(row["same_as"] is not None for row in rows),
-        statuses={status: statuses.count(status) for status in sorted(set(statuses))},
+        runs=statuses.total(),
+        copies=copies,
+        statuses=dict(sorted(statuses.items())),
         problems=index.problems(),
     )
 

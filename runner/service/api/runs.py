@@ -77,7 +77,7 @@ async def list_runs(
 
         return json.dumps(catalogue.read(work), ensure_ascii=False).encode()
 
-    key = ("runs", catalogue.version() or catalogue.last_change, request.url.query)
+    key = ("runs", catalogue.state(), request.url.query)
     return Response(await kept.answer(key, make), media_type="application/json")
 
 

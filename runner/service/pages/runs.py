@@ -70,7 +70,7 @@ async def runs(
         return _page(catalogue, filter, sort, ",".join(columns or ()), page, viewer)
 
     try:
-        body = await kept.answer(("runs page", catalogue.version(), request.url.query, viewer), make)
+        body = await kept.answer(("runs page", catalogue.state(), request.url.query, viewer), make)
     except RunnerError as error:
         status = HTTPStatus.BAD_REQUEST
         told = _frame(filter, "", USUAL) | {"problem": message_of(error, request), "rows": [], "total": None}

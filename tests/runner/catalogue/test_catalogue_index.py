@@ -103,8 +103,8 @@ def test_only_what_changed_is_read(folder):
     aged(folder)
     changed = list_runs(folder)[2].update(status="failed")
     with contextlib.closing(opened(pytest.fail)) as database:
-        (news,) = Folders(database, [str(folder)]).news()
-    assert [row["entry"] for row in news.changed] == [changed.run_id]
+        (difference,) = Folders(database, [str(folder)]).differences()
+    assert difference.changed == [changed.run_id]
     assert ids(folder, "status:failed") == [changed.run_id]
 
 
@@ -141,7 +141,7 @@ def test_a_run_is_found_in_the_recording_alone_and_keeps_its_labels(folder, reco
     (place / RUN_FILE).unlink()
     alone = rows(folder)[0][0]
     differing = {key for key in whole if whole[key] != alone[key]}
-    assert differing <= {"fingerprint", "settled", "seconds", "settings"}
+    assert differing <= {"fingerprint", "mark", "settled", "seconds", "settings"}
     assert json.loads(whole["settings"]) == json.loads(alone["settings"])
 
 
