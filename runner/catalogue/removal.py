@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,19 +23,27 @@ from runner.catalogue.filters import Filter
 from runner.catalogue.index import Index
 from runner.catalogue.rows import Row
 from runner.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
-from runner.errors import RunnerError, StorageError
+from runner.errors import RunnerError, RunNotFound, StorageError
 from runner.labels import KEEP, LABELS_FILE, are_readable
 from runner.locking import locked
-from runner.runs import Run
+from runner.runs import Run, runs_in
 
 _STRAY_SECONDS: Final = 60
+_PRUNED_BY: Final = ("root", "entry", "config", "status", "tags")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Removal:
-    """A run that may be removed."""
+    """A run that may be removed, in few bytes: there may be very many."""
 
-    run: Run
+    run_id: str
+    name: str
+    seed: int | None
+    status: str
+    finish_percent: float | None
+    created: datetime
+    folder: Path
+    is_archived: bool
     root: Path
     contents: Contents
     refusal: str = ""
@@ -44,6 +53,16 @@ class Removal:
     def freed(self) -> int:
         """Bytes that the disk gets back."""
         return self.contents.freed
+
+    def run(self) -> Run:
+        """Return the run as it is now.
+
+        Raises:
+            RunNotFound: it is no more.
+        """
+        for run in runs_in(self.folder):
+            return run
+        raise RunNotFound(f"run {self.run_id} was removed just now.")
 
 
 def plan(run: Run, root: Path, force: bool = False) -> Removal:
@@ -66,7 +85,20 @@ def plan(run: Run, root: Path, force: bool = False) -> Removal:
             f"its folder also has {listed(contents.strange)}, which no run writes; "
             "move that away, or remove it as well with --force"
         )
-    return Removal(run, root, contents, refusal)
+    last = run.summary.last_evaluation
+    return Removal(
+        run_id=run.run_id,
+        name=run.name,
+        seed=run.seed,
+        status=run.status,
+        finish_percent=last.finish_percent if last else None,
+        created=run.created,
+        folder=run.folder,
+        is_archived=bool(run.archive),
+        root=root,
+        contents=contents,
+        refusal=refusal,
+    )
 
 
 def remove(removal: Removal, force: bool = False) -> None:
@@ -80,9 +112,12 @@ def remove(removal: Removal, force: bool = False) -> None:
         RunnerError: it is not to be removed, or a process began to work on it meanwhile; it is as before.
         StorageError: the folder cannot be written; what is left of the run is out of sight.
     """
-    run = removal.run
-    if removal.refusal:
-        raise RunnerError(f"run {run.run_id} stays: {removal.refusal}.")
+    run = removal.run()
+    refusal = removal.refusal or _protected(
+        run
+    )  # it may have been tagged, or begun again, while its owner was asked
+    if refusal:
+        raise RunnerError(f"run {run.run_id} stays: {refusal}.")
     with locked(run, archived=True):
         pass  # nobody else works on it
     hidden = removal.root / f"{REMOVED}{run.folder.name}-{secrets.token_hex(4)}"
@@ -132,7 +167,7 @@ def unwanted(index: Index, wish: Wish, now: float) -> tuple[list[dict[str, Any]]
     if wish.older_than is not None:
         old = Row.created < int((now - wish.older_than) * 1000)
         condition = old if condition is None else condition & old
-    rows = index.select(Filter(condition, wish.filter.settings))
+    rows = index.select(Filter(condition, wish.filter.settings), columns=_PRUNED_BY)
     spared = set() if wish.keep_last is None else _newest(index, wish.keep_last)
     rows = [row for row in rows if (row["root"], row["entry"]) not in spared]
     rows = [row for row in rows if row["status"] in wish.statuses or not wish.statuses]
@@ -145,7 +180,7 @@ def _newest(index: Index, count: int) -> set[tuple[str, str]]:
     """Return the places of the newest runs of each configuration's name."""
     seen: Counter[str | None] = Counter()
     found = set()
-    for row in index.select(Filter(None)):
+    for row in index.rows(Filter(None), columns=_PRUNED_BY):
         if seen[row["config"]] < count:
             found.add((row["root"], row["entry"]))
         seen[row["config"]] += 1
@@ -166,7 +201,7 @@ def _misplaced(run: Run, root: Path) -> str:
         return f"{run.recording} stands alone; remove the file yourself"
     if run.folder.is_symlink():
         return f"{run.folder} is a link to {run.folder.readlink()}; remove the link yourself"
-    if run.folder.resolve().parent != root.resolve():
+    if run.folder.parent != root and run.folder.resolve().parent != root.resolve():
         return f"{run.folder} is not in {root}; name its folder by --recordings"
     return ""
 

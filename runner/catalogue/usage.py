@@ -26,7 +26,7 @@ _LEFT_OVER: Final = re.compile(
 _ID: Final = re.compile(r"\w+")
 
 
-@dataclass
+@dataclass(slots=True)
 class Contents:
     """What is in a run's folder, in bytes; links to elsewhere and files with other names count as nothing."""
 

@@ -85,10 +85,10 @@ def print_table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
     left = [column not in FIELDS or FIELDS[column].kind in _LEFT for column in columns]
     cells = [[printable(in_words(row, column)) for column in columns] for row in rows]
     if not console().is_terminal:
-        click.echo("\n".join(_aligned([headings, *cells], left)))
+        click.echo("\n".join(aligned([headings, *cells], left)))
         return
-    aligned = tuple(heading for heading, is_left in zip(headings, left, strict=True) if is_left)
-    drawn = table(*headings, left=aligned, shrinking=_SHRINKING)
+    left_headings = tuple(heading for heading, is_left in zip(headings, left, strict=True) if is_left)
+    drawn = table(*headings, left=left_headings, shrinking=_SHRINKING)
     for line in cells:
         drawn.add_row(*line)
     draw(drawn)
@@ -112,7 +112,7 @@ def fitting(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> list[str]
     return kept
 
 
-def _aligned(lines: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:
+def aligned(lines: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:
     """Return lines of cells in columns: where there is no terminal to fit, and may be very many."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     ways = list(zip(widths, left, strict=True))

@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.cli.output import UNKNOWN, age, draw, number, print_json, say, size, table
+from runner.cli.output import UNKNOWN, age, console, draw, number, print_json, say, size, table
 from runner.errors import RunnerError
 
 if TYPE_CHECKING:
     from runner.catalogue.removal import Removal
     from runner.runs import Run
+
+_MOST_DRAWN: Final = 1000
+"""Rows that are fitted to a terminal; more are printed as in a file, which is far quicker."""
 
 yes_option: Final = click.option("--yes", "-y", is_flag=True, help="Do not ask.")
 force_option: Final = click.option(
@@ -75,10 +78,10 @@ def _as_json(removals: Sequence[Removal], kept: dict[str, str], dry_run: bool) -
 
     runs = [
         {
-            "run_id": removal.run.run_id,
-            "name": removal.run.name,
-            "status": removal.run.status if dry_run else removal.run.file.status,
-            "path": str(removal.run.folder.absolute()),
+            "run_id": removal.run_id,
+            "name": removal.name,
+            "status": removal.status,
+            "path": str(removal.folder.absolute()),
             "bytes": removal.freed,
         }
         for removal in removals
@@ -88,27 +91,36 @@ def _as_json(removals: Sequence[Removal], kept: dict[str, str], dry_run: bool) -
 
 
 def _draw(removals: Sequence[Removal]) -> None:
-    from datetime import UTC, datetime
+    from runner.cli.listing import aligned, printable
 
     headings = ("id", "name", "seed", "status", "finished %", "age", "frees")
-    drawn = table(*headings, left=("id", "name", "status"), shrinking=("name",))
-    now = datetime.now(UTC)
+    left = ("id", "name", "status")
+    if console().is_terminal and len(removals) <= _MOST_DRAWN:
+        drawn = table(*headings, left=left, shrinking=("name",))
+        for removal in removals:
+            drawn.add_row(*_cells(removal))
+        draw(drawn)
+    else:
+        lines = [list(map(printable, _cells(removal))) for removal in removals]
+        for line in aligned([headings, *lines], [heading in left for heading in headings]):
+            click.echo(line)
     for removal in removals:
-        run = removal.run
-        last = run.summary.last_evaluation
-        drawn.add_row(
-            run.run_id,
-            run.name,
-            str(run.seed),
-            run.status,
-            number(last.finish_percent) if last else UNKNOWN,
-            age((now - run.created).total_seconds()),
-            size(removal.freed),
-        )
-    draw(drawn)
-    for removal in removals:
-        if removal.run.archive:
-            say(_archive_in_words(removal.run))
+        if removal.is_archived:
+            say(_archive_in_words(removal.run()))
+
+
+def _cells(removal: Removal) -> tuple[str, ...]:
+    from datetime import UTC, datetime
+
+    return (
+        removal.run_id,
+        removal.name,
+        str(removal.seed),
+        removal.status,
+        UNKNOWN if removal.finish_percent is None else number(removal.finish_percent),
+        age((datetime.now(UTC) - removal.created).total_seconds()),
+        size(removal.freed),
+    )
 
 
 def _archive_in_words(run: Run) -> str:

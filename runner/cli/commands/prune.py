@@ -66,7 +66,7 @@ def command(
     if wish.filter.condition is None and older_than is None and keep_last is None and not statuses:
         raise click.UsageError("expected a FILTER, --older-than, --keep-last or --status: which runs?")
     removals, protected = _chosen(recordings, wish, force)
-    kept = {each.run.run_id: each.refusal for each in removals if each.refusal}
+    kept = {each.run_id: each.refusal for each in removals if each.refusal}
     for run_id, why in kept.items():
         say(f"Run {run_id} stays: {why}.")
     if protected:
@@ -99,5 +99,6 @@ def _chosen(recordings: tuple[Path, ...], wish: Wish, force: bool) -> tuple[list
     from runner.runs import runs_in
 
     rows, protected = look(recordings, lambda index: unwanted(index, wish, time.time()), say)
-    found = [(run, Path(row["root"])) for row in rows for run in runs_in(Path(row["root"], row["entry"]))]
-    return [plan(run, root, force) for run, root in found], protected
+    places = [(Path(row["root"]), row["entry"]) for row in rows]
+    planned = [plan(run, root, force) for root, entry in places for run in runs_in(root / entry)]
+    return planned, protected

@@ -39,7 +39,7 @@ def command(
     root = recordings_folder(recordings)
     runs = {run.folder.resolve(): run for run in (find(name, recordings) for name in run_names)}
     removals = [plan(run, root, force) for run in runs.values()]
-    refused = [f"run {each.run.run_id} stays: {each.refusal}." for each in removals if each.refusal]
+    refused = [f"run {each.run_id} stays: {each.refusal}." for each in removals if each.refusal]
     if refused:
         raise RunnerError("\n".join([*refused, "Nothing was removed."]))
     carry_out(removals, {}, force, yes, dry_run, as_json)

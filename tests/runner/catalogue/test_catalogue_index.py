@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 import runner
+from runner.catalogue import folders
 from runner.catalogue.database import index_path, opened
 from runner.catalogue.filters import Filter, parse
 from runner.catalogue.finding import find_run
@@ -366,3 +367,42 @@ def test_twenty_processes_write_at_once(folder):
     with sqlite3.connect(index_path()) as database:
         assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
     assert [path.name for path in Path(index_path()).parent.glob("*.tmp")] == []
+
+
+def renamed(run, name):
+    change_labels(run.folder, lambda _: Labels(name=name))
+
+
+def test_a_name_given_or_taken_away_just_now_is_known(folder):
+    runs = [create_run(folder, CONFIG, seed).update(status="finished") for seed in range(3)]
+    aged(folder)
+    renamed(runs[1], "patient")
+    assert find_run("patient", folder).run_id == runs[1].run_id
+    aged(folder)
+    renamed(runs[2], "patient")
+    with pytest.raises(RunNotFound, match="answers to 2 runs"):
+        find_run("patient", folder)
+    aged(folder)
+    renamed(runs[1], "other")
+    renamed(runs[2], "another")
+    with pytest.raises(RunNotFound, match="no run 'patient'"):
+        find_run("patient", folder)
+    newest = create_run(folder, CONFIG, 9)
+    assert find_run("@latest", folder).run_id == newest.run_id
+    assert find_run(newest.run_id[:7], folder).run_id == newest.run_id
+
+
+def test_making_the_index_anew_never_empties_it(folder, monkeypatch):
+    runs = [create_run(folder, CONFIG, seed) for seed in range(4)]
+    ids(folder)
+    seen = []
+    row_of = folders.row_of
+
+    def looking_on(run, size):
+        with contextlib.closing(sqlite3.connect(index_path())) as other:
+            seen.extend(other.execute("SELECT COUNT(*) FROM runs").fetchone())
+        return row_of(run, size)
+
+    monkeypatch.setattr(folders, "row_of", looking_on)
+    assert len(look([folder], lambda index: index.select(ALL), anew=True)) == 4
+    assert seen == [len(runs)] * 4

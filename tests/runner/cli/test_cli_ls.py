@@ -6,6 +6,7 @@ import os
 import pytest
 
 from runner.api import experiment_of
+from runner.config import from_mapping
 from runner.runs import RUN_FILE, create_run
 
 
@@ -93,3 +94,10 @@ def test_the_folder_is_the_working_directorys_by_default(recorded_run, tmp_path,
     monkeypatch.delenv("DUALTAXI_RECORDINGS", raising=False)
     assert recorded_run.run_id in CliRunner().invoke(cli, ["ls"]).stdout
     assert os.environ.get("DUALTAXI_RECORDINGS") is None
+
+
+def test_json_of_no_run_and_of_two_is_an_array(command):
+    assert command.json("ls") == []
+    runs = [create_run(command.recordings, from_mapping({"name": "some", "episodes": 5}), n) for n in (1, 2)]
+    assert {run["run_id"] for run in command.json("ls")} == {run.run_id for run in runs}
+    assert len(command.json("ls", "--offset", "1")) == len(command.json("ls", "--limit", "1")) == 1

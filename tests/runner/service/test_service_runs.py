@@ -57,3 +57,10 @@ def test_a_run_begun_after_the_folders_were_looked_at_is_found_at_once(client, r
     assert client.get("/api/v1/runs/fresh").status_code == 404
     runner.run({"name": "fresh", "env": {"id": "FrozenLake-v1"}, "episodes": 300}, recordings=recordings)
     assert client.get("/api/v1/runs/fresh").status_code == 200
+
+
+def test_the_page_of_runs_is_of_now_after_a_change_here(client, recordings):
+    run = client.get("/api/v1/runs").json()["runs"][0]["run_id"]
+    for name in ("once", "twice", "thrice"):
+        client.patch(f"/api/v1/runs/{run}", json={"name": name})
+        assert f">{name}<" in client.get("/runs").text
