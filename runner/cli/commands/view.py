@@ -85,22 +85,30 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     if len(run_names) > 2:
         raise click.UsageError(f"found {len(run_names)} runs, expected one or two.")
+    from runner.cli.progress import stage_line
+    from runner.cli.working import announcing
     from runner.export.places import require_new
     from runner.export.rerun.viewer import require_rerun
 
     require_rerun("view")
     if screenshot is not None:
         require_new(screenshot, force)
-    from runner.export.rerun.cache import exported
-    from runner.export.rerun.spots import with_spot
-
     runs = [find_recorded(name, recordings) for name in run_names]
     request = request_of(episodes, evaluations, every, everything)
-    parting = None if len(runs) == 1 or spot is not None else _parting(runs)
-    place = with_spot(runs[0], request, spot or parting)
-    if parting is not None:
-        _tell_steps(place.time, with_spot(runs[1], request, parting).time)
-    path, selections = exported(runs, place.request)
+    with stage_line("loading Rerun") as stage:
+        from runner.export.rerun.cache import exported
+        from runner.export.rerun.spots import with_spot
+
+        parting = None
+        if len(runs) == 2 and spot is None:
+            stage("comparing the runs")
+            parting = _parting(runs)
+        place = with_spot(runs[0], request, spot or parting)
+        if parting is not None:
+            _tell_steps(place.time, with_spot(runs[1], request, parting).time)
+        stage("exporting")
+        with announcing():
+            path, selections = exported(runs, place.request)
     for selection in selections:
         tell(selection)
     _show(path, place, web, port, screenshot, picture_size)
@@ -123,11 +131,13 @@ def _tell_steps(first: int, second: int) -> None:
 
 def _show(path: Path, place: Spot, web: bool, port: int, screenshot: Path | None, picture_size: str) -> None:
     """Show an exported file, in the way that is asked for."""
+    from runner.cli.progress import stage_line
     from runner.export.rerun import viewer
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so the viewer is ended too
     if screenshot is not None:
-        viewer.screenshot(path, place.time, screenshot, picture_size)
+        with stage_line("drawing"):
+            viewer.screenshot(path, place.time, screenshot, picture_size)
         click.echo(screenshot)
     elif web:
         with viewer.web_viewer(path, viewer.check_port(port)) as (process, address):

@@ -16,7 +16,7 @@ from runner.mdp import Mdp
 from runner.words import spoken
 
 FRAMES_A_SECOND: Final = 10.0
-_PLOTS: Final = (
+PLOTS: Final = (
     ("Trials finished (%)", ("eval/metrics/finish_percent",)),
     ("Episode length (mean)", ("train/metrics/episode_length", "eval/metrics/episode_length")),
     ("Return of an episode (mean)", ("train/metrics/returns", "eval/metrics/returns")),
@@ -26,6 +26,7 @@ _PLOTS: Final = (
     ("Epsilon, step size", ("train/metrics/epsilon", "train/metrics/step_size")),
     ("Rewards (% of the last steps)", ("train/metrics/reward_percent",)),
 )
+"""The views of metrics: title, and the entities whose lines it shows."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,10 @@ def _grid(run: Shown) -> Any:
             f"{run.root}/{phase}/{what}" for phase in ("train", "eval") for what in ("state", "action")
         ]
         return rrb.TimeSeriesView(
-            origin=f"{run.root}/", contents=contents, name=f"{run.title}: state and action"
+            origin=f"{run.root}/",
+            contents=contents,
+            name=f"{run.title}: state and action",
+            axis_x=whole_axis(run.last),
         )
     margin = 0.8
     bounds = rrb.VisualBounds2D(
@@ -159,14 +163,18 @@ def _events(run: Shown) -> Any:
     return rrb.TextLogView(origin=f"{run.root}/", contents=contents, name="Events", columns=columns)
 
 
+def whole_axis(last: int) -> rrb.TimeAxis:
+    """Return a time axis from 0 to the step `last`; to the cursor if that is 0, not known yet."""
+    start, end = rr.TimeRangeBoundary.absolute(seq=0), rr.TimeRangeBoundary.cursor_relative(seq=0)
+    if last:
+        end = rr.TimeRangeBoundary.absolute(seq=last)
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
+
+
 def _plots(runs: Sequence[Shown], last: int) -> list[Any]:
-    whole = rr.TimeRange(
-        start=rr.TimeRangeBoundary.absolute(seq=0),
-        end=rr.TimeRangeBoundary.absolute(seq=last) if last else rr.TimeRangeBoundary.cursor_relative(seq=0),
-    )
-    axis = rrb.TimeAxis(view_range=whole)
+    axis = whole_axis(last)
     views = []
-    for name, paths in _PLOTS:
+    for name, paths in PLOTS:
         contents = [
             f"{run.root}/{path}" for run in runs for path in paths if run.paths is None or path in run.paths
         ]

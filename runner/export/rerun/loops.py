@@ -20,9 +20,9 @@ from runner.export.rerun.classes import vocabulary_of
 from runner.export.rerun.columns import Batch, Sender, scalars
 from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
-from runner.export.rerun.layout import Shown, draw_background
-from runner.export.rerun.metrics import line_colours
-from runner.export.rerun.scene import TRAIL_STEPS, marks_of, rgb, scene_of
+from runner.export.rerun.layout import Shown, draw_background, whole_axis
+from runner.export.rerun.lines import phase_colours, series_lines
+from runner.export.rerun.scene import TRAIL_STEPS, marks_of, scene_of
 from runner.export.rerun.selection import (
     SPREAD_STEPS,
     Request,
@@ -89,6 +89,8 @@ class LoopExporter:
         self._logged: list[str] = []
         self._frames = [phase for phase in PHASES if any(True for _ in recording.messages(_frame(phase)))]
         self._arrays: list[str] = []
+        self._last = 0
+        """The last step on the timeline at which anything was sent."""
 
     def blueprint(self, title: str) -> Any:
         """Return the arrangement of what there is; call it after `export`."""
@@ -112,8 +114,9 @@ class LoopExporter:
             left.append(rrb.TextLogView(origin=f"{root}/log", name="Log"))
         episodes = any(self._recording.count(schema.PHASES[phase][1]) for phase in PHASES)
         drawn = [*(("return", "length") if episodes else ()), "reward", *self._lines()]
-        plots = [_series(root, name, [f"{phase}/{name}" for phase in PHASES]) for name in drawn]
-        plots += [_series(root, name, [f"logged/{name}"]) for name in self._logged[:6]]
+        axis = whole_axis(self._last)
+        plots = [_series(root, name, [f"{phase}/{name}" for phase in PHASES], axis) for name in drawn]
+        plots += [_series(root, name, [f"logged/{name}"], axis) for name in self._logged[:6]]
         shares = [
             *([4] if self._scene else []),
             *([3] * len(self._frames)),
@@ -157,7 +160,7 @@ class LoopExporter:
             if not k:
                 sender.static("return", _dress(phase, names))
                 sender.static("length", _dress(phase, [phase]))
-            times = _times(block["log_time"], block["episode"])
+            times = self._times(block["log_time"], block["episode"])
             sender.send("return", times, scalars(block["returns"]))
             sender.send("length", times, scalars(block["length"].astype(np.float64)[:, np.newaxis]))
 
@@ -176,6 +179,9 @@ class LoopExporter:
                 self._send_rows(name, rows)
                 waiting[name] = []
         self._logged = list(waiting)
+        logged = Sender(self._stream, f"{self._root}/logged")
+        for name in waiting:
+            logged.static(name, series_lines([name]))
         for name, rows in waiting.items():
             if rows:
                 self._send_rows(name, rows)
@@ -183,7 +189,8 @@ class LoopExporter:
     def _send_rows(self, name: str, rows: Sequence[tuple[int, int, float]]) -> None:
         times, episodes, values = (np.array(column) for column in zip(*rows, strict=True))
         sender = Sender(self._stream, f"{self._root}/logged")
-        sender.send(name, _times(times, episodes), scalars(values.astype(np.float64)[:, np.newaxis]))
+        columns = scalars(values.astype(np.float64)[:, np.newaxis])
+        sender.send(name, self._times(times, episodes), columns)
 
     def _send_texts(self) -> None:
         for text in self._recording.decoded(schema.LOG_TOPIC):
@@ -226,7 +233,7 @@ class LoopExporter:
                     ]
                     sender.static(part, _dress(phase, told))
                 dressed = True
-            times = _times(steps["log_time"], steps["episode"])
+            times = self._times(steps["log_time"], steps["episode"])
             times.append(rr.TimeColumn("t", sequence=steps["t"].astype(np.int64)))
             sender.send("reward", times, scalars(steps["rewards"]))
             for part, columns in lines.items():
@@ -280,15 +287,27 @@ class LoopExporter:
     def _send_rewards_one_by_one(self, phase: str, spans: Sequence[Span]) -> None:
         """Send the rewards of a loop whose steps vary in size."""
         sender = Sender(self._stream, f"{self._root}/{phase}")
+        if spans:
+            sender.static("reward", _dress(phase, self._names(phase)))
         for span in spans:
             steps = islice(self._recording.transitions(phase), span.start, span.stop)
             while batch := list(islice(steps, BATCH)):
                 times, episodes = (np.array([step[key] for step in batch]) for key in ("log_time", "episode"))
                 paid = np.array([step["rewards"] for step in batch])
-                sender.send("reward", _times(times, episodes), scalars(paid))
+                sender.send("reward", self._times(times, episodes), scalars(paid))
 
     def _at(self, log_time: int) -> None:
-        self._stream.set_time("step", sequence=log_time // schema.STEP_NANOSECONDS)
+        step = log_time // schema.STEP_NANOSECONDS
+        self._last = max(self._last, step)
+        self._stream.set_time("step", sequence=step)
+
+    def _times(self, log_time: NDArray[Any], episode: NDArray[Any]) -> list[rr.TimeColumn]:
+        steps = log_time.astype(np.int64) // schema.STEP_NANOSECONDS
+        self._last = max(self._last, int(steps.max(initial=0)))
+        return [
+            rr.TimeColumn("step", sequence=steps),
+            rr.TimeColumn("episode", sequence=episode.astype(np.int64)),
+        ]
 
 
 class _Grid:
@@ -349,13 +368,6 @@ def _frame(phase: str) -> schema.Topic:
     return schema.TRAIN_FRAME if phase == "train" else schema.EVAL_FRAME
 
 
-def _times(log_time: NDArray[Any], episode: NDArray[Any]) -> list[rr.TimeColumn]:
-    return [
-        rr.TimeColumn("step", sequence=log_time.astype(np.int64) // schema.STEP_NANOSECONDS),
-        rr.TimeColumn("episode", sequence=episode.astype(np.int64)),
-    ]
-
-
 def _column(steps: NDArray[np.void], path: tuple[str, ...]) -> NDArray[np.float64]:
     """Return the numbers of a leaf, [n, numbers]."""
     column: NDArray[Any] = steps
@@ -369,12 +381,11 @@ def _entity(name: str) -> str:
     return re.sub(r"[^\w.-]+", "_", name)[:80] or "_"
 
 
-def _series(root: str, name: str, parts: Sequence[str]) -> Any:
-    return rrb.TimeSeriesView(
-        origin=f"{root}/", contents=[f"{root}/{part}" for part in parts], name=name.replace("_", " ")
-    )
+def _series(root: str, name: str, parts: Sequence[str], axis: rrb.TimeAxis) -> Any:
+    contents = [f"{root}/{part}" for part in parts]
+    return rrb.TimeSeriesView(origin=f"{root}/", contents=contents, name=name.replace("_", " "), axis_x=axis)
 
 
 def _dress(phase: str, names: Sequence[str]) -> rr.SeriesLines:
-    """Return how lines look."""
-    return rr.SeriesLines(names=names, colors=[rgb(colour) for colour in line_colours(phase, len(names))])
+    """Return how the lines of a phase look; a view has those of both phases."""
+    return series_lines(names, phase_colours(phase, len(names)))

@@ -10,23 +10,16 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.export.rerun.events import evaluation_texts, send_text
-from runner.export.rerun.scene import rgb
+from runner.export.rerun.lines import palette, phase_colours, series_lines
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.words import spoken
 
-TRAIN_COLOUR: Final = "#E69F00"
-EVAL_COLOUR: Final = "#0072B2"
-COLOURS: Final = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
+SCHEDULES: Final = ("epsilon", "step_size", "discount")
+_ONE_PHASE: Final = ("filled_percent", "reward_percent", "events", "episodes")
+"""Metrics of several lines whose view has one phase alone."""
 
 Rows = list[dict[str, Any]]
-
-
-def line_colours(phase: str, count: int) -> list[str]:
-    """Return the colours of the lines of a plot: one has its phase's, of several no two are alike."""
-    if count == 1:
-        return [TRAIN_COLOUR if phase == "train" else EVAL_COLOUR]
-    return [COLOURS[i % len(COLOURS)] for i in range(count)]
 
 
 class MetricWriter:
@@ -37,7 +30,7 @@ class MetricWriter:
         root: entity path of the run; empty for the root.
         learners: their names.
         event_names: of the environment.
-        tint: colour of all its lines, where runs are compared.
+        tint: the colour whose shades its lines have, where runs are compared.
         label: name of the run, where runs are compared.
     """
 
@@ -65,7 +58,7 @@ class MetricWriter:
         self._series("train/metrics/episode_length", rows, [[r["mean_length"]] for r in rows], ["training"])
         filled = [name if len(self._learners) > 1 else "filled" for name in self._learners]
         self._series("train/metrics/filled_percent", rows, [r["percent_filled"] for r in rows], filled)
-        for name in ("epsilon", "step_size", "discount"):
+        for name in SCHEDULES:
             self._series(f"train/metrics/{name}", rows, [[r[name]] for r in rows], [name.replace("_", " ")])
 
     def rewards(self, rows: Rows, known: Sequence[float]) -> None:
@@ -175,16 +168,17 @@ class MetricWriter:
         self._stream.send_columns(whole, [rr.TimeColumn(t, sequence=at) for t, at in times.items()], columns)
 
     def _style(self, path: str, names: Sequence[str]) -> Any:
-        trained = path.startswith("train/")
-        colours = line_colours("train" if trained else "eval", len(names))
-        if self._tint:
-            colours = [self._tint] * len(names)
-        width = 1.2 if trained else 2.2
-        return rr.SeriesLines(
-            names=[self._label + name for name in names],
-            colors=[rgb(c) for c in colours],
-            widths=[width] * len(names),
-        )
+        phase, name = path.split("/", maxsplit=1)[0], path.rsplit("/", maxsplit=1)[-1]
+        if name in SCHEDULES:
+            colours = [palette(1 + len(SCHEDULES), self._tint)[1 + SCHEDULES.index(name)]]
+        elif name in _ONE_PHASE and len(names) > 1:
+            colours = palette(len(names), self._tint)
+        else:
+            colours = phase_colours(phase, len(names), self._tint)
+        width = 1.2 if phase == "train" else 2.2
+        if name in SCHEDULES:  # one over the other where their values are equal
+            width = 3.0 - SCHEDULES.index(name)
+        return series_lines([self._label + name for name in names], colours, width)
 
 
 def send_metrics(writer: MetricWriter, recording: Recording) -> None:

@@ -15,6 +15,7 @@ from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, scalars
 from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
+from runner.export.rerun.lines import phase_colours, series_lines
 from runner.export.rerun.maps import MapWriter
 from runner.export.rerun.scene import Marks, Scene
 from runner.export.rerun.values import ValueWriter
@@ -49,7 +50,11 @@ class StepWriter(Sender):
     def dress(self) -> None:
         """Log what never changes."""
         names = [f"reward {spoken(learner)}" for learner in self._learners]
-        self.static("reward", rr.SeriesLines(names=names))
+        self.static("reward", series_lines(names, phase_colours(self._phase, len(names))))
+        if not self._grid:
+            for k, name in enumerate(("state", "action")):
+                colours = phase_colours(self._phase, 2)[k : k + 1]
+                self.static(name, series_lines([f"{name} ({self._phase})"], colours))
         self._values.dress()
         if self._grid:
             self._grid.dress()

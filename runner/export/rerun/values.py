@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, StepValues, instances, rgba, scalars, strips
+from runner.export.rerun.lines import series_lines
 from runner.export.rerun.scene import INK, MOVER_COLOURS, own_actions
 from runner.mdp import Mdp
 from runner.words import numbered_actions, spoken
@@ -58,7 +59,7 @@ class ValueWriter(Sender):
             "q",
             rr.LineStrips2D.from_fields(colors=bars, radii=0.22),
             rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=40.0),
-            rr.SeriesLines(names=series),
+            series_lines(series),
         )
 
     def write(self, batch: Batch) -> None:

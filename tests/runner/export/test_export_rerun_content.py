@@ -6,9 +6,12 @@ import subprocess
 
 import numpy as np
 import pytest
+import rerun as rr
 from rerun.chunk import RrdReader
 
 from runner.analysis.outcomes import events_of
+from runner.export.rerun.cache import TINTS
+from runner.export.rerun.layout import PLOTS
 from runner.export.rerun.scene import marks_of, own_actions, scene_of
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import viewer_program
@@ -234,3 +237,51 @@ def test_own_actions_make_up_the_joint_one(exported):
     assert np.array_equal(
         np.ravel_multi_index(tuple(own_actions(mdp).T), mdp.action_counts), np.arange(mdp.joint_actions)
     )
+
+
+def static_parts(path):
+    """Return the static components of each entity of an export that draws lines."""
+    parts = {}
+    for chunk in RrdReader(str(path)).store().stream().to_chunks():
+        batch = chunk.to_record_batch()
+        if chunk.is_static and "SeriesLines:names" in batch.schema.names:
+            columns = {name: batch.column(name)[0].as_py() for name in batch.schema.names if ":" in name}
+            parts[str(chunk.entity_path)] = columns
+    return parts
+
+
+def scalar_entities(path):
+    chunks = RrdReader(str(path)).store().stream().to_chunks()
+    return {
+        str(chunk.entity_path)
+        for chunk in chunks
+        if not chunk.is_static and "Scalars:scalars" in chunk.to_record_batch().schema.names
+    }
+
+
+def check_lines(path, views):
+    """Assert that no line shows an average, and that a view has no two lines of one colour."""
+    lines = static_parts(path)
+    assert scalar_entities(path) <= set(lines)
+    minmax = rr.components.AggregationPolicy.MinMax.value
+    assert all(part["SeriesLines:aggregation_policy"] == [minmax] for part in lines.values())
+    for entities in views:
+        colours = [
+            colour for name in entities for colour in lines.get(name, {}).get("SeriesLines:colors", [])
+        ]
+        assert len(set(colours)) == len(colours), entities
+
+
+def test_lines_show_values_that_occurred_each_in_its_own_colour(exported):
+    check_lines(exported.path, [[f"/{path}" for path in paths] for _, paths in PLOTS])
+
+
+def test_lines_of_two_runs_differ_in_colour(pictured, tmp_path):
+    with (
+        open_recording(pictured("taxis").recording) as a,
+        open_recording(pictured("rivals").recording) as b,
+    ):
+        sources = [Source(a, "A", "/a", TINTS[0]), Source(b, "B", "/b", TINTS[1])]
+        export(sources, Request(), tmp_path / "both.rrd")
+    views = [[f"/{run}/{path}" for run in "ab" for path in paths] for _, paths in PLOTS]
+    check_lines(tmp_path / "both.rrd", views)

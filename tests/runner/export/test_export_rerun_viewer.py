@@ -15,11 +15,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from rerun.chunk import RrdReader
 
+from runner.cli import cli, progress
 from runner.errors import RunnerError, StorageError
 from runner.export.rerun import live as live_view
-from runner.export.rerun import viewer
+from runner.export.rerun import viewer, writing
 from runner.export.rerun.cache import exported
 from runner.export.rerun.live import LiveView
 from runner.export.rerun.selection import Request
@@ -104,6 +106,32 @@ def test_a_screenshot_is_kept_whole_or_its_place_is_told(monkeypatch, tmp_path):
     assert picture.read_bytes() == b"drawn"
     with pytest.raises(StorageError, match="cannot be written"):
         viewer.screenshot(tmp_path / "a.rrd", 0, tmp_path / "missing" / "step.png")
+
+
+@pytest.mark.parametrize("size", ["foo", "1600", "1600x", "0x900", "1600x99999", "-5x900", "1600x900x2"])
+def test_a_size_that_cannot_be_drawn_is_refused_before_anything_is_exported(pictured, monkeypatch, size):
+    monkeypatch.setattr(writing, "export", lambda *_: pytest.fail("exported"))
+    words = ["view", str(pictured("taxis").folder), "--screenshot", "step.png", "--size", size]
+    done = CliRunner().invoke(cli, words)
+    assert done.exit_code == 2
+    assert f"found '{size}', expected WIDTHxHEIGHT" in done.stderr
+
+
+@pytest.mark.parametrize(("names", "stages"), [(1, []), (2, ["comparing the runs"])])
+def test_what_view_is_doing_is_shown_on_a_terminal(pictured, monkeypatch, names, stages):
+    shown = []
+
+    @contextlib.contextmanager
+    def stage_line(stage):
+        shown.append(stage)
+        yield shown.append
+
+    monkeypatch.setattr(progress, "stage_line", stage_line)
+    monkeypatch.setattr(viewer, "screenshot", lambda *_: None)
+    runs = [str(pictured(world).folder) for world in ("taxis", "rivals")[:names]]
+    done = CliRunner().invoke(cli, ["view", *runs, "--screenshot", "step.png", "--force"])
+    assert done.exit_code == 0, done.output
+    assert shown == ["loading Rerun", *stages, "exporting", "drawing"]
 
 
 def test_the_web_viewer_ends_with_the_command(pictured):

@@ -451,6 +451,7 @@ def test_rerun_gets_what_a_loop_recorded(folder, name, tmp_path):
         (static,) = [chunk.to_record_batch() for chunk in chunks if chunk.is_static]
         colours = static.column("SeriesLines:colors")[0].as_py()
         assert len(set(colours)) == len(colours) == 4, "no two lines look alike"
+        assert static.column("SeriesLines:aggregation_policy")[0].as_py() == [5], "lowest and highest"
 
 
 def test_rerun_gets_a_loop_of_a_single_step_and_episode(tmp_path):
