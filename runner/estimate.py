@@ -30,8 +30,10 @@ OTHER_BYTES: Final = 2
 
 @dataclass(frozen=True)
 class Estimate:
-    """Steps and bytes of one run."""
+    """Evaluations, snapshots, steps and bytes of one run."""
 
+    evaluations: int
+    snapshots: int
     typical_steps: int
     typical_bytes: int
     most_steps: int
@@ -40,16 +42,22 @@ class Estimate:
 
 def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
     """Return the estimate of one seed of an experiment; `step_limit` of its environment must not be 0."""
-    trials = 0
+    evaluations = trials = 0
     if config.evaluation is not None:
-        evaluations = -(-config.episodes // config.evaluation.every) + 1
+        evaluations = _occasions(config.episodes, config.evaluation.every)
         trials = evaluations * config.evaluation.trials
+    snapshots = _occasions(config.episodes, config.snapshots.every or config.episodes)
     learns = config.algorithm != "random"
     clumsy = min(config.episodes, CLUMSY_EPISODES) if learns else config.episodes
     typical = round(step_limit * (CLUMSY * (clumsy + trials) + SKILLED * (config.episodes - clumsy)))
     most = step_limit * (config.episodes + trials)
     rate = bytes_a_step(config)
-    return Estimate(typical, typical * rate, most, most * rate)
+    return Estimate(evaluations, snapshots, typical, typical * rate, most, most * rate)
+
+
+def _occasions(episodes: int, every: int) -> int:
+    """Return how often something is done before training, after every so many episodes, and at the end."""
+    return -(-episodes // every) + 1
 
 
 def bytes_a_step(config: ExperimentConfig) -> int:

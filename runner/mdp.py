@@ -177,57 +177,94 @@ def check_mdp(mdp: Mdp) -> None:
     One expectation relies on those before it.
     """
     with np.errstate(all="ignore"):
-        for expectations in (_said_right(mdp), _arrays_right(mdp)):
-            for expectation, holds in expectations:
+        for expectations in (_descriptions_right(mdp), _arrays_right(mdp)):
+            for expectation, holds, found in expectations:
                 if not holds:
-                    raise EnvironmentNotUsable(f"environment {mdp.env_id!r}: {expectation}; found otherwise.")
+                    raise EnvironmentNotUsable(
+                        f"environment {mdp.env_id!r}: {expectation}; found {_in_words(found)}."
+                    )
     mistake = scene_mistake(mdp.scene, mdp.scene_cells, mdp.scene_carriers, mdp.states)
     if mistake is not None:
-        raise EnvironmentNotUsable(f"environment {mdp.env_id!r}: {mistake}; found otherwise.")
+        raise EnvironmentNotUsable(f"environment {mdp.env_id!r}: {mistake}.")
 
 
-def _said_right(mdp: Mdp) -> Iterator[tuple[str, bool]]:
-    """Yield what must hold of what is said beside the arrays, and whether it does."""
-    yield "an id must be text", is_text(mdp.env_id)
-    yield "kwargs must be a mapping", isinstance(mdp.kwargs, Mapping)
-    yield f"1 to {MAX_AGENTS} agents", 1 <= len(mdp.agents) <= MAX_AGENTS
-    yield "an agent has a name", all(map(is_text, mdp.agents))
-    yield "each agent needs a number of actions", len(mdp.agents) == len(mdp.action_counts)
-    yield "each agent needs at least one action", all(is_whole(n, 1, 2**31) for n in mdp.action_counts)
-    yield f"at most {MAX_EVENTS} events", len(mdp.event_names) <= MAX_EVENTS
-    yield "an event has a name of its own", _distinct(mdp.event_names)
-    yield (
-        "success events must be events",
-        _distinct(mdp.success_events) and (set(mdp.success_events) <= set(mdp.event_names)),
-    )
-    yield "penalty_below must be a number", isinstance(mdp.penalty_below, int | float)
-    yield "the step limit must be a number from 0", is_whole(mdp.step_limit, 0, 2**31 - 1)
+def _descriptions_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
+    """Yield what must hold of all but the arrays, whether it does, and what was found."""
+    agents, counts, events = mdp.agents, mdp.action_counts, mdp.event_names
+    yield "an id must be text", is_text(mdp.env_id), mdp.env_id
+    yield "kwargs must be a mapping", isinstance(mdp.kwargs, Mapping), mdp.kwargs
+    yield f"1 to {MAX_AGENTS} agents", 1 <= len(agents) <= MAX_AGENTS, len(agents)
+    yield "an agent has a name", all(map(is_text, agents)), agents
+    yield "each agent needs a number of actions", len(agents) == len(counts), counts
+    yield "each agent needs at least one action", all(is_whole(n, 1, 2**31) for n in counts), counts
+    yield f"at most {MAX_EVENTS} events", len(events) <= MAX_EVENTS, len(events)
+    yield "an event has a name of its own", _distinct(events), events
+    successes = mdp.success_events
+    known = _distinct(successes) and set(successes) <= set(events)
+    yield f"success events must be some of the events {events}", known, successes
+    penalty = mdp.penalty_below
+    yield "penalty_below must be a number", isinstance(penalty, int | float), penalty
+    limit = mdp.step_limit
+    yield "the step limit must be a number from 0", is_whole(limit, 0, 2**31 - 1), limit
 
 
-def _arrays_right(mdp: Mdp) -> Iterator[tuple[str, bool]]:
-    """Yield what must hold of the arrays, and whether it does."""
+def _arrays_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
+    """Yield what must hold of the arrays, whether it does, and what was found."""
     for name, kind in _DTYPES.items():
         array = getattr(mdp, name)
-        yield f"{name} must be an array of {np.dtype(kind)}", _is_array(array, kind)
+        yield f"{name} must be an array of {np.dtype(kind)}", _is_array(array, kind), array
     shape, size = mdp.next_state.shape, sum(array.nbytes for array in mdp.arrays().values())
-    yield f"its arrays may take {MAX_ARRAYS_BYTES:,} bytes, to be recorded", size <= MAX_ARRAYS_BYTES
-    yield "next_state must have three axes", mdp.next_state.ndim == 3 and mdp.next_state.size > 0
-    yield "next_state must name states", _within(mdp.next_state, 0, shape[0])
-    yield "shapes must agree", mdp.probability.shape == mdp.terminated.shape == mdp.events.shape == shape
+    limit = f"its arrays may take {MAX_ARRAYS_BYTES:,} bytes, to be recorded"
+    yield limit, size <= MAX_ARRAYS_BYTES, f"{size:,}"
+    three = mdp.next_state.ndim == 3 and mdp.next_state.size > 0
+    yield "next_state must have three axes", three, mdp.next_state
+    states = f"next_state must name states, 0 to {shape[0] - 1}"
+    yield states, _within(mdp.next_state, 0, shape[0]), lambda: _range(mdp.next_state)
+    others = {name: getattr(mdp, name).shape for name in ("probability", "terminated", "events")}
+    alike = all(other == shape for other in others.values())
+    yield f"shapes must agree with next_state's, {shape}", alike, others
     stray = mdp.events >> np.uint32(len(mdp.event_names))
-    yield "events must have no other bits than there are names", not stray.any()
-    yield "rewards must add one axis", mdp.rewards.ndim == 4 and mdp.rewards.shape[:-1] == shape
-    yield "rewards must be one, or one an agent", mdp.rewards.shape[-1] in (1, len(mdp.agents))
-    yield "rewards must be finite", bool(np.isfinite(mdp.rewards).all())
-    yield "probabilities of a pair must add up to 1", _sums_to_one(mdp.probability)
+    bits = f"events must have no other bits than the {len(mdp.event_names)} that have names"
+    yield bits, not stray.any(), lambda: hex(int(mdp.events.max()))
+    adds = mdp.rewards.ndim == 4 and mdp.rewards.shape[:-1] == shape
+    yield f"rewards must add one axis to next_state's, {shape}", adds, mdp.rewards
+    each = mdp.rewards.shape[-1] in (1, len(mdp.agents))
+    yield f"rewards must be 1, or one for each of the {len(mdp.agents)} agents", each, mdp.rewards.shape[-1]
+    finite = np.isfinite(mdp.rewards)
+    yield "rewards must be finite", bool(finite.all()), lambda: str(mdp.rewards[~finite][0])
+    sums = "probabilities of a pair must be from 0 on and add up to 1"
+    yield sums, _sums_to_one(mdp.probability), lambda: _sums(mdp.probability)
     distribution = mdp.start.shape == shape[:1] and _sums_to_one(mdp.start)
-    yield "start must be a distribution over states", distribution
-    yield "the agents' actions must make the joint actions", math.prod(mdp.action_counts) == shape[1]
-    same = mdp.scene_cells is None or mdp.scene_carriers is None or _rows(mdp.scene_cells) == shape[0]
-    yield (
-        "the scene's arrays must have a row a state",
-        same and (_rows(mdp.scene_cells) == _rows(mdp.scene_carriers)),
-    )
+    start = f"start must be a distribution over the {shape[0]} states"
+    yield start, distribution, lambda: _sums(mdp.start) if mdp.start.shape == shape[:1] else mdp.start
+    joint = math.prod(mdp.action_counts)
+    yield f"the agents' actions must make the {shape[1]} joint actions", joint == shape[1], joint
+    rows = [_rows(mdp.scene_cells), _rows(mdp.scene_carriers)]
+    same = mdp.scene_cells is None or mdp.scene_carriers is None or rows[0] == shape[0]
+    fits = same and rows[0] == rows[1]
+    yield f"each of the scene's arrays must have a row for each of the {shape[0]} states", fits, rows
+
+
+def _in_words(found: Any) -> str:
+    """Return what was found, or what a function gives, as a message can hold it: arrays by type and shape."""
+    if callable(found):
+        found = found()
+    if isinstance(found, np.ndarray):
+        return f"an array of {found.dtype}, shape {found.shape}"
+    if isinstance(found, str):
+        return found[:100]
+    return f"{found!r:.100}"
+
+
+def _range(values: NDArray[Any]) -> str:
+    return f"{values.min()} to {values.max()}" if values.size else "none"
+
+
+def _sums(probability: NDArray[np.float64]) -> str:
+    """Return the lowest value, and the sums along the last axis, in words."""
+    if not probability.size:
+        return "none"
+    return f"values from {probability.min():g} on, sums {_range(probability.sum(axis=-1))}"
 
 
 def _distinct(names: tuple[Any, ...]) -> bool:

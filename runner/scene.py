@@ -43,12 +43,16 @@ def scene_mistake(
         states: S.
     """
     if scene is None:
-        return None if cells is None and carriers is None else "the scene's arrays need a scene"
+        return None if cells is None and carriers is None else "the scene's arrays need a scene; found none"
     if not isinstance(scene, Mapping) or not set(scene) >= _KEYS:
-        return f"a scene must have {', '.join(sorted(_KEYS))}"
+        keys = ", ".join(sorted(map(str, scene))) if isinstance(scene, Mapping) else f"{scene!r}"
+        return f"a scene must have {', '.join(sorted(_KEYS))}; found {keys:.100}"
     rows, columns = scene["rows"], scene["columns"]
     if not is_whole(rows, 1, MAX_CELLS) or not is_whole(columns, 1, MAX_CELLS) or rows * columns > MAX_CELLS:
-        return f"a scene has rows and columns, and at most {MAX_CELLS:,} cells"
+        return (
+            f"a scene has rows and columns, and at most {MAX_CELLS:,} cells; "
+            f"found {rows!r:.40} rows and {columns!r:.40} columns"
+        )
 
     def is_cell(value: Any) -> bool:
         return _is_pair(value) and is_whole(value[0], 0, rows - 1) and is_whole(value[1], 0, columns - 1)
@@ -60,8 +64,11 @@ def scene_mistake(
         "actions": (_is_action, "a name, and a move or none"),
     }
     for key, (is_one, what) in expected.items():
-        if not isinstance(scene[key], list | tuple) or not all(map(is_one, scene[key])):
-            return f"each of the scene's {key} needs {what}"
+        if not isinstance(scene[key], list | tuple):
+            return f"the scene's {key} must be a list; found {scene[key]!r:.100}"
+        for one in scene[key]:
+            if not is_one(one):
+                return f"each of the scene's {key} needs {what}; found {one!r:.100}"
     things = len(scene["things"])
     return _array_mistake("cells", cells, np.int16, (states, things), (0, rows * columns - 1)) or (
         _array_mistake("carriers", carriers, np.int8, (states, things), (-1, things - 1))
@@ -74,9 +81,9 @@ def _array_mistake(
     if array is None:
         return None
     if array.dtype != kind or array.shape != shape:
-        return f"scene_{name} must be of {np.dtype(kind)} and [states, things]"
+        return f"scene_{name} must be {np.dtype(kind)} {shape}; found {array.dtype} {array.shape}"
     if array.size and not bounds[0] <= int(array.min()) <= int(array.max()) <= bounds[1]:
-        return f"scene_{name} must be from {bounds[0]} to {bounds[1]}"
+        return f"scene_{name} must be from {bounds[0]} to {bounds[1]}; found {array.min()} to {array.max()}"
     return None
 
 

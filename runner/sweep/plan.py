@@ -11,7 +11,7 @@ from runner.amounts import size
 from runner.config import ConfigError, ExperimentConfig, from_mapping
 from runner.environments import load_mdp
 from runner.errors import StorageError
-from runner.estimate import bytes_a_step, free_bytes
+from runner.estimate import estimate, free_bytes
 from runner.execution import run_job
 from runner.job import Job
 from runner.mdp import Mdp
@@ -25,8 +25,6 @@ from runner.sweep.trials import Room, Standing
 
 BYTES_AN_EPISODE: Final = 40
 BYTES_AN_EVALUATION: Final = 1500
-TYPICAL_LENGTH: Final = 0.1
-"""Of a training episode, as a share of the step limit."""
 TABLE_SHARE: Final = 0.75
 """What a learned table keeps of its bytes when it is compressed."""
 
@@ -90,17 +88,13 @@ def _growth(config: ExperimentConfig, mdp: Mdp) -> int:
     """Return about how many bytes all that one episode does not show will take."""
     counts = (mdp.joint_actions,) if config.tables == "joint" else mdp.action_counts
     table = mdp.states * sum(counts) * 8
-    snapshots = 1 + (config.episodes // config.snapshots.every if config.snapshots.every else 0)
-    evaluations, trials = 0, 0
-    if config.evaluation is not None:
-        evaluations = config.episodes // config.evaluation.every + 1
-        trials = evaluations * config.evaluation.trials
-    steps = mdp.step_limit * TYPICAL_LENGTH * (config.episodes + trials)
+    one = estimate(config, mdp.step_limit)
+    trials = one.evaluations * (config.evaluation.trials if config.evaluation else 0)
     return round(
-        snapshots * table * TABLE_SHARE
+        one.snapshots * table * TABLE_SHARE
         + (config.episodes + trials) * BYTES_AN_EPISODE
-        + evaluations * BYTES_AN_EVALUATION
-        + (steps * bytes_a_step(config) if config.recording.steps == "all" else 0)
+        + one.evaluations * BYTES_AN_EVALUATION
+        + (one.typical_bytes if config.recording.steps == "all" else 0)
     )
 
 

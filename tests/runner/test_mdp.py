@@ -242,6 +242,31 @@ def test_arrays_that_contradict_each_other_are_refused(case, lake):
         from_parts(broken.description(), broken.arrays())
 
 
+@pytest.mark.parametrize(
+    ("case", "found"),
+    [
+        ("a state too many", r"name states, 0 to 15; found 0 to 16\."),
+        ("two axes", r"three axes; found an array of int32, shape \(16, 4\)\."),
+        ("a probability of 2", r"add up to 1; found values from 0 on, sums 1\.0 to "),
+        ("reward infinite", r"finite; found inf\."),
+        ("an unnamed success", r"some of the events \(\); found \('goal',\)\."),
+        ("an agent without actions", r"found \(4,\)\."),
+        ("too many events", r"at most 31 events; found 32\."),
+        ("a negative step limit", r"from 0; found -1\."),
+        ("no agents", r"1 to \d+ agents; found 0\."),
+    ],
+)
+def test_it_is_said_what_was_found(case, found, lake):
+    broken = replace(lake, **CONTRADICTIONS[case](lake))
+    with pytest.raises(EnvironmentNotUsable, match=found):
+        from_parts(broken.description(), broken.arrays())
+
+
+def test_it_is_said_what_is_wrong_with_a_scene(lake):
+    with pytest.raises(EnvironmentNotUsable, match=r"a scene must have .*; found rows\."):
+        from_parts(lake.description() | {"scene": {"rows": 3}}, lake.arrays())
+
+
 anything = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**20), 10**20) | st.floats() | st.text(max_size=3),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
