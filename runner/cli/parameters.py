@@ -11,25 +11,6 @@ from click.shell_completion import CompletionItem
 from runner.errors import RunnerError
 
 
-class PictureSize(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
-    """Width and height of a picture in pixels, such as `1600x900`; given as that text."""
-
-    name = "size"
-    LIMITS: ClassVar = range(100, 8193)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the size if it is one that the viewer can draw."""
-        parts = str(value).split("x")
-        if len(parts) != 2 or not all(p.isascii() and p.isdigit() and int(p) in self.LIMITS for p in parts):
-            self.fail(
-                f"found {value!r}, expected WIDTHxHEIGHT in pixels, each {self.LIMITS.start} to "
-                f"{self.LIMITS.stop - 1}, such as 1600x900.",
-                param,
-                ctx,
-            )
-        return str(value)
-
-
 class RunName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
     """The name of a run; completes ids and names."""
 
