@@ -31,6 +31,7 @@ from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.consistency import Findings, Inconsistent, check_phase
+from runner.recording.contents import Report as BytesReport
 from runner.recording.digest import ContentHash
 from runner.recording.integrity import check_integrity, checked_survey, may_be_cut
 from runner.recording.past import Past
@@ -70,24 +71,40 @@ class Verification:
         return not self.finding
 
 
-def verify(path: Path, rerun: bool = False, report: Report = lambda _: None) -> Verification:
+def damage_of(path: Path, report: BytesReport = lambda *_: None) -> str:
+    """Return the first thing that is wrong with a recording's bytes; empty if nothing is.
+
+    Args:
+        path: the recording.
+        report: called with the bytes that were checked, and those of the file.
+
+    Raises:
+        RecordingError: there is no such file, or it is no recording of ours.
+    """
+    refuse_foreign(path)
+    try:
+        check_integrity(path, report)
+    except RecordingError as error:
+        return str(error)
+    return ""
+
+
+def verify(
+    path: Path, rerun: bool = False, report: Report = lambda _: None, damage: str | None = None
+) -> Verification:
     """Verify a recording.
 
     Args:
         path: the recording.
         rerun: compare with the installed environment's job instead of the recorded environment's.
         report: called with the progress a few times a second.
+        damage: what `damage_of` found, if it was called before; else it is called here.
 
     Raises:
         RecordingError: there is no such file, or it is no recording of ours.
         EnvironmentNotUsable: the environment is not installed, for a rerun.
     """
-    refuse_foreign(path)
-    damage = ""
-    try:
-        check_integrity(path)
-    except RecordingError as error:
-        damage = str(error)
+    damage = damage_of(path) if damage is None else damage
     try:
         with open_recording(path) as recording:
             found = _lost(recording) or _compare(recording, rerun, report)
@@ -107,8 +124,11 @@ def verify(path: Path, rerun: bool = False, report: Report = lambda _: None) -> 
 
 def _holds_nothing_yet(path: Path) -> bool:
     """Return whether a recording is cut off before its first messages, and good as far as it goes."""
-    contents = checked_survey(path)
-    return not contents.chunks and may_be_cut(path, contents)
+    try:
+        contents = checked_survey(path)
+        return not contents.chunks and may_be_cut(path, contents)
+    except RecordingError:
+        return False
 
 
 def refuse_foreign(path: Path) -> None:

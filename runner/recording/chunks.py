@@ -20,12 +20,16 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.schema import Topic
+from runner.recording.schema import ALL_BLOCK_TOPICS, TOPIC_OF, Topic
 
 MAX_CHUNK_BYTES: Final = 64 << 20
 """The largest chunk that is read, packed or unpacked; the recorder's are below 16 MiB."""
+_PLAIN_BYTES: Final = 4 << 20
+"""Chunks of up to this size are unpacked without a look at their first message."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, size unpacked, its CRC, and the length of the name of the compression."""
+MAX_CHUNK_MESSAGES: Final = 1 << 16
+"""The most messages of one size that a chunk has: the largest `chunk_steps`."""
 _NAME_BYTES: Final = 4
 
 
@@ -167,10 +171,32 @@ def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes
     """
     view = memoryview(body)
     head = chunk_head(view, len(view), where)
+    if head.uncompressed_size > _PLAIN_BYTES:
+        _refuse_many(view, head, where)
     records = decompress(view[head.data_at :], head.compression, head.uncompressed_size, where)
     if zlib.crc32(records) != head.crc:
         raise RecordingError(f"{where}: its content does not match its checksum")
     return head, records
+
+
+def _refuse_many(body: memoryview, head: ChunkHead, where: str) -> None:
+    """Refuse a chunk that would hold more messages than any of ours, by its first message alone.
+
+    A few kilobytes can unpack to the largest chunk there is; thousands of them would keep a reader busy for
+    minutes before their messages were seen to make no sense.
+
+    Raises:
+        RecordingError: it is one, or holds no message.
+    """
+    beginning, _ = _unpack(body[head.data_at :], head.compression, MESSAGE_HEAD.size, where)
+    if len(beginning) < MESSAGE_HEAD.size:
+        raise RecordingError(f"{where}: holds no whole message")
+    _, length, channel, *_ = MESSAGE_HEAD.unpack(beginning[: MESSAGE_HEAD.size])
+    messages = head.uncompressed_size // (9 + length)
+    if TOPIC_OF.get(channel) in ALL_BLOCK_TOPICS and messages > MAX_CHUNK_MESSAGES:
+        raise RecordingError(
+            f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_MESSAGES:,} at most"
+        )
 
 
 def first_channel(body: bytes | memoryview, where: str) -> int:

@@ -23,12 +23,13 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD
-from runner.recording.chunks import MAX_CHUNK_BYTES, unpack_chunk
-from runner.recording.index import MAX_NAME_BYTES, MAX_NAMED
+from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head, unpack_chunk
+from runner.recording.index import MAX_NAME_BYTES, MAX_NAMED, refuse_exhausting
 
 MAX_METADATA_BYTES: Final = 4 << 20
 """The largest metadata record that is read, config and provenance among them."""
 _RESULT = "result"
+_CHUNK_HEAD_BYTES: Final = 60
 N = TypeVar("N", AttachmentIndex, MetadataIndex)
 UNREADABLE: Final = (struct.error, ValueError, KeyError, McapError)
 """What parsing damaged records raises."""
@@ -68,30 +69,61 @@ Check = Callable[[int, int, bytes, bytes], None]
 """Called with (opcode, offset, body, unpacked message records) of a good record; raises what it finds."""
 
 
-def survey(path: Path, keep_result: bool = False, check: Check = lambda *_: None) -> Contents:
+Report = Callable[[int, int], None]
+"""Called with the bytes that were read, and those of the file."""
+
+
+def survey(
+    path: Path,
+    keep_result: bool = False,
+    check: Check = lambda *_: None,
+    report: Report = lambda *_: None,
+) -> Contents:
     """Return what of a recording is good, from its beginning to the first record that is not.
 
     Args:
         path: the recording.
         keep_result: whether a `result` record counts; who goes on writing leaves it out and writes anew.
         check: looks at each record besides; what it raises ends the walk as damage does.
+        report: called after each record.
 
     Raises:
-        RecordingError: the file cannot be read.
+        RecordingError: the file cannot be read, or its chunks would exhaust whoever reads them.
     """
     try:
         with path.open("rb") as stream:
-            return _survey(stream, keep_result, check)
+            size = stream.seek(0, 2)
+            refuse_exhausting(size, _declared(stream, size, str(path)), str(path))
+            return _survey(stream, keep_result, check, report)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
 
 
-def _survey(stream: BinaryIO, keep_result: bool, check: Check) -> Contents:
+def _declared(stream: BinaryIO, size: int, path: str) -> int:
+    """Return how many bytes the chunks of a file declare to hold, up to a record that makes no sense."""
+    offset, declared = len(MCAP0_MAGIC), 0
+    while offset + 9 <= size:
+        stream.seek(offset)
+        head = stream.read(9 + _CHUNK_HEAD_BYTES)
+        opcode, length = RECORD_HEAD.unpack_from(head)
+        if length > min(size - offset - 9, MAX_CHUNK_BYTES) or not 1 <= opcode < Opcode.DATA_END:
+            break
+        if opcode == Opcode.CHUNK:
+            try:
+                declared += chunk_head(head[9:], length, path).uncompressed_size
+            except RecordingError:
+                break
+        offset += 9 + length
+    return declared
+
+
+def _survey(stream: BinaryIO, keep_result: bool, check: Check, report: Report) -> Contents:
     contents = Contents(size=stream.seek(0, 2))
     surveyor = _Surveyor(contents, keep_result, check)
     for opcode, at, body in walk(stream, contents.size):
         if opcode == Opcode.DATA_END:
             return contents
+        report(at, contents.size)
         try:
             surveyor.take(opcode, at, body)
         except RecordingError as error:

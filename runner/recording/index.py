@@ -157,9 +157,18 @@ def read_index(stream: BinaryIO, path: str) -> Index:
     if not index.channels:
         raise RecordingError(f"{path}: the recording was cut off before its first message.")
     unpacked = int(index.chunks.columns["uncompressed_size"].sum(dtype=np.uint64)) if index.chunks else 0
+    refuse_exhausting(size, unpacked, path)
+    return index
+
+
+def refuse_exhausting(size: int, unpacked: int, path: str) -> None:
+    """Refuse a file whose chunks declare to hold far more than any recording of its size does.
+
+    Raises:
+        RecordingError: it is one.
+    """
     if unpacked > size * UNPACKED_A_BYTE + _UNPACKED_ANYWAY:
         raise RecordingError(f"{path}: {size:,} bytes declare to hold {unpacked:,}; made to exhaust memory.")
-    return index
 
 
 def checksum(stream: BinaryIO, start: int, end: int) -> int:

@@ -21,7 +21,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER, HEADER_BYTES, RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head, message_index
-from runner.recording.contents import Contents, read_chunk, survey
+from runner.recording.contents import Contents, Report, read_chunk, survey
 from runner.recording.writer import RecordingFile, schema_and_channel_bytes
 
 Times = NDArray[np.uint64]
@@ -33,8 +33,12 @@ def _beginnings() -> tuple[bytes, ...]:
     return tuple(schema_and_channel_bytes(topics) for topics in schema.KINDS.values())
 
 
-def check_integrity(path: Path) -> None:
+def check_integrity(path: Path, report: Report = lambda *_: None) -> None:
     """Check every byte of a finished recording.
+
+    Args:
+        path: the recording.
+        report: called with the bytes that were checked, and those of the file.
 
     Raises:
         RecordingError: something is wrong; the first such thing is named with its offset.
@@ -42,7 +46,7 @@ def check_integrity(path: Path) -> None:
     try:
         with path.open("rb") as stream:
             _check_beginning(stream, path)
-        contents = survey(path, keep_result=True, check=_IndexCheck(path).take)
+        contents = survey(path, keep_result=True, check=_IndexCheck(path).take, report=report)
         if contents.reason:
             raise RecordingError(
                 f"{path}: {contents.reason.removeprefix(f'{path}: ')}; `dualtaxi repair` mends it."

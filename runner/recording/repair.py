@@ -21,7 +21,7 @@ from mcap.opcode import Opcode
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
-from runner.recording.contents import asks_for_indexes, attachment_of, metadata_of, read_chunk
+from runner.recording.contents import Report, asks_for_indexes, attachment_of, metadata_of, read_chunk
 from runner.recording.facts import NEEDED, check_run, json_object, kind_of, sizes_of
 from runner.recording.integrity import check_integrity, places
 from runner.recording.reader import open_recording
@@ -59,21 +59,25 @@ class Repair:
         return not self.lost and not self.lost_bytes
 
 
-def repair(path: Path) -> Repair:
+def repair(path: Path, report: Report = lambda *_: None) -> Repair:
     """Make a recording whole; the file is not touched until its successor is complete and read back.
+
+    Args:
+        path: the recording.
+        report: called with the bytes that were read, and those of the file; it is read twice or thrice.
 
     Raises:
         RecordingError: it is no recording of ours, or what describes it is damaged.
         StorageError: there is no room for the new file, or the folder cannot be written.
     """
     with contextlib.suppress(RecordingError):
-        check_integrity(path)
+        check_integrity(path, report)
         return Repair(path, was_whole=True, lost=_lost_before(path))
     fresh = path.with_suffix(".repairing")
     try:
         fresh.unlink(missing_ok=True)
-        done = _salvaged(path, fresh)
-        _read_back(fresh, done)
+        done = _salvaged(path, fresh, report)
+        _read_back(fresh, done, report)
         if done.lost:
             done.original = _free_name(path)
             path.rename(done.original)
@@ -94,7 +98,7 @@ def _lost_before(path: Path) -> dict[str, list[list[int]]]:
     return {}
 
 
-def _salvaged(path: Path, fresh: Path) -> Repair:
+def _salvaged(path: Path, fresh: Path, report: Report) -> Repair:
     """Write what is good of a file into a new one."""
     try:
         stream = path.open("rb")
@@ -102,7 +106,7 @@ def _salvaged(path: Path, fresh: Path) -> Repair:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
     with stream:
         topics = schema.KINDS[_kind(DamagedFile(stream, path), path)]
-        return _Salvage(path, DamagedFile(stream, path), topics).write(fresh)
+        return _Salvage(path, DamagedFile(stream, path), topics).write(fresh, report)
 
 
 def _kind(file: DamagedFile, path: Path) -> str:
@@ -123,13 +127,13 @@ def _remove(fresh: Path) -> None:
         fresh.unlink(missing_ok=True)
 
 
-def _read_back(fresh: Path, done: Repair) -> None:
+def _read_back(fresh: Path, done: Repair, report: Report) -> None:
     """Compare every byte of the new file with what it should be, and count its messages.
 
     Raises:
         RecordingError: it is not what it should be; the old file stays.
     """
-    check_integrity(fresh)
+    check_integrity(fresh, report)
     with open_recording(fresh) as recording:
         for topic in recording.topics:
             if topic in recording.dtypes:
@@ -165,11 +169,11 @@ class _Salvage:
         self._counts: dict[str, int] = {}
         """Messages of each topic, as the result says."""
 
-    def write(self, fresh: Path) -> Repair:
+    def write(self, fresh: Path, report: Report) -> Repair:
         """Write a new file of what is good."""
         described = set()
         with RecordingFile(fresh, self._topics) as file:
-            for opcode, offset, body in self._damaged.good_records():
+            for opcode, offset, body in self._damaged.good_records(report):
                 if opcode == Opcode.METADATA:
                     name, entries = metadata_of(body)
                     described.add(name)

@@ -17,7 +17,7 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import RecordingError
 from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head
-from runner.recording.contents import UNREADABLE, attachment_of, metadata_of, read_chunk
+from runner.recording.contents import UNREADABLE, Report, attachment_of, metadata_of, read_chunk
 from runner.recording.index import IN_DATA
 
 _LIKE_A_CHUNK: Final = re.compile(
@@ -58,14 +58,18 @@ class DamagedFile:
         if (magic := self._read(0, len(MCAP0_MAGIC))) != MCAP0_MAGIC:
             raise RecordingError(f"{path}: found {magic!r} at its start, expected an MCAP file.")
 
-    def good_records(self) -> Iterator[tuple[int, int, bytes]]:
+    def good_records(self, report: Report = lambda *_: None) -> Iterator[tuple[int, int, bytes]]:
         """Yield (opcode, offset, body) of the records that can be read, past those that cannot.
+
+        Args:
+            report: called with the bytes that were read, and those of the file.
 
         Raises:
             RecordingError: too much looks like chunks and is none.
         """
         offset = len(MCAP0_MAGIC)
         while offset + 9 <= self.size:
+            report(offset, self.size)
             opcode, length = RECORD_HEAD.unpack(self._read(offset, 9))
             if (opcode, length) == (Opcode.DATA_END, 4):
                 return

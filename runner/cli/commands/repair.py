@@ -58,13 +58,14 @@ def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json:
       dualtaxi repair @latest
       dualtaxi repair backup/recording.mcap
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.progress import bytes_line
     from runner.recording.repair import repair
     from runner.verify import refuse_foreign
 
     path, run = recording_of(run_name, recordings)
     refuse_foreign(path)
-    with _kept(run):
-        done = repair(path)
+    with _kept(run), bytes_line("repairing") as report:
+        done = repair(path, report)
         if run is not None and done.lost:
             _tell_run(run)
     if as_json:

@@ -42,13 +42,16 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
       dualtaxi verify k3v9m2xq --rerun
       dualtaxi verify backup/recording.mcap --json
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.verify import verify
+    from runner.cli.progress import bytes_line
+    from runner.verify import damage_of, verify
 
     path, run = recording_of(run_name, recordings)
     refuse_running(run)
     episodes = (run.episodes_to_do or 0) if run else 0
+    with bytes_line("reading") as reading:
+        damage = damage_of(path, reading)
     with at_work("verifying", episodes) as (report, _):
-        found = verify(path, rerun, report)
+        found = verify(path, rerun, report, damage)
     if as_json:
         print_json(_as_json(found, rerun))
     else:

@@ -19,7 +19,9 @@ from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.facts import environment_said
 from runner.recording.integrity import check_integrity
+from runner.recording.repair import repair
 from runner.recording.rewriting import rewrite
+from runner.verify import verify
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
 CHUNK, MESSAGE_INDEX, DATA_END = 6, 7, 15
@@ -346,3 +348,29 @@ def _text(text: str) -> bytes:
 def _mapping(entries: dict[str, str]) -> bytes:
     body = b"".join(_text(key) + _text(value) for key, value in entries.items())
     return struct.pack("<I", len(body)) + body
+
+
+def bomb(data: bytes, messages: int, chunks: int) -> bytes:
+    """Return an unfinished recording of equal chunks, each of so many equal steps."""
+    start = next(start for opcode, start, _ in records_of(data) if opcode == CHUNK)
+    step = struct.pack("<BQHIQQ", 5, 22 + 60, 1, 0, 0, 0) + bytes(60)
+    body = zstandard.compress(step * messages)
+    head = struct.pack("<QQQII", 0, 0, len(step) * messages, zlib.crc32(step * messages), 4) + b"zstd"
+    chunk = head + struct.pack("<Q", len(body)) + body
+    return data[:start] + (struct.pack("<BQ", CHUNK, len(chunk)) + chunk) * chunks
+
+
+def test_chunks_of_more_messages_than_any_recorder_writes_are_refused_unpacked(lake, tmp_path):
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(bomb(lake.recording.read_bytes(), 700_000, 2))
+    with pytest.raises(RecordingError, match="declares 700,000 messages, expected 65,536 at most"):
+        check_integrity(path)
+    assert repair(path).kept.get("/train/step") is None
+
+
+def test_a_file_that_declares_to_hold_far_more_than_it_can_is_refused_before_it_is_unpacked(lake, tmp_path):
+    path = tmp_path / "bomb.mcap"
+    path.write_bytes(bomb(lake.recording.read_bytes(), 700_000, 100))
+    with pytest.raises(RecordingError, match="made to exhaust memory"):
+        check_integrity(path)
+    assert "made to exhaust memory" in verify(path).finding
