@@ -4,7 +4,7 @@
     places = drawing.places(mdp, states)              # int16 [frames, things, 3]: x, y, size in percent
     svg = drawing.frame(places[3], "step 3")
 
-This is the only place where a grid is drawn: film and notebook show these frames, and the page moves the
+This is the only place where a grid is drawn: the notebook shows these frames, and page and film move the
 very same elements to the places computed here. Lengths are in units of a hundredth of a cell. Colours
 are of Okabe and Ito, and nothing is told by colour alone: landmarks have letters, movers numbers.
 """
@@ -24,6 +24,8 @@ CELL: Final = 100
 MARGIN: Final = 14
 TRAIL: Final = 40
 """So many of a mover's last places are joined by its trail."""
+TRAIL_WIDTH: Final = 7
+TRAIL_OPACITY: Final = 0.55
 
 MOVER_COLOURS: Final = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7", "#F0E442", "#D55E00")
 _COLOUR_NAMES: Final = dict(
@@ -43,7 +45,8 @@ STYLE: Final = (
     ".g-person{fill:#22262b;stroke:#ffffff;stroke-width:3;paint-order:stroke}"
     ".g-ring{fill:none;stroke:#B0357F;stroke-width:6}.g-pole{stroke:#22262b;stroke-width:4;stroke-linecap:round}"
     ".g-flag{fill:#CC79A7;stroke:#22262b;stroke-width:2.5;stroke-linejoin:round}"
-    ".g-trail{fill:none;stroke-width:7;stroke-linecap:round;stroke-linejoin:round;opacity:.55}"
+    f".g-trail{{fill:none;stroke-width:{TRAIL_WIDTH};stroke-linecap:round;stroke-linejoin:round;"
+    f"opacity:{TRAIL_OPACITY:g}}}"
 )
 """The rules of a picture that stands alone; a page may override them for the dark."""
 
@@ -115,21 +118,21 @@ class Drawing:
     def trails(self, places: NDArray[np.int16] | None = None) -> str:
         """Return the trails of the movers over the frames so far, [frames, things, 3]."""
         return "".join(
-            f'<polyline class="g-trail" data-trail="{thing}" stroke="{self._colour(thing)}" '
+            f'<polyline class="g-trail" data-trail="{thing}" stroke="{self.colour(thing)}" '
             f'points="{"" if places is None else trail_points(places[:, thing])}"/>'
             for thing in self.movers
         )
 
+    def order(self) -> list[int]:
+        """Return the things in the order in which they are drawn: goals first, riders last."""
+        rank = {"goal": 0, "mover": 1}
+        return sorted(range(len(self._things)), key=lambda i: rank.get(self._things[i]["kind"], 2))
+
     def things(self, place: NDArray[np.int16]) -> str:
         """Return the things at their places [things, 3]; those that stand still are at the bottom."""
-        order = {"goal": 0, "mover": 2}
-        numbers = sorted(range(len(self._things)), key=lambda i: order.get(self._things[i]["kind"], 1))
-        numbers = [i for i in numbers if self._things[i]["kind"] in order] + [
-            i for i in numbers if self._things[i]["kind"] not in order
-        ]
         return "".join(
-            f'<g class="g-thing" data-thing="{i}" transform="{transform(place[i])}">{self._shape(i)}</g>'
-            for i in numbers
+            f'<g class="g-thing" data-thing="{i}" transform="{transform(place[i])}">{self.shape(i)}</g>'
+            for i in self.order()
         )
 
     def frame(
@@ -172,21 +175,23 @@ class Drawing:
 
     def _thing_in_words(self, thing: Mapping[str, Any]) -> str:
         if thing["kind"] == "mover":
-            return f"{_COLOUR_NAMES[self._colour(self._things.index(thing))]}: {thing['label']}"
+            return f"{_COLOUR_NAMES[self.colour(self._things.index(thing))]}: {thing['label']}"
         return f"{'frame with a flag' if thing['kind'] == 'goal' else 'black figure'}: {thing['label']}"
 
-    def _shape(self, number: int) -> str:
+    def shape(self, number: int) -> str:
+        """Return the elements of a thing, around the origin."""
         thing = self._things[number]
         if thing["kind"] == "goal":
             return _GOAL
         if thing["kind"] != "mover":
             return _PERSON
-        colour, label = self._colour(number), thing["label"]
+        colour, label = self.colour(number), thing["label"]
         sign = escape(label[-1] if label[-1].isdigit() else label[0].upper())
         pattern = _CAR if label.split()[0] in _DRIVEN else _PAWN
         return pattern.format(colour=colour, sign=sign if len(self.movers) > 1 else "")
 
-    def _colour(self, number: int) -> str:
+    def colour(self, number: int) -> str:
+        """Return the colour of a mover."""
         return MOVER_COLOURS[self.movers.index(number) % len(MOVER_COLOURS)]
 
 

@@ -9,6 +9,7 @@ import click
 from runner.cli.finding import find_recorded
 from runner.cli.options import episode_option, recordings_option, run_argument, trial_option
 from runner.cli.output import say, size
+from runner.cli.progress import counting
 
 
 @click.command("gif")
@@ -82,7 +83,7 @@ def command(
     from runner.recording.reader import open_recording
 
     require_packages()
-    said: list[int] = []
+    frames: list[int] = []
     with open_recording(find_recorded(run_name, recordings).recording) as recording:
         require_states(recording)
         require_steps(recording, "show")
@@ -94,9 +95,14 @@ def command(
         else:
             after, number = trial or replay.typical_trial(recording)
             shown = replay.trial(recording, after, number, steps)
-        write_new(output, force, lambda path: said.append(write_gif(path, recording, shown, speed, width)))
+        with counting("frames", shown.steps + 1) as progress:
+
+            def write(path: Path) -> None:
+                frames.append(write_gif(path, recording, shown, speed, width, progress))
+
+            write_new(output, force, write)
         for shortcoming in shortcomings(recording):
             say(shortcoming)
     if shown.steps < shown.length:
         say(f"Shown are the first {shown.steps:,} of {shown.length:,} steps; --steps shows more.")
-    click.echo(f"{output}: {shown.title}, {said[0]} frames, {size(output.stat().st_size)}")
+    click.echo(f"{output}: {shown.title}, {frames[0]} frames, {size(output.stat().st_size)}")
