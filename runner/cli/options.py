@@ -9,6 +9,9 @@ import click
 
 from runner.cli.parameters import ConfigName, RunName, TrialName
 
+EXPORTS: Final = Path("exports")
+"""Where commands write files unless -o says where; in a clone, Git ignores it."""
+
 run_argument: Final = click.argument("run_name", metavar="RUN", type=RunName())
 
 runs_argument: Final = click.argument("run_names", metavar="RUN...", nargs=-1, required=True, type=RunName())

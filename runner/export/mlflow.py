@@ -23,6 +23,7 @@ from runner.recording.reader import Recording
 
 RUN_TAG: Final = "dualtaxi.run_id"
 DIGEST_TAG: Final = "dualtaxi.content_digest"
+_SQLITE: Final = "sqlite:///"
 _STATUS: Final = {"finished": "FINISHED", "interrupted": "KILLED", "failed": "FAILED"}
 _AT_ONCE: Final = 1000
 _PARAMS_AT_ONCE: Final = 100
@@ -62,7 +63,7 @@ def export(
 
     Args:
         recording: the run's.
-        tracking: the store: `sqlite:///mlflow.db`, or the address of a server.
+        tracking: the store: `sqlite:///exports/mlflow.db`, or the address of a server.
         experiment: the name of the experiment, made if it is missing.
         with_recording: also store the recording as an artifact.
         force: write it anew, and delete what is there of it.
@@ -75,6 +76,8 @@ def export(
 
     with _quiet():
         try:
+            if tracking.startswith(_SQLITE):  # SQLite makes the file, but not its folder
+                Path(tracking.removeprefix(_SQLITE)).parent.mkdir(parents=True, exist_ok=True)
             return _export(recording, tracking, experiment, with_recording, force)
         except (MlflowException, ImportError, OSError) as error:
             raise RunnerError(f"{tracking}: MLflow cannot use it ({error}).") from error

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli.finding import find_recorded
-from runner.cli.options import episode_option, recordings_option, run_argument, trial_option
+from runner.cli.options import EXPORTS, episode_option, recordings_option, run_argument, trial_option
 from runner.cli.output import say, size
 from runner.cli.progress import counting
 
@@ -20,7 +20,7 @@ from runner.cli.progress import counting
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    default=Path("episode.gif"),
+    default=EXPORTS / "episode.gif",
     show_default=True,
     metavar="FILE",
     help="Where to.",

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli.finding import find_recorded
-from runner.cli.options import recordings_option, run_argument
+from runner.cli.options import EXPORTS, recordings_option, run_argument
 from runner.cli.output import say
 from runner.cli.parameters import EpisodeRanges
 from runner.cli.progress import counting
@@ -19,7 +19,7 @@ from runner.cli.progress import counting
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    default=Path("minari"),
+    default=EXPORTS / "minari",
     show_default=True,
     metavar="FOLDER",
     help="The folder of datasets, as MINARI_DATASETS_PATH names it.",

@@ -17,8 +17,8 @@ from runner.cli.output import say
     "--tracking-uri",
     "tracking",
     envvar="MLFLOW_TRACKING_URI",
-    default="sqlite:///mlflow.db",
-    show_default="$MLFLOW_TRACKING_URI, or sqlite:///mlflow.db",
+    default="sqlite:///exports/mlflow.db",
+    show_default="$MLFLOW_TRACKING_URI, or sqlite:///exports/mlflow.db",
     metavar="URI",
     help="The store: a database or a server.",
 )

@@ -8,7 +8,7 @@ import click
 
 from runner.cli.choosing import choice_options, request_of, tell
 from runner.cli.finding import find_recorded
-from runner.cli.options import recordings_option, run_argument
+from runner.cli.options import EXPORTS, recordings_option, run_argument
 from runner.cli.output import duration, size
 
 
@@ -19,7 +19,7 @@ from runner.cli.output import duration, size
     "--output",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE.rrd",
-    help="The file to write.  [default: NAME-RUN.rrd]",
+    help="The file to write.  [default: exports/NAME-RUN.rrd]",
 )
 @choice_options
 @click.option("--force", is_flag=True, help="Replace the file if it exists.")
@@ -58,7 +58,7 @@ def command(
 
     started = time.monotonic()
     run = find_recorded(run_name, recordings)
-    path = output or Path(f"{run.name}-{run.run_id}.rrd")
+    path = output or EXPORTS / f"{run.name}-{run.run_id}.rrd"
     require_new(path, force)
     request = request_of(episodes, evaluations, every, everything)
     with open_recording(run.recording) as recording, announcing(), stage_line("exporting"):

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli.finding import find_recorded
-from runner.cli.options import recordings_option, run_argument
+from runner.cli.options import EXPORTS, recordings_option, run_argument
 from runner.cli.output import say, size
 from runner.cli.parameters import EpisodeRanges
 from runner.cli.progress import counting
@@ -21,7 +21,7 @@ _OPTIONS = (
         "--output",
         type=click.Path(path_type=Path),
         metavar="FOLDER",
-        help="The folder to write.  [default: NAME-RUN-FORM]",
+        help="The folder to write.  [default: exports/NAME-RUN-FORM]",
     ),
     click.option("--phase", type=click.Choice(["train", "eval"]), help="Steps and episodes of it alone."),
     click.option(
@@ -76,7 +76,7 @@ def _export(
     from runner.recording.reader import open_recording
 
     run = find_recorded(run_name, recordings)
-    path = output or Path(f"{run.file_stem}-{form}")
+    path = output or EXPORTS / f"{run.file_stem}-{form}"
     choice = Choice(phase or ("train" if episodes else ""), episodes or ())
     with open_recording(run.recording) as recording:
         require_steps(recording, "export")

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli.finding import find_recorded
-from runner.cli.options import recordings_option, run_argument
+from runner.cli.options import EXPORTS, recordings_option, run_argument
 from runner.cli.output import say
 
 
@@ -18,7 +18,7 @@ from runner.cli.output import say
     "--output",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="The folder to write.  [default: tensorboard/NAME-RUN]",
+    help="The folder to write.  [default: exports/tensorboard/NAME-RUN]",
 )
 @click.option("--force", is_flag=True, help="Replace the folder if it exists.")
 @recordings_option
@@ -41,7 +41,7 @@ def command(run_name: str, output: Path | None, force: bool, recordings: Path | 
 
     require_packages()
     run = find_recorded(run_name, recordings)
-    path = output or Path("tensorboard", run.file_stem)
+    path = output or EXPORTS / "tensorboard" / run.file_stem
     with open_recording(run.recording) as recording:
         with new_folder(path, force, OURS) as folder, stage_line("writing events"):
             count = write_events(recording, folder)

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli.finding import find_all_recorded
-from runner.cli.options import recordings_option, runs_argument
+from runner.cli.options import EXPORTS, recordings_option, runs_argument
 from runner.cli.output import say
 
 
@@ -17,7 +17,7 @@ from runner.cli.output import say
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    default=Path("plot.png"),
+    default=EXPORTS / "plot.png",
     show_default=True,
     metavar="FILE",
     help="Where to: FILE.png, FILE.svg or FILE.pdf.",

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli.finding import find_all_recorded
-from runner.cli.options import recordings_option, runs_argument
+from runner.cli.options import EXPORTS, recordings_option, runs_argument
 from runner.cli.output import say, size
 from runner.cli.parameters import TrialName
 
@@ -18,7 +18,7 @@ from runner.cli.parameters import TrialName
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    default=Path("report.html"),
+    default=EXPORTS / "report.html",
     show_default=True,
     metavar="FILE",
     help="Where to.",

@@ -101,6 +101,7 @@ def _saved(
     """Save what is sent to a stream as a file, which is there whole or not at all."""
     fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         fresh.touch()  # where no file can be, Rerun would raise what is no OSError
         stream.save(fresh, default_blueprint=shown)
         stream.send_recording_name(" and ".join(source.title for source in sources))

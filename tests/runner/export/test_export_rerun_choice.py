@@ -136,10 +136,16 @@ class TestCommand:
         assert path.read_bytes()[:4] == b"RRF2"
 
     def test_a_place_where_no_file_can_be_is_told(self, pictured, tmp_path):
-        path = tmp_path / "missing" / "a.rrd"
+        (tmp_path / "file").touch()
+        path = tmp_path / "file" / "a.rrd"
         result = invoke("export", "rerun", pictured("lake").folder, "-o", path)
-        assert result.exit_code == 1
-        assert f"{path}: cannot be written (No such file or directory)." in result.stderr
+        assert result.exit_code == 2
+        assert f"{path}: cannot be written (" in result.stderr
+
+    def test_without_a_place_it_is_written_to_exports(self, pictured, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        assert invoke("export", "rerun", pictured("lake").folder).exit_code == 0
+        assert [path.suffix for path in (tmp_path / "exports").iterdir()] == [".rrd"]
 
     @pytest.mark.parametrize("text", ["x", "1-2", ":x", ""])
     def test_ranges_that_are_none(self, pictured, text):

@@ -144,7 +144,7 @@ def test_minari_reads_the_episodes(export, taxis, phase, monkeypatch):
 
     monkeypatch.setattr("runner.export.minari._AT_ONCE", 7)
     told = export("minari", taxis.recording, "--phase", phase)
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("minari").absolute()))
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("exports/minari").absolute()))
     dataset = minari.load_dataset(f"taxis-{taxis.run_id}-v0")
     recorded = steps_of(taxis.recording, phase)
     with open_recording(taxis.recording) as recording:
@@ -168,7 +168,7 @@ def test_minari_reads_the_episodes(export, taxis, phase, monkeypatch):
 def test_minari_of_chosen_and_of_cut_off_episodes(export, taxis, killed, monkeypatch):
     import minari
 
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("minari").absolute()))
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("exports/minari").absolute()))
     export("minari", taxis.recording, "--episodes", "7")
     assert minari.load_dataset(f"taxis-{taxis.run_id}-v0").total_steps == len(
         steps_of(taxis.recording, "train", 7, 8)
@@ -297,7 +297,7 @@ def test_a_store_that_cannot_be_used_is_told(export, taxis):
 @pytest.mark.parametrize("form", ["csv", "parquet", "minari"])
 def test_a_run_without_steps_names_what_records_them(export, bare, form):
     assert "rerecord" in export(form, bare.recording, code=2).stderr
-    assert list(Path().iterdir()) in ([], [Path("minari")])
+    assert list(Path().iterdir()) in ([], [Path("exports")])
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "tensorboard"])
