@@ -125,7 +125,7 @@ def facts_html(run: Run) -> str:
     evaluation = asdict(run.summary.last_evaluation) if run.summary.last_evaluation else {}
     facts = {
         "run": f"{run.run_id}, {run.status}",
-        "name": f"{run.name}, seed {run.seed}",
+        "name": f"{run.title}",
         "recording": str(run.recording),
         **{f"last evaluation: {key.replace('_', ' ')}": value for key, value in evaluation.items()},
     }

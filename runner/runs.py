@@ -101,8 +101,18 @@ class Run:
 
     @property
     def seed(self) -> int:
-        """Its job's seed."""
+        """Its job's seed; 0 for a loop that was given none."""
         return self.file.seed or 0
+
+    @property
+    def has_seed(self) -> bool:
+        """Whether it was given a seed; every job has one."""
+        return self.facts.get("seeded") is not False
+
+    @property
+    def title(self) -> str:
+        """Its name, and its seed if it has one: `patient, seed 3`."""
+        return f"{self.name}, seed {self.seed}" if self.has_seed else self.name
 
     @property
     def recording(self) -> Path:
@@ -202,9 +212,14 @@ def create_run(
 
 
 def new_run(
-    recordings: Path, config: Mapping[str, Any], seed: int, name: str, run_id: str | None = None
+    recordings: Path,
+    config: Mapping[str, Any],
+    seed: int | None,
+    name: str,
+    run_id: str | None = None,
+    **more: Any,
 ) -> Run:
-    """Make a folder for a new run of this configuration, as `create_run` does.
+    """Make a folder for a new run of this configuration, as `create_run` does; `more` are further facts.
 
     Raises:
         StorageError: the recordings folder cannot be written.
@@ -224,11 +239,13 @@ def new_run(
             {
                 "run_id": run_id,
                 "name": name,
-                "seed": seed,
+                "seed": seed or 0,
+                **({"seeded": False} if seed is None else {}),
                 "status": "running",
                 "created": datetime.now(UTC).isoformat(timespec="milliseconds"),
                 "owner": owner(),
                 "config": dict(config),
+                **more,
             },
         )
         write_whole(folder / RUN_FILE, run.facts)

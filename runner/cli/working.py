@@ -89,7 +89,7 @@ def run_in_words(run: Run) -> dict[str, str]:
     summary = _told(run)
     took = "" if summary.get("seconds") is None else f", in {duration(summary['seconds'])}"
     return {
-        "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
+        "run": f"{run.run_id}  {run.title}, {run.status}",
         "steps": _steps_in_words(summary) + took,
         "digest": summary.get("content_digest") or UNKNOWN,
         "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
@@ -130,7 +130,7 @@ def tell_received(run: Run, digest: str, already: str, as_json: bool, **more: ob
     draw(
         facts(
             {
-                "run": f"{run.run_id}  {run.name}, seed {run.seed}, {run.status}",
+                "run": f"{run.run_id}  {run.title}, {run.status}",
                 "digest": digest,
                 "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
                 "next": suggested(run, "show"),

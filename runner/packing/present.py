@@ -26,7 +26,7 @@ class Occupied(RunnerError):
 
     def __init__(self, run: Run, recordings: Path) -> None:
         super().__init__(
-            f"{recordings}: found another run {run.run_id} ({run.name}, seed {run.seed}, {run.status}), "
+            f"{recordings}: found another run {run.run_id} ({run.title}, {run.status}), "
             "whose content is not that of the one to come"
         )
         self.run = run

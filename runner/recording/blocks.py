@@ -84,10 +84,10 @@ def _tag(field: Field, value: np.dtype[Any]) -> bytes:
     """Return the constant bytes before a field's value: tag, and its length if it is bytes or packed."""
     if not field.repeated and field.kind != Pb.TYPE_BYTES:
         return bytes([field.number << 3 | _FIXED[field.kind][1]])
-    return bytes([field.number << 3 | _DELIMITED]) + _varint(value.itemsize)
+    return bytes([field.number << 3 | _DELIMITED]) + varint(value.itemsize)
 
 
-def _varint(number: int) -> bytes:
+def varint(number: int) -> bytes:
     """Return a number as protobuf writes lengths: seven bits a byte, the lowest first."""
     low = []
     while number >= 128:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import struct
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.blocks import varint
 from runner.recording.protobuf import message_class
 from runner.recording.schema import STEP_NANOSECONDS, MessageType
 from runner.recording.spaces import NUMBERS
@@ -33,6 +35,25 @@ class QTable:
 def encode(message: MessageType, values: Mapping[str, Any]) -> bytes:
     """Return the message with these field values; a field that is missing is protobuf's zero."""
     return bytes(message_class(message)(**values).SerializeToString(deterministic=True))
+
+
+def scalar_encoder(name: str, phase: str) -> Callable[[float, int, int], bytes]:
+    """Return a function that encodes `dualtaxi.Scalar` messages, from value, step and episode.
+
+    It gives the bytes that `encode` gives, in a tenth of the time, because only three numbers change.
+    """
+    named, phased = name.encode(), phase.encode()
+    before_value = b"\n" + varint(len(named)) + named + b"\x11"
+    before_step = b"\x1a" + varint(len(phased)) + phased + b"!"
+    pack = struct.Struct(f"<{len(before_value)}sd{len(before_step)}sqcq").pack
+
+    def encode_scalar(value: float, step: int, episode: int) -> bytes:
+        if value and step and episode:
+            return pack(before_value, value, before_step, step, b")", episode)
+        fields = {"name": name, "value": value, "phase": phase, "step": step, "episode": episode}
+        return encode(schema.SCALAR, fields)  # protobuf leaves zeros out
+
+    return encode_scalar
 
 
 def decode(message: MessageType, payload: bytes) -> dict[str, Any]:

@@ -39,8 +39,10 @@ class Piles:
 
     def add(self, topic: Topic, log_time: int, payload: bytes) -> None:
         """Put a message on its topic's pile."""
-        pile = self._piles.setdefault(topic, _Pile())
-        if pile.records and len(pile.records) + len(payload) > MOST_BYTES:
+        pile = self._piles.get(topic)
+        if pile is None:
+            pile = self._piles[topic] = _Pile()
+        elif pile.records and len(pile.records) + len(payload) > MOST_BYTES:
             self._close(topic)
             pile = self._piles[topic] = _Pile()
         pile.offsets.append(len(pile.records))

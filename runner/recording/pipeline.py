@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -28,6 +29,8 @@ from runner.recording.writer import RecordingFile, storage_error
 
 ENCODERS: Final = 2
 WORK_UNDER_WAY: Final = 32
+MOST_HELD: Final = 4
+"""Pieces of work that are held before threads are started; fewer than a topic has buffers."""
 SYNC_SECONDS: Final = 5.0
 """How often the system is asked to put on disk what was written."""
 _BEAT_SECONDS: Final = 1.0
@@ -39,7 +42,7 @@ class _Work:
 
     topic: Topic
     records: memoryview
-    chunk: Future[Chunk] | None
+    encode: Callable[[], Chunk] | None
     used: Callable[[], None]
 
 
@@ -51,10 +54,18 @@ class Pipeline:
         packing: how chunks are packed.
         beat: called about once a second from the writer's thread, or when something is sent.
         threads: False has the sender do the work.
+        before: called once, before anything is written. Given it, the pipeline holds what it is sent, up to
+            `MOST_HELD` pieces, until `release`; threads are started only then, and a recording that is
+            closed before does without them.
     """
 
     def __init__(
-        self, file: RecordingFile | None, packing: Packing, beat: Callable[[], None], threads: bool = True
+        self,
+        file: RecordingFile | None,
+        packing: Packing,
+        beat: Callable[[], None],
+        threads: bool = True,
+        before: Callable[[], None] | None = None,
     ) -> None:
         self.hash = ContentHash()
         self.failure: BaseException | None = None
@@ -66,11 +77,16 @@ class Pipeline:
         self._last_beat = self._last_sync = time.monotonic()
         self._encoders: ThreadPoolExecutor | None = None
         self._writer: threading.Thread | None = None
-        self._work: queue.Queue[_Work | None] = queue.Queue(maxsize=WORK_UNDER_WAY)
-        if threads:
-            self._encoders = ThreadPoolExecutor(ENCODERS, thread_name_prefix="encoder")
-            self._writer = threading.Thread(target=self._run, name="recording-writer", daemon=True)
-            self._writer.start()
+        self._work: queue.Queue[tuple[_Work, Future[Chunk] | None] | None] = queue.Queue(WORK_UNDER_WAY)
+        self._before = before
+        self._held: list[_Work] | None = None if before is None else []
+        if threads and before is None:
+            self._start()
+
+    def _start(self) -> None:
+        self._encoders = ThreadPoolExecutor(ENCODERS, thread_name_prefix="encoder")
+        self._writer = threading.Thread(target=self._run, name="recording-writer", daemon=True)
+        self._writer.start()
 
     def send(
         self,
@@ -91,10 +107,10 @@ class Pipeline:
             write: False leaves them out of the file; the digest covers them all the same.
             used: called when they were written, by who writes.
         """
-        chunk = None
+        encode = None
         if write and self._file is not None:
-            chunk = self._encode(encode_chunk, topic, records, log_times, offsets, self._packing)
-        self._hand_over(_Work(topic, records, chunk, used))
+            encode = partial(encode_chunk, topic, records, log_times, offsets, self._packing)
+        self._hand_over(_Work(topic, records, encode, used))
 
     def submit(self, topic: Topic, make: Callable[[], bytes], log_time: int) -> None:
         """Send one message of a topic on its way that is yet to be made; waits while too many are.
@@ -111,8 +127,27 @@ class Pipeline:
             times = np.array([log_time], np.uint64)
             return encode_chunk(topic, record, times, np.zeros(1, np.uint64), self._packing)
 
-        chunk = self._encode(encoded) if self._file is not None else None
-        self._hand_over(_Work(topic, memoryview(b""), chunk, lambda: None))
+        encode = encoded if self._file is not None else None
+        self._hand_over(_Work(topic, memoryview(b""), encode, lambda: None))
+
+    def release(self, threads: bool = True) -> None:
+        """Write what is held, and hold nothing from now on; `threads` False does so without threads.
+
+        Raises:
+            BaseException: what `before` raised; nothing is written then, now or later.
+        """
+        held, self._held, before, self._before = self._held, None, self._before, None
+        if held is None or before is None:
+            return
+        try:
+            before()
+        except BaseException as error:
+            self.failure = error
+            raise
+        if threads:
+            self._start()
+        for work in held:
+            self._hand_over(work)
 
     @property
     def open(self) -> bool:
@@ -132,27 +167,32 @@ class Pipeline:
 
     def close(self) -> None:
         """Wait until everything sent is written, or was given up after a failure; stop the threads."""
-        self._closed = True
-        if self._writer is not None and self._writer.is_alive():
-            self._work.put(None)
-            self._writer.join()
-        if self._encoders is not None:
-            self._encoders.shutdown(cancel_futures=True)
+        try:
+            self.release(threads=False)
+        finally:
+            self._closed = True
+            if self._writer is not None and self._writer.is_alive():
+                self._work.put(None)
+                self._writer.join()
+            if self._encoders is not None:
+                self._encoders.shutdown(cancel_futures=True)
 
     def _hand_over(self, work: _Work) -> None:
-        if self._writer is None:
-            self._do(work)
+        if self._held is not None:
+            self._held.append(work)
+            if len(self._held) == MOST_HELD:
+                self.release()
+        elif self._writer is None:
+            self._do(work, None)
         else:
-            self._work.put(work)
+            self._work.put((work, self._encode(work.encode)))
 
-    def _encode(self, work: Callable[..., Chunk], *arguments: object) -> Future[Chunk]:
-        """Give work to an encoder thread; there is none when the interpreter is exiting: then do it here."""
-        if self._encoders is not None:
+    def _encode(self, encode: Callable[[], Chunk] | None) -> Future[Chunk] | None:
+        """Give work to an encoder thread; None if there is none, also when the interpreter is exiting."""
+        if self._encoders is not None and encode is not None:
             with contextlib.suppress(RuntimeError):
-                return self._encoders.submit(work, *arguments)
-        done: Future[Chunk] = Future()
-        done.set_result(work(*arguments))
-        return done
+                return self._encoders.submit(encode)
+        return None
 
     def _run(self) -> None:
         while True:
@@ -163,13 +203,13 @@ class Pipeline:
                 continue
             if work is None:
                 return
-            self._do(work)
+            self._do(*work)
 
-    def _do(self, work: _Work) -> None:
+    def _do(self, work: _Work, chunk: Future[Chunk] | None) -> None:
         now = time.monotonic()
         try:
             if self.failure is None:
-                self._write(work)
+                self._write(work, chunk)
                 if now - self._last_sync > SYNC_SECONDS and self._file is not None:
                     self._file.sync()
                     self._last_sync = now
@@ -180,11 +220,11 @@ class Pipeline:
             self._beat()
             self._last_beat = now
 
-    def _write(self, work: _Work) -> None:
+    def _write(self, work: _Work, encoded: Future[Chunk] | None) -> None:
         self.hash.update(work.topic, work.records)
-        if work.chunk is None or self._file is None:
+        if work.encode is None or self._file is None:
             return
-        chunk = work.chunk.result()
+        chunk = work.encode() if encoded is None else encoded.result()
         try:
             self._file.add_chunk(work.topic, chunk)
         except OSError:

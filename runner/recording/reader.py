@@ -171,6 +171,7 @@ class Recording:
             "run_id": self.run["run_id"],
             "name": self.run["name"],
             "seed": int(self.run["seed"]),
+            **({"seeded": False} if self.run.get("seeded") == "false" else {}),
             "created": self.run["created"],
             "status": result.get("status", "interrupted"),
             "config": self.config,

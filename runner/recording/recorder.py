@@ -30,6 +30,8 @@ FLUSH_SECONDS: Final = 0.5
 """An open block is closed when it is this old; with the time to write it, well under a second."""
 BLOCKS_UNDER_WAY: Final = 8
 EPISODES_A_BLOCK: Final = 2048
+_FIRST_RECORDS: Final = 256
+"""Records in the first block of a topic where recordings may be short: to clear more of them costs time."""
 BLOCK_BYTES: Final = 8 << 20
 """A block has no more bytes than this, unless one record has."""
 
@@ -53,6 +55,7 @@ class _Lane:
     open: _Block | None = None
     free: queue.SimpleQueue[_Block] = field(default_factory=queue.SimpleQueue)
     made: int = 0
+    is_used: bool = False
 
 
 class Recorder:
@@ -70,6 +73,9 @@ class Recorder:
         sizes: the fixed-width topics of the recording; those of a job unless given.
         threads: False packs and writes in the thread that records.
         watch: called with the records of a block as they are taken in; the block is used again.
+        before: called once, before the first message is written. Given it, threads are started and
+            messages written only when some have gathered, or by `release`, so that a short recording
+            costs little.
     """
 
     def __init__(
@@ -85,9 +91,12 @@ class Recorder:
         sizes: Mapping[Topic, Sizes] | None = None,
         threads: bool = True,
         watch: Callable[[Topic, NDArray[np.void]], None] = lambda *_: None,
+        before: Callable[[], None] | None = None,
     ) -> None:
         self._file = file
         self._watch = watch
+        self._chunk_steps = chunk_steps
+        self._first_records = _FIRST_RECORDS if before is not None else None
         self._past = past or Past()
         sizes = sizes or {topic: block_counts(topic, learners, events) for topic in schema.BLOCK_TOPICS}
         self._lanes = {
@@ -104,13 +113,29 @@ class Recorder:
         self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
         """Messages committed so far, a topic."""
         self._last_flush = time.monotonic()
-        self._pipeline = Pipeline(file, packing or Packing(), beat, threads)
+        self._pipeline = Pipeline(file, packing or Packing(), beat, threads, before)
         self._piles = Piles(self._pipeline.send)
 
     @property
     def bytes_written(self) -> int:
         """Bytes in the file so far."""
         return self._file.size if self._file is not None else 0
+
+    def resize(self, sizes: Mapping[Topic, Sizes]) -> None:
+        """Change the sizes of fixed-width topics that have no messages yet, given those of all topics."""
+        for topic, own in sizes.items():
+            lane = self._lanes[topic]
+            if lane.sizes != own:
+                assert not self.counts[topic.name], f"{topic.name} has messages already"
+                self._lanes[topic] = _Lane(topic, own, capacity_of(topic, own, self._chunk_steps), lane.write)
+
+    def release(self) -> None:
+        """Write what was held back, and hold nothing back from now on.
+
+        Raises:
+            StorageError: the disk is full or failing.
+        """
+        self._pipeline.release()
 
     def blank(self, topic: Topic, n: int) -> NDArray[np.void]:
         """Return n records of a fixed-width topic of their own, with every constant byte set."""
@@ -258,6 +283,9 @@ class Recorder:
 
     def _take_block(self, lane: _Lane) -> _Block:
         """Return a block to fill: a used one that came back, or a new one while there may be more."""
+        if self._first_records is not None and not lane.is_used:
+            lane.is_used = True
+            return _Block(blank_records(lane.topic, lane.sizes, min(self._first_records, lane.capacity)))
         if lane.made < BLOCKS_UNDER_WAY and lane.free.empty():
             lane.made += 1
             return _Block(blank_records(lane.topic, lane.sizes, lane.capacity))
@@ -272,13 +300,14 @@ class Recorder:
             return
         filled = block.records[: block.filled]
         offsets = np.arange(block.filled, dtype=np.uint64) * np.uint64(filled.itemsize)
+        is_whole = len(block.records) == lane.capacity  # the first, smaller one is not used again
         self._pipeline.send(
             lane.topic,
             filled.view(np.uint8).data.cast("B"),
             filled["log_time"],
             offsets,
             write=write and lane.write,
-            used=partial(lane.free.put, block),
+            used=partial(lane.free.put, block) if is_whole else lambda: None,
         )
 
 

@@ -17,14 +17,14 @@ Attachments = Mapping[str, tuple[str, bytes]]
 
 
 def run_facts(
-    run_id: str, name: str, seed: int, job: str, created: str, agents: Sequence[str], events: int
+    run_id: str, name: str, seed: int | None, job: str, created: str, agents: Sequence[str], events: int
 ) -> dict[str, str]:
     """Return what every recording says of its run.
 
     Args:
         run_id: its id.
         name: what it is called.
-        seed: its job's seed.
+        seed: its job's seed; None for a loop that was given none.
         job: the identity of its job.
         created: when it began.
         agents: the learners: one reward each.
@@ -34,12 +34,13 @@ def run_facts(
         "format_version": str(schema.FORMAT_VERSION),
         "run_id": run_id,
         "name": name,
-        "seed": str(seed),
+        "seed": str(seed or 0),
         "job": job,
         "created": created,
         "agents": json.dumps(agents),
         "learners": str(len(agents)),
         "events": str(events),
+        **({"seeded": "false"} if seed is None else {}),
     }
 
 

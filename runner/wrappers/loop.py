@@ -1,17 +1,19 @@
-"""The recording of somebody's own loop: its folder, its file, and whoever writes into it."""
+"""The recording of a user's own loop: its folder, its file, and everything that is written into it."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
 from blake3 import blake3
+from numpy.typing import NDArray
 
 from runner import runs
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError, kept_message
@@ -19,8 +21,8 @@ from runner.provenance import provenance
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
 from runner.recording.facts import sizes_of
-from runner.recording.messages import encode, encode_image, encode_log
-from runner.recording.recorder import FLUSH_SECONDS, Recorder
+from runner.recording.messages import encode, encode_image, encode_log, scalar_encoder
+from runner.recording.recorder import Recorder
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.telling import (
     Attachments,
@@ -32,12 +34,17 @@ from runner.recording.telling import (
 from runner.recording.writer import create_recording
 from runner.runs import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
 from runner.service.outbox import Follower, connected, is_server, outbox_folder
-from runner.wrappers.described import Described, as_json
+from runner.wrappers import flushing
+from runner.wrappers.described import Described, as_json, as_mapping, can_widen, widened
 from runner.wrappers.outcomes import Outcomes
-from runner.wrappers.plan import Plan
-from runner.wrappers.values import lone_number
+from runner.wrappers.plan import ALL_INFO, Plan
+from runner.wrappers.values import lone_number, warn_user
 
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
+MAX_INFO_BYTES: Final = 1 << 20
+"""Bytes of JSON that the info of one step may take."""
+_UNDECIDED_SECONDS: Final = 5.0
+"""The dtype of actions is left open so long while no step is taken; then it is that of their space."""
 
 
 class Putting(Protocol):
@@ -61,6 +68,27 @@ class Putting(Protocol):
     def commit(self) -> None:
         """Hand all steps to the recorder."""
 
+    def reshape(self, described: Described) -> None:
+        """Prepare for actions of another dtype; no step was put down yet."""
+
+
+class Ignored:
+    """Takes the steps of a forked process, and does nothing with them."""
+
+    filled = 0
+    place = (0, 0)
+
+    def ignore(self, *_: object) -> None:
+        """Do nothing."""
+
+    open = commit = reshape = take = reset = ignore
+
+
+class View(Protocol):
+    """What a user holds of a loop: it is told when the process turns out to be a forked one."""
+
+    def _detach(self) -> None: ...
+
 
 R = TypeVar("R", bound=Putting)
 
@@ -78,8 +106,13 @@ class Loop(Generic[R]):
         StorageError: the recordings folder cannot be written.
     """
 
-    def __init__(self, described: Described, plan: Plan, rows: Callable[[Recorder, str], R]) -> None:
-        config = plan.mapping(described)
+    def __init__(
+        self,
+        described: Described,
+        plan: Plan,
+        rows: Callable[[Recorder, Described, str, Callable[[Any], None]], R],
+    ) -> None:
+        self._config = plan.mapping(described)
         client = connected(str(plan.recordings)) if is_server(plan.recordings) else None
         folder = outbox_folder() if client else recordings_folder(plan.recordings)
         self._started = time.monotonic()
@@ -90,17 +123,24 @@ class Loop(Generic[R]):
         self.described = described
         self.plan = plan
         self.lock = threading.RLock()
-        self.run = new_run(folder, config, plan.seed, config["name"])
+        self.closed = False
+        self.is_foreign = False
+        """Whether this process was forked from the one that records."""
+        self.views: weakref.WeakSet[Any] = weakref.WeakSet()
+        self._has_warned: set[str] = set()
+        self._is_described = False
+        self._is_settled = not can_widen(described.action)
+        self._has_logged = False
+        self._scalars: dict[tuple[str, str], Callable[[float, int, int], bytes]] = {}
         self._topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
+        made_by = provenance()
+        known = {key: made_by[key] for key in runs.MADE_BY if key in made_by}
+        self._made_by = made_by
+        self.run = new_run(folder, self._config, plan.seed, self._config["name"], provenance=known)
         path = self.run.folder / RECORDING_FILE
         with unless_empty(self.run):
             self._file = create_recording(path, schema.KINDS[described.kind])
-        try:
-            facts = self._describe(config)
-        except BaseException as error:
-            self._file.close()
-            self._mark_failed(error)
-            raise
+        facts = self._facts()
         self._outcomes = Outcomes(described.mdp)
         self._recorder = Recorder(
             self._file,
@@ -111,22 +151,27 @@ class Loop(Generic[R]):
             beat=self.run.beat,
             sizes=sizes_of(facts, str(path)),
             watch=self._outcomes.take_records,
+            before=self._describe,
         )
+        if self._is_settled:
+            try:
+                self._describe()
+            except BaseException as error:
+                self._file.close()
+                self._mark_failed(error)
+                raise
         self._follower = Follower(client, self.run, lambda: self._file.size) if client else None
-        self.closed = False
-        self._process = os.getpid()
-        self._stop = threading.Event()
-        self._flusher = threading.Thread(target=self._keep_flushing, name="recording-flush", daemon=True)
-        self._flusher.start()
+        flushing.watch(self)
 
-    def _describe(self, config: Mapping[str, Any]) -> dict[str, str]:
-        """Write what makes the recording self-contained; return what is said of the run."""
+    def _facts(self) -> dict[str, str]:
+        """Return what the recording says of the run."""
         described, mdp, run = self.described, self.described.mdp, self.run
-        identity = {key: value for key, value in config.items() if key not in ("name", "seeds", "recording")}
+        left_out = ("name", "seeds", "recording")
+        identity = {key: value for key, value in self._config.items() if key not in left_out}
         job = json.dumps(identity | {"seed": self.plan.seed}, sort_keys=True)
-        facts = run_facts(
+        return run_facts(
             run.run_id,
-            run.name,
+            str(run.facts["name"]),
             self.plan.seed,
             job=blake3(job.encode()).hexdigest()[:32],
             created=run.created_text,
@@ -137,11 +182,27 @@ class Loop(Generic[R]):
             "spaces": json.dumps(described.spaces()),
             "environments": str(described.environments),
         }
-        made_by = provenance()
-        write_description(self._file, facts, config, made_by, _environment(described))
-        told = {key: made_by[key] for key in runs.MADE_BY if key in made_by}
-        self.run = run.update(provenance=told)
-        return facts
+
+    def _describe(self) -> None:
+        """Write what makes the recording self-contained, once; from then on dtypes are fixed."""
+        if not self._is_described:
+            self._is_described = self._is_settled = True
+            write_description(
+                self._file, self._facts(), self._config, self._made_by, _environment(self.described)
+            )
+
+    def _first_action(self, action: Any) -> None:
+        """Record all actions in the dtype of the first one, if the space's own cannot hold it exactly."""
+        if self._is_settled:
+            return
+        self._is_settled = True
+        wide = widened(self.described.action, action)
+        if wide is self.described.action:
+            return
+        self.described = replace(self.described, wide_action=wide)
+        self._recorder.resize(sizes_of(self._facts(), str(self.run.recording)))
+        for rows in self._rows.values():
+            rows.reshape(self.described)
 
     # --- what is recorded -----------------------------------------------------------------------------
 
@@ -155,11 +216,14 @@ class Loop(Generic[R]):
             raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
         if phase not in self._rows:
             with self.lock:
-                self._rows[phase] = self._make_rows(self._recorder, phase)
+                self._rows[phase] = self._make_rows(self._recorder, self.described, phase, self._first_action)
         return self._rows[phase]
 
     def activate(self, rows: R) -> None:
-        """Say whose steps come now; times go on in the order in which steps are taken. Holds the lock."""
+        """Make these the rows whose steps come now. The caller holds the lock."""
+        if self.is_foreign:
+            self._warn_of_fork()
+            return
         if self.closed:
             raise RunnerError(
                 f"run {self.run.run_id} is closed: steps can no longer be recorded in it. "
@@ -181,48 +245,59 @@ class Loop(Generic[R]):
         Raises:
             ConfigError: it is neither, or the name is none.
         """
-        if not _is_text(name) or not name or (isinstance(value, str) and not _is_text(value)):
-            raise ConfigError(
-                f"log: found the name {name!r} for {value!r}, expected text that is valid Unicode"
-            )
+        if isinstance(value, str):
+            self._log_text(name, value)
+            return
+        number = value if value.__class__ is float else _number(name, value)
+        encoder = self._scalars.get((phase, name)) or self._scalar_encoder(phase, name, value)
         with self.lock:
-            position = self._moment()
-            if isinstance(value, str):
-                payload = encode_log(value, position * STEP_NANOSECONDS / 1e9, name=name)
-                self._recorder.append(self._topics["/log"], payload, position)
+            if self.is_foreign:
+                self._warn_of_fork()
                 return
-            number = _number(name, value)
+            position = self._moment()
             step, episode = self.rows(phase).place
-            fields = {"name": name, "value": number, "phase": phase, "step": step, "episode": episode}
-            self._recorder.append(self._topics["/scalar"], encode(schema.SCALAR, fields), position)
+            self._recorder.append(schema.SCALAR_TOPIC, encoder(number, step, episode), position)
             self._outcomes.take_logged(name, number)
+            self._has_logged = True
+
+    def _scalar_encoder(self, phase: str, name: str, value: Any) -> Callable[[float, int, int], bytes]:
+        _check_name(name, value)
+        encoder = self._scalars[phase, name] = scalar_encoder(name, phase)
+        return encoder
+
+    def _log_text(self, name: str, text: str) -> None:
+        _check_name(name, text)
+        if not _is_text(text):
+            raise ConfigError(f"log: found {text!r} for {name!r}, expected text that is valid Unicode")
+        if len(text) > MAX_ARRAY_BYTES // 4:
+            raise ConfigError(
+                f"log: found a text of {len(text):,} characters for {name!r}, "
+                f"expected at most {MAX_ARRAY_BYTES // 4:,}"
+            )
+        with self._recording() as is_recorded:
+            if is_recorded:
+                position = self._moment()
+                payload = encode_log(text, position * STEP_NANOSECONDS / 1e9, name=name)
+                self._recorder.append(schema.LOG_TOPIC, payload, position)
+                self._has_logged = True
 
     def snapshot(self, phase: str, name: str, array: Any) -> None:
-        """Record an array of numbers as it is now.
+        """Record an array of numbers, or all arrays of a mapping, as they are now.
 
         Raises:
-            ConfigError: it holds something else, or is too large.
+            ConfigError: it holds something else, or is too large; nothing is recorded then.
         """
-        try:
-            values = np.asarray(array, order="C")
-        except (TypeError, ValueError) as error:
-            raise ConfigError(f"snapshot: found no array of numbers for {name!r} ({error})") from error
-        if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8 or not _is_text(name):
-            raise ConfigError(
-                f"snapshot: found {values.dtype} for {name!r}, expected an array of numbers and a name."
-            )
-        if values.nbytes > MAX_ARRAY_BYTES:
-            raise ConfigError(
-                f"snapshot: found {values.nbytes:,} bytes for {name!r}, expected at most "
-                f"{MAX_ARRAY_BYTES:,}; record it in parts."
-            )
-        values = values.astype(values.dtype.newbyteorder("<"), copy=False)
-        with self.lock:
+        arrays = dict(_arrays(name, array))
+        with self._recording() as is_recorded:
+            if not is_recorded:
+                return
             position = self._moment()
             step, episode = self.rows(phase).place
-            fields = {"name": name, "phase": phase, "step": step, "episode": episode}
-            fields |= {"shape": list(values.shape), "dtype": values.dtype.str, "data": values.tobytes()}
-            self._recorder.append(self._topics["/array"], encode(schema.ARRAY, fields), position)
+            for own_name, values in arrays.items():
+                fields = {"name": own_name, "phase": phase, "step": step, "episode": episode}
+                fields |= {"shape": list(values.shape), "dtype": values.dtype.str, "data": values.tobytes()}
+                self._recorder.append(schema.ARRAY_TOPIC, encode(schema.ARRAY, fields), position)
+                self._has_logged = True
 
     def info(
         self,
@@ -232,15 +307,34 @@ class Loop(Generic[R]):
         beside: Mapping[str, Any] | None = None,
     ) -> None:
         """Record the chosen fields of an info, those that it has, of the step or reset just put down."""
-        chosen = {key: as_json(info[key]) for key in self.plan.info if key in info}
+        names = self.plan.info
+        chosen = info if ALL_INFO in names else {key: info[key] for key in names if key in info}
         if not chosen and not beside:
             return
-        said = {"info": chosen} | ({"reset": as_json(beside)} if beside else {})
-        with self.lock:
+        text = '{"info": ' + self._json_of("info", chosen)
+        text += ', "reset": ' + self._json_of("reset", beside) + "}" if beside else "}"
+        with self._recording() as is_recorded:
+            if not is_recorded:
+                return
             step, _ = self.rows(phase).place
-            fields = {"step": step if reset else step - 1, "reset": reset, "json": json.dumps(said)}
+            fields = {"step": step if reset else step - 1, "reset": reset, "json": text}
             topic = self._topics[f"/{phase}/info"]
             self._recorder.append(topic, encode(schema.INFO, fields), self._moment())
+
+    def _json_of(self, what: str, fields: Mapping[str, Any]) -> str:
+        """Return fields as a JSON object; say in place of a field that it could not be recorded."""
+        pieces, size = [], 0
+        for key, value in fields.items():
+            try:
+                text = json.dumps(as_json(value))
+                if size + len(text) > MAX_INFO_BYTES:
+                    raise ValueError(f"{what} takes more than {MAX_INFO_BYTES:,} bytes of JSON")
+            except (ValueError, RecursionError) as error:
+                text = json.dumps(f"not recorded: {error}")
+                self._warn_once(f"{what}[{key!r}] is not recorded where {error}. This is warned of once.")
+            size += len(text)
+            pieces.append(f"{json.dumps(str(key))}: {text}")
+        return "{" + ", ".join(pieces) + "}"
 
     def reset_info(
         self, phase: str, info: Mapping[str, Any], options: Mapping[str, Any] | None, seed: Any
@@ -260,6 +354,8 @@ class Loop(Generic[R]):
         """
         from runner.wrappers.frames import image_bytes
 
+        if self.is_foreign:
+            return
         pixels = np.array(image)
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
             raise ConfigError(
@@ -275,6 +371,25 @@ class Loop(Generic[R]):
 
             self._recorder.submit(self._topics[f"/{phase}/frame"], make, position)
 
+    @contextlib.contextmanager
+    def _recording(self) -> Iterator[bool]:
+        """Hold the lock; yield whether this process records: one that was forked does not."""
+        with self.lock:
+            if self.is_foreign:
+                self._warn_of_fork()
+            yield not self.is_foreign
+
+    def _warn_of_fork(self) -> None:
+        self._warn_once(
+            f"run {self.run.run_id} is recorded by the process that this one was forked from: what is done "
+            "here is not recorded. To record it, wrap the environment in this process."
+        )
+
+    def _warn_once(self, message: str) -> None:
+        if message not in self._has_warned:
+            self._has_warned.add(message)
+            warn_user(message)
+
     def _moment(self) -> int:
         """Return the number of steps executed so far, of a loop that is not closed."""
         if self.closed:
@@ -286,14 +401,13 @@ class Loop(Generic[R]):
     def close(self, status: str = "finished", error: str = "") -> Run:
         """Write everything, and say how it ended; return the run as it then is. The second time, only that.
 
-        A process that was forked from the one that records only returns the run: the file is not its own.
+        A forked process only returns the run: the recording belongs to the process it was forked from.
 
         Raises:
             StorageError: the disk is full or failing; what was written is kept.
         """
-        if os.getpid() != self._process:
+        if self.is_foreign:
             return self.run
-        self._stop.set()
         with self.lock:
             if self.closed:
                 return self.run
@@ -309,6 +423,7 @@ class Loop(Generic[R]):
                 raise
             finally:
                 self.closed, self.active = True, None
+                self._rows.clear()
                 self._file.close()
             self.run = self.run.update(status=status, summary=summary)
         if self._follower:
@@ -343,23 +458,44 @@ class Loop(Generic[R]):
         seconds = round(time.monotonic() - self._started, 3)
         return result | {"seconds": seconds, "bytes": self._file.size}
 
-    def _keep_flushing(self) -> None:
-        """Put on its way what is half a second old, also while the loop does something else."""
-        while not self._stop.wait(FLUSH_SECONDS):
-            with self.lock:
-                if self.closed:
-                    return
-                try:
-                    self._flush()
-                except BaseException:  # the loop's own thread meets it again, with its next step
-                    return
+    def flush(self) -> bool:
+        """Write what is half a second old, also while the loop does something else; called by a thread.
 
-    def _flush(self) -> None:
-        for rows in self._rows.values():
-            rows.commit()
-        self._recorder.flush()
-        for rows in self._rows.values():
-            rows.open()
+        Returns whether to call it again.
+        """
+        if not self.lock.acquire(timeout=0.1):
+            return True
+        try:
+            if self.closed or self.is_foreign:
+                return False
+            if self._is_undecided():
+                self.run.beat()
+                return True
+            for rows in self._rows.values():
+                rows.commit()
+            self._recorder.flush()
+            self._recorder.release()
+            for rows in self._rows.values():
+                rows.open()
+        except BaseException:  # raised again in the loop's own thread, with its next step
+            return False
+        finally:
+            self.lock.release()
+        return True
+
+    def _is_undecided(self) -> bool:
+        """Return whether to wait for the first action, whose dtype the description states."""
+        is_early = time.monotonic() - self._started < _UNDECIDED_SECONDS
+        return not self._is_settled and not self._has_logged and is_early
+
+    def disown(self) -> None:
+        """Leave the recording to the process that this one was just forked from."""
+        self.is_foreign, self.active = True, None
+        self.lock = threading.RLock()  # a thread that is not here may have held the other one
+        ignored: Any = Ignored()
+        self._rows = dict.fromkeys(schema.PHASES, ignored)
+        for view in list(self.views):
+            view._detach()
 
 
 def _environment(described: Described) -> Attachments:
@@ -387,12 +523,59 @@ def _number(name: str, value: Any) -> float:
         ConfigError: it is none.
     """
     try:
+        if callable(detach := getattr(value, "detach", None)):  # a tensor of PyTorch's
+            value = detach()
         return lone_number(value, name) if np.size(value) == 1 and np.ndim(value) else float(value)
-    except (TypeError, ValueError, OverflowError, RecordingError) as error:
+    except (TypeError, ValueError, OverflowError, RuntimeError, RecordingError) as error:
         raise ConfigError(
             f"log: found {type(value).__name__} for {name!r}, expected a number that a float64 holds, or "
             "text; an array is recorded by snapshot()."
         ) from error
+
+
+def _check_name(name: Any, value: Any) -> None:
+    if not _is_text(name) or not name:
+        raise ConfigError(f"log: found the name {name!r} for {value!r}, expected text that is valid Unicode")
+
+
+def _arrays(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the arrays to record for a value: the value itself, or those of a mapping by `name/key`.
+
+    Raises:
+        ConfigError: there is something else than numbers, or too many.
+    """
+    if not _is_text(name):
+        raise ConfigError(f"snapshot: found the name {name!r}, expected an array of numbers and a name.")
+    if (inside := as_mapping(value)) is not None:
+        for key, part in inside.items():
+            yield from _arrays(f"{name}/{key}", part)
+        return
+    try:
+        values = _as_array(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"snapshot: found no array of numbers for {name!r} ({error})") from error
+    if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
+        raise ConfigError(
+            f"snapshot: found {values.dtype} for {name!r}, expected an array of numbers and a name."
+        )
+    if values.nbytes > MAX_ARRAY_BYTES:
+        raise ConfigError(
+            f"snapshot: found {values.nbytes:,} bytes for {name!r}, expected at most "
+            f"{MAX_ARRAY_BYTES:,}; record it in parts."
+        )
+    yield name, values.astype(values.dtype.newbyteorder("<"), copy=False)
+
+
+def _as_array(value: Any) -> NDArray[Any]:
+    """Return an array or tensor as NumPy's; the short floats that NumPy lacks become float32, exactly."""
+    if callable(detach := getattr(value, "detach", None)):
+        value = detach().cpu()
+        if "bfloat16" in str(value.dtype) or "float8" in str(value.dtype):
+            value = value.float()
+    values = np.asarray(value, order="C")
+    if values.dtype.name.startswith(("bfloat16", "float8")):
+        return values.astype(np.float32)
+    return values
 
 
 def _is_text(value: Any) -> bool:

@@ -17,7 +17,7 @@ from runner.mdp import MAX_AGENTS
 from runner.wrappers.described import Described, describe, kind_of
 from runner.wrappers.loop import Loop
 from runner.wrappers.plan import plan_of
-from runner.wrappers.single import Recorded
+from runner.wrappers.single import Recorded, given
 from runner.wrappers.staged import AgentRows, VectorRows
 
 
@@ -56,7 +56,7 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
         n, asked = self.env.num_envs, dict(options) if options else {}
         mask = asked.pop("reset_mask", None)
         which = np.ones(n, np.bool_) if mask is None else np.array(mask, np.bool_)
-        result = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        result = self.env.reset(**given(seed=seed, options=options))
         seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
         with self._loop.lock:
             self._loop.activate(self._rows)
@@ -71,8 +71,8 @@ def record_vector(
     recordings: str | os.PathLike[str] | None = None,
     *,
     name: str | None = None,
-    seed: int = 0,
-    config: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    config: object = None,
     info: Sequence[str] = (),
     **packing: Any,
 ) -> RecordedVector:
@@ -113,8 +113,7 @@ def record_vector(
     described = replace(described, environments=envs.num_envs, mdp=None, agents=("agent",))
     _require_fixed(described)
     plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
-    loop = Loop(described, plan, lambda recorder, phase: VectorRows(recorder, described, phase))
-    return RecordedVector(envs, loop, mode)
+    return RecordedVector(envs, Loop(described, plan, VectorRows), mode)
 
 
 class RecordedParallel(Recorded[AgentRows]):
@@ -152,7 +151,7 @@ class RecordedParallel(Recorded[AgentRows]):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Reset the environment, and record it."""
-        result = self.env.reset(seed=seed, options=options)
+        result = self.env.reset(**given(seed=seed, options=options))
         with self._loop.lock:
             self._loop.activate(self._rows)
             self._rows.reset(result[0], seed)
@@ -165,8 +164,8 @@ def record_parallel(
     recordings: str | os.PathLike[str] | None = None,
     *,
     name: str | None = None,
-    seed: int = 0,
-    config: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    config: object = None,
     info: Sequence[str] = (),
     **packing: Any,
 ) -> RecordedParallel:
@@ -196,8 +195,7 @@ def record_parallel(
     described = _game(env)
     _require_fixed(described)
     plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
-    loop = Loop(described, plan, lambda recorder, phase: AgentRows(recorder, described, phase))
-    return RecordedParallel(env, loop)
+    return RecordedParallel(env, Loop(described, plan, AgentRows))
 
 
 def _require_fixed(described: Described) -> None:

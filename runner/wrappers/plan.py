@@ -12,9 +12,11 @@ import numpy as np
 
 from runner.errors import ConfigError
 from runner.scene import is_whole
-from runner.wrappers.described import Described, as_json
+from runner.wrappers.described import Described, as_json, as_mapping
 
 MADE_BY: Final = "runner.record"
+ALL_INFO: Final = "*"
+"""Among the names of info fields: all of them."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +25,8 @@ class Plan:
 
     recordings: str | os.PathLike[str] | None = None
     name: str | None = None
-    seed: int = 0
-    config: Mapping[str, Any] = field(default_factory=dict)
+    seed: int | None = None
+    config: Mapping[Any, Any] = field(default_factory=dict)
     info: tuple[str, ...] = ()
     frames_every: int = 0
     frame_format: str = "png"
@@ -44,7 +46,7 @@ class Plan:
             "name": self.name or described.env_id.rpartition("/")[2].rpartition(":")[2],
             "made_by": MADE_BY,
             "env": {"id": described.env_id, "kwargs": described.kwargs},
-            "seeds": [self.seed],
+            "seeds": [] if self.seed is None else [self.seed],
             "config": self._settings(),
             "info": list(self.info),
             "frames": {"every": self.frames_every, "format": self.frame_format},
@@ -60,21 +62,24 @@ class Plan:
     def _settings(self) -> Any:
         """Return the user's own settings as JSON holds them."""
         try:
-            told = as_json(dict(self.config))
-            json.dumps(told, ensure_ascii=False).encode()
+            settings = as_json(self.config)
+            json.dumps(settings, ensure_ascii=False).encode()
         except (RecursionError, ValueError) as error:
             raise ConfigError(
                 f"config: found what JSON cannot hold ({error}), expected text, numbers, lists and mappings."
             ) from error
-        return told
+        return settings
 
     def _check(self) -> None:
         from runner.api import checked_name
 
         expectations = (
             ("name", "text", self.name is None or isinstance(self.name, str)),
-            ("seed", "a whole number from 0", is_whole(self.seed, 0, 2**64 - 1)),
-            ("config", "a mapping", isinstance(self.config, Mapping)),
+            (
+                "seed",
+                "a whole number from 0, or None",
+                self.seed is None or is_whole(self.seed, 0, 2**64 - 1),
+            ),
             ("info", "names of fields", all(isinstance(name, str) for name in self.info)),
             ("frames_every", "a whole number from 0", is_whole(self.frames_every, 0, 2**31)),
             ("frame_format", "png or jpeg", self.frame_format in ("png", "jpeg")),
@@ -92,14 +97,14 @@ class Plan:
 def plan_of(
     recordings: str | os.PathLike[str] | None,
     name: str | None,
-    seed: int,
-    config: Mapping[str, Any] | None,
+    seed: int | None,
+    config: object,
     info: Sequence[str],
     frames_every: int,
     frame_format: str,
     packing: Mapping[str, Any],
 ) -> Plan:
-    """Return what a user asked for.
+    """Return the plan for the arguments of `record`.
 
     Raises:
         ConfigError: there is no such argument, or Pillow is missing for frames.
@@ -108,8 +113,13 @@ def plan_of(
     known = ("compression", "level", "index", "chunk_steps")
     if unknown := set(packing) - set(known):
         raise ConfigError(f"found the argument {sorted(unknown)[0]!r}, expected one of {', '.join(known)}")
-    if isinstance(info, str):
+    if isinstance(info, str) and info != ALL_INFO:
         raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
+    settings = as_mapping({} if config is None else config)
+    if settings is None:
+        raise ConfigError(
+            f"config: found {type(config).__name__}, expected a mapping, a dataclass or a namespace"
+        )
     if frames_every:
         from runner.wrappers.frames import pillow
 
@@ -118,7 +128,7 @@ def plan_of(
         recordings=recordings,
         name=name,
         seed=given.item() if isinstance(given, np.integer) else given,
-        config=config or {},
+        config=settings,
         info=tuple(info),
         frames_every=frames_every,
         frame_format=frame_format,

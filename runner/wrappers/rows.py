@@ -7,6 +7,7 @@ numbers, the state before each, the lengths of episodes) is computed for a whole
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +20,7 @@ from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
 from runner.wrappers.described import Described, parts_of
 from runner.wrappers.judge import Judge
-from runner.wrappers.values import check_value, filler, lone_number, value_bytes, whole_number
+from runner.wrappers.values import filler, leaves, lone_number, value_bytes, whole_number
 
 _DISCRETE: Final = struct.Struct("<qqd??")
 _DISCRETE_DTYPE: Final = np.dtype(
@@ -40,9 +41,14 @@ class Rows:
         recorder: takes them.
         described: the environment and its spaces.
         phase: `train` or `eval`.
+        first_action: called with the first action of the phase before it is put down; may call `reshape`.
     """
 
-    def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
+        self._first_action = first_action
+        self._set_leaves(described)
         topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
         self._recorder = recorder
         self._phase = phase
@@ -125,6 +131,17 @@ class Rows:
     def _end(self, row: int, terminated: bool, truncated: bool) -> None:
         self._ends.append((row, self._return, terminated, truncated))
         self._fresh = True
+
+    def _set_leaves(self, described: Described) -> None:
+        self._action_leaves = leaves(parts_of(described.recorded_action, "the action space"), "action")
+        self._observation_leaves = leaves(
+            parts_of(described.observation, "the observation space"), "observation"
+        )
+
+    def reshape(self, described: Described) -> None:
+        """Take blocks anew for actions of another dtype; no step was put down yet."""
+        self._set_leaves(described)
+        self.open()
 
     # --- blocks ---------------------------------------------------------------------------------------
 
@@ -228,9 +245,11 @@ class BlockRows(Rows):
     _brought: np.dtype[np.void]
     """What a step brings that waits until its block is completed."""
 
-    def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
         self._scratch = np.zeros(0, self._brought)
-        super().__init__(recorder, described, phase)
+        super().__init__(recorder, described, phase, first_action)
 
     def _open_steps(self) -> tuple[int, int]:
         self._block = self._recorder.block(self._steps)
@@ -259,12 +278,14 @@ class DiscreteRows(BlockRows):
 
     _brought = _DISCRETE_DTYPE
 
-    def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
         self._state_start = int(described.observation.start)  # type: ignore[attr-defined]
         self._action_start = int(described.action.start)  # type: ignore[attr-defined]
         self._state: int | None = None
         """The state before the first row; None before any reset."""
-        super().__init__(recorder, described, phase)
+        super().__init__(recorder, described, phase, first_action)
 
     def _open_steps(self) -> tuple[int, int]:
         rooms = super()._open_steps()
@@ -319,17 +340,23 @@ class ArrayRows(BlockRows):
 
     _brought = _ENDING_DTYPE
 
-    def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
-        self._action_parts = parts_of(described.action, "the action space")
-        self._observation_parts = parts_of(described.observation, "the observation space")
-        super().__init__(recorder, described, phase)
+    _is_settled = False
+    """Whether the dtype of actions is known: an action was put down."""
 
     def _open_steps(self) -> tuple[int, int]:
         rooms = super()._open_steps()
-        self._action = filler(self._action_parts, self._block["action"], "action")
-        self._next = filler(self._observation_parts, self._block["next_observation"], "observation")
-        self._first = filler(self._observation_parts, self._reset_block["observation"], "observation")
+        put_action = filler(self._action_leaves, self._block["action"])
+        self._action = put_action if self._is_settled else self._settle
+        self._next = filler(self._observation_leaves, self._block["next_observation"])
+        self._first = filler(self._observation_leaves, self._reset_block["observation"])
         return rooms
+
+    def _settle(self, row: int, action: Any) -> None:
+        """Put down the first action, whose dtype is the one that all are recorded in."""
+        self._is_settled = True
+        self._first_action(action)
+        self._action = filler(self._action_leaves, self._block["action"])
+        self._action(row, action)
 
     def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
         """Put down a step."""
@@ -338,15 +365,12 @@ class ArrayRows(BlockRows):
             reward = float(reward)
         except (TypeError, ValueError):
             reward = lone_number(reward, "reward")
-        if row == 0:
-            check_value(self._action_parts, action, "action", 4)
         self._action(row, action)
         self._next(row, observation)
         _ENDING.pack_into(self._bytes, row * 10, reward, terminated, truncated)
         self._count(reward, terminated, truncated)
 
     def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
-        check_value(self._observation_parts, observation)
         self._first(len(self._reset_rows), observation)
 
     def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
@@ -359,11 +383,12 @@ class ArrayRows(BlockRows):
 class VariableRows(Rows):
     """Rows of `dualtaxi.Transition` where a space has texts: each message is made when it comes."""
 
-    def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
-        self._action_parts = parts_of(described.action, "the action space")
-        self._observation_parts = parts_of(described.observation, "the observation space")
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
         self._paid = np.zeros(_VARIABLE_ROWS)
-        super().__init__(recorder, described, phase)
+        self._is_settled = False
+        super().__init__(recorder, described, phase, first_action)
 
     def _open_steps(self) -> tuple[int, int]:
         return _VARIABLE_ROWS, _VARIABLE_ROWS
@@ -371,13 +396,16 @@ class VariableRows(Rows):
     def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
         """Put down a step."""
         row, reward = self.filled, lone_number(reward, "reward")
+        if not self._is_settled:
+            self._is_settled = True
+            self._first_action(action)
         step, episode = self.place[0], self._coming
         began = row if self._fresh else self._begins[-1] if self._begins else -self._t
         payload = encode(
             schema.TRANSITION,
             {
-                "action": value_bytes(self._action_parts, action),
-                "next_observation": value_bytes(self._observation_parts, observation),
+                "action": value_bytes(self._action_leaves, action),
+                "next_observation": value_bytes(self._observation_leaves, observation),
                 "rewards": [reward],
                 "step": step,
                 "episode": episode,
@@ -399,7 +427,7 @@ class VariableRows(Rows):
         payload = encode(
             schema.RESET,
             {
-                "observation": value_bytes(self._observation_parts, observation),
+                "observation": value_bytes(self._observation_leaves, observation),
                 "reset": self._were_reset,
                 "episode": episode,
                 "step": step,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import weakref
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Generic, Literal, Self
 
 import gymnasium
+from gymnasium.vector import VectorEnv
 
 from runner.errors import ConfigError
 from runner.recording import schema
@@ -34,19 +36,31 @@ class Recorded(Generic[R]):
         """The run that is recorded, in its folder; its `summary` is there once it is closed."""
         return self._loop.run
 
-    def log(self, name: str, value: Any) -> None:
-        """Record a number or a text under a name: `rec.log("loss", loss)`.
+    def log(self, name: str | Mapping[str, Any], value: Any = None) -> None:
+        """Record a number or a text under a name: `rec.log("loss", loss)`, `rec.log({"loss": loss})`.
 
         Raises:
             ConfigError: it is neither.
         """
-        self._loop.log(self._phase, name, value)
+        if isinstance(name, str):
+            self._loop.log(self._phase, name, value)
+            return
+        if not isinstance(name, Mapping) or value is not None:
+            raise ConfigError(f"log: found {name!r}, expected a name and a value, or a mapping of them")
+        for key, own in name.items():
+            if isinstance(own, Mapping):
+                self.log({f"{key}/{inner}": part for inner, part in own.items()})
+            else:
+                self._loop.log(self._phase, key, own)
 
     def snapshot(self, name: str, array: Any) -> None:
-        """Record an array of numbers as it is now: `rec.snapshot("q", q)`.
+        """Record an array of numbers, or each of a mapping of arrays, as it is now: `rec.snapshot("q", q)`.
+
+        Tensors of PyTorch and JAX are taken too; their short floats, such as bfloat16, become float32. The
+        arrays of a mapping, such as a `state_dict`, are named `name/key`.
 
         Raises:
-            ConfigError: it holds something else, or is larger than 64 MB.
+            ConfigError: it holds something else, or an array is larger than 64 MB.
         """
         self._loop.snapshot(self._phase, name, array)
 
@@ -92,16 +106,41 @@ class Recorded(Generic[R]):
     def _own(self, loop: Loop[R]) -> None:
         """Begin a recording; should it never be closed, it is when the process ends."""
         self._loop = loop
-        weakref.finalize(self, loop.close, "interrupted")
+        loop.views.add(self)
+        weakref.finalize(self, _close_abandoned, loop)
+
+    def _detach(self) -> None:
+        """Record nothing more: this process was forked from the one that records."""
+        self._enter(self._phase)
 
     def _leave(self, error: BaseException | None) -> None:
         """Close the recording with how the loop ended."""
-        if error is None:
-            self._loop.close()
-        elif isinstance(error, KeyboardInterrupt) or (isinstance(error, SystemExit) and not error.code):
-            self._loop.close("interrupted")
-        else:
-            self._loop.close("failed", f"{type(error).__name__}: {error}")
+        self._loop.close(*_ending(error))
+
+
+def _ending(error: BaseException | None) -> tuple[str, str]:
+    """Return the status of a run that this error ended, and the text to keep."""
+    if error is None:
+        return "finished", ""
+    if isinstance(error, KeyboardInterrupt) or (isinstance(error, SystemExit) and not error.code):
+        return "interrupted", ""
+    return "failed", f"{type(error).__name__}: {error}"
+
+
+def _close_abandoned(loop: Loop[Any]) -> None:
+    """Close a recording that nobody closed: as failed if an uncaught exception ends the process.
+
+    Python keeps such an exception in `sys.last_value`; an interactive session keeps errors there that
+    ended nothing.
+    """
+    error = getattr(sys, "last_value", None)
+    is_interactive = bool(sys.flags.interactive) or hasattr(sys, "ps1")
+    loop.close(*(("interrupted", "") if error is None or is_interactive else _ending(error)))
+
+
+def given(**arguments: Any) -> dict[str, Any]:
+    """Return the arguments that are not None: an environment's `reset` need not know the others."""
+    return {name: value for name, value in arguments.items() if value is not None}
 
 
 class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -119,15 +158,16 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         gymnasium.Wrapper.__init__(self, env)
         self._owner = owner
         self._env_step = env.step
-        self._lock = loop.lock
         self._watched = bool(loop.plan.info or loop.plan.frames_every)
         self._until_frame = 0
         self._loop = loop
+        loop.views.add(self)
         self._enter(phase)
 
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
         self._take = self._rows.take
+        self._lock = self._loop.lock
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Take a step, and record it."""
@@ -146,7 +186,7 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Reset the environment, and record it: the seed, the options, the observation."""
         asked = dict(options) if options else None
-        result = self.env.reset(seed=seed, options=options)
+        result = self.env.reset(**given(seed=seed, options=options))
         observation, info = result
         with self._lock:
             self._loop.activate(self._rows)
@@ -173,8 +213,8 @@ def record(
     recordings: str | os.PathLike[str] | None = None,
     *,
     name: str | None = None,
-    seed: int = 0,
-    config: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    config: object = None,
     info: Sequence[str] = (),
     frames_every: int = 0,
     frame_format: str = "png",
@@ -197,9 +237,10 @@ def record(
         recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, unless given; or a server
             (`http://localhost:8000`), to which the run is pushed while it is recorded and at its end.
         name: what the run is called; the environment's name unless given.
-        seed: what the run is listed with; the seeds of resets are recorded beside.
-        config: your own settings, to be shown, compared and searched by: what JSON can hold.
-        info: fields of `info` to record, of steps and resets; one that is missing now and then is no error.
+        seed: the seed that the run is listed with, if any; the seeds of resets are recorded anyway.
+        config: your own settings, to be shown, compared and searched by: a mapping, a dataclass, a namespace
+            such as argparse gives, or OmegaConf's.
+        info: fields of `info` to record, of steps and resets, where they occur; `["*"]` for all.
         frames_every: render a frame at each reset, every so many steps and at the end of each episode; the
             environment must be made with render_mode="rgb_array".
         frame_format: `png`, exact, or `jpeg`.
@@ -208,11 +249,11 @@ def record(
         packing: `compression`, `level`, `index`, `chunk_steps`, as the configuration's `recording` has them.
 
     Raises:
-        EnvironmentNotUsable: a space cannot be recorded: Graph, Sequence, OneOf, or one of your own.
+        EnvironmentNotUsable: a space cannot be recorded.
         ConfigError: an argument cannot be used.
         StorageError: the recordings folder cannot be written.
     """
-    if not isinstance(env, gymnasium.Env):
+    if not isinstance(env, gymnasium.Env) or issubclass(type(env), VectorEnv):  # EnvPool's are both
         raise ConfigError(
             f"found {type(env).__name__}, expected a Gymnasium environment, such as gymnasium.make gives; "
             "record_vector is for vector environments, record_parallel for PettingZoo's."
@@ -229,7 +270,7 @@ def record(
     plan = plan_of(recordings, name, seed, config, info, frames_every, frame_format, packing)
     if frames_every:
         _require_pictures(env)
-    loop = Loop(described, plan, lambda recorder, part: ROWS[described.kind](recorder, described, part))
+    loop: Loop[Rows] = Loop(described, plan, ROWS[described.kind])
     recorded = RecordedEnv(env, loop, phase)
     recorded._own(loop)
     return recorded

@@ -6,7 +6,7 @@ phase is of environment n modulo N.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
-from runner.wrappers.described import Described, Part, parts_of
-from runner.wrappers.values import put_batch, put_chosen
+from runner.wrappers.described import Described, parts_of
+from runner.wrappers.values import Leaf, leaves, put_batch, put_chosen
 
 Flags = NDArray[np.bool_]
 
@@ -32,7 +32,11 @@ class StagedRows:
     filled = 0
     off_table = 0
 
-    def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
+        self._first_action = first_action
+        self._is_settled = False
         topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
         self._recorder = recorder
         self._phase = phase
@@ -48,6 +52,7 @@ class StagedRows:
         self._return = np.zeros((n, len(described.agents)))
         self._ended = 0
         self._were_reset = 0
+        self._set_leaves(described)
 
     @property
     def place(self) -> tuple[int, int]:
@@ -59,6 +64,20 @@ class StagedRows:
 
     def commit(self) -> None:
         """Do nothing: no rows wait."""
+
+    def reshape(self, described: Described) -> None:
+        """Make room for actions of another dtype; no step was put down yet."""
+        self._stage = self._recorder.blank(self._steps, self._n)
+        self._set_leaves(described)
+
+    def _set_leaves(self, described: Described) -> None:
+        raise NotImplementedError
+
+    def _settle(self, action: Any) -> None:
+        """Learn the dtype of actions from the first one."""
+        if not self._is_settled:
+            self._is_settled = True
+            self._first_action(action)
 
     def _put_steps(
         self, rewards: NDArray[Any], only_reset: Flags, terminated: Flags, truncated: Flags
@@ -132,15 +151,21 @@ class StagedRows:
 class VectorRows(StagedRows):
     """The steps of the environments of a vector environment."""
 
-    def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
-        super().__init__(recorder, described, phase)
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
+        super().__init__(recorder, described, phase, first_action)
         self._discrete = described.kind == "step"
         self._observation, self._action = described.observation, described.action
-        self._observation_parts = parts_of(described.observation, "the observation space")
-        self._action_parts = parts_of(described.action, "the action space")
         dtype = recorder.blank(self._resets, 1).dtype["observation"]
         self._seen = np.zeros(self._n, np.dtype([("value", dtype)]))["value"]
         """What was last observed in each environment."""
+
+    def _set_leaves(self, described: Described) -> None:
+        self._observation_leaves = leaves(
+            parts_of(described.observation, "the observation space"), "observation"
+        )
+        self._action_leaves = leaves(parts_of(described.recorded_action, "the action space"), "action")
 
     def take(
         self,
@@ -164,20 +189,21 @@ class VectorRows(StagedRows):
             final: what was observed last of episodes that ended, where `observation` is already of the
                 next; None where it is not.
         """
+        self._settle(action)
         stage, over = self._stage, terminated | truncated
         now = np.zeros_like(self._seen)
-        put_batch(self._observation_parts, observation, now, "an observation")
+        put_batch(self._observation_leaves, observation, now, (self._n,))
         last = now
         if final is not None and over.any():
             last = now.copy()
-            put_chosen(self._observation_parts, final, last, np.flatnonzero(over))
+            put_chosen(self._observation_leaves, final, last, np.flatnonzero(over))
         if self._discrete:
             actions = np.asarray(action).astype(np.int64)
             stage["state"] = self._seen - _start(self._observation)
             stage["action"] = actions - _start(self._action)
             stage["next_state"] = last - _start(self._observation)
         else:
-            put_batch(self._action_parts, action, stage["action"], "an action")
+            put_batch(self._action_leaves, action, stage["action"], (self._n,))
             stage["next_observation"] = last
             stage["acted"] = 1
             stage["agents_terminated"], stage["agents_truncated"] = terminated, truncated
@@ -194,7 +220,7 @@ class VectorRows(StagedRows):
         chosen = np.flatnonzero(which)
         self._abandon(chosen)
         now = np.zeros_like(self._seen)
-        put_batch(self._observation_parts, observation, now, "an observation")
+        put_batch(self._observation_leaves, observation, now, (self._n,))
         self._seen[which] = now[which]
         self._begin(chosen, now[which], seeds)
 
@@ -202,13 +228,15 @@ class VectorRows(StagedRows):
 class AgentRows(StagedRows):
     """The steps of all agents of a PettingZoo parallel environment."""
 
-    def __init__(self, recorder: Recorder, described: Described, phase: str) -> None:
-        super().__init__(recorder, described, phase)
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
+        super().__init__(recorder, described, phase, first_action)
         self._agents = described.agents
-        assert isinstance(described.observation, spaces.Dict)
-        assert isinstance(described.action, spaces.Dict)
-        self._observation_parts = _by_agent(described.observation)
-        self._action_parts = _by_agent(described.action)
+
+    def _set_leaves(self, described: Described) -> None:
+        self._observation_leaves = _by_agent(described.observation, "observation")
+        self._action_leaves = _by_agent(described.recorded_action, "action")
 
     def take(
         self,
@@ -220,11 +248,12 @@ class AgentRows(StagedRows):
         over: bool,
     ) -> None:
         """Put down a step; agents that are missing take no part in it."""
+        self._settle(actions)
         stage = self._stage
         for name in ("action", "next_observation"):
             stage[name] = np.zeros((), stage.dtype[name])
-        self._put_agents(self._action_parts, actions, stage["action"])
-        self._put_agents(self._observation_parts, observations, stage["next_observation"])
+        self._put_agents(self._action_leaves, actions, stage["action"])
+        self._put_agents(self._observation_leaves, observations, stage["next_observation"])
         stage["acted"] = self._mask(dict.fromkeys(actions, True))
         stage["agents_terminated"] = self._mask(terminated)
         stage["agents_truncated"] = self._mask(truncated)
@@ -240,26 +269,27 @@ class AgentRows(StagedRows):
         only = np.zeros(1, np.intp)
         self._abandon(only)
         row = self._recorder.blank(self._resets, 1)["observation"]
-        self._put_agents(self._observation_parts, observations, row)
+        self._put_agents(self._observation_leaves, observations, row)
         self._begin(only, row, [seed])
 
     def _put_agents(
-        self, parts: Mapping[str, Sequence[Part]], values: Mapping[str, Any], into: NDArray[Any]
+        self, own: Mapping[str, Sequence[Leaf]], values: Mapping[str, Any], into: NDArray[Any]
     ) -> None:
         for agent, value in values.items():
-            if agent not in parts:
+            if agent not in own:
                 raise RecordingError(
                     f"found the agent {agent!r}, expected one of possible_agents: {', '.join(self._agents)}"
                 )
-            put_batch(parts[agent], {agent: value}, into, f"a value of {agent}")
+            put_batch(own[agent], {agent: value}, into)
 
     def _mask(self, flags: Mapping[str, bool]) -> int:
         return sum(bool(flags.get(agent)) << i for i, agent in enumerate(self._agents))
 
 
-def _by_agent(space: spaces.Dict) -> dict[str, list[Part]]:
-    parts = parts_of(space, "the agents' spaces")
-    return {agent: [part for part in parts if part.keys[0] == agent] for agent in space.spaces}
+def _by_agent(space: spaces.Space[Any], what: str) -> dict[str, list[Leaf]]:
+    assert isinstance(space, spaces.Dict)
+    own = leaves(parts_of(space, "the agents' spaces"), what)
+    return {agent: [leaf for leaf in own if leaf.keys[0] == agent] for agent in space.spaces}
 
 
 def _start(space: Any) -> int:

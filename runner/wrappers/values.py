@@ -1,48 +1,140 @@
-"""Values of spaces, put where they are written from; what is not of its space is refused."""
+"""Values of spaces on their way into a recording: checked for shape and for rounding."""
 
 from __future__ import annotations
 
+import math
+import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.spaces import encode_text
+from runner.recording.spaces import MAX_VALUE_BYTES, encode_text
 from runner.wrappers.described import Part
 
+_HERE: Final = str(Path(__file__).parent)
+_SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
 
-def filler(parts: Sequence[Part], column: NDArray[Any], what: str) -> Callable[[int, Any], None]:
-    """Return what puts a value of a space into a row of a column.
+
+class Leaf:
+    """One part of a space, with the checks that its values pass before they are recorded.
+
+    Args:
+        part: where the part is in a value, and its dtype.
+        what: `observation` or `action`. An action may have another shape with as many numbers, because
+            only the environment knows which shapes it takes.
+    """
+
+    def __init__(self, part: Part, what: str) -> None:
+        self.part = part
+        self.keys = part.keys
+        self.name = what + "".join(f"[{key!r}]" for key in part.keys)
+        self.text = part.text
+        self._is_action = what == "action"
+        if part.dtype is None:
+            return
+        self.base = np.dtype(part.dtype.base.str)
+        self.shape = part.dtype.shape
+        scalars = {kind for kind in _SCALARS if np.can_cast(kind, self.base)}
+        scalars |= {bool} | ({int} if self.base.kind in "iu" else {float} if self.base.char == "d" else set())
+        self.exact_scalars = frozenset(() if self.shape else scalars)
+        """Classes of which every value is recorded exactly, or refused by NumPy."""
+        self._is_rounded = False
+
+    def fit(self, value: Any, batch: tuple[int, ...] = ()) -> NDArray[Any]:
+        """Return a value as an array that can be recorded; warn the first time that one is rounded.
+
+        Args:
+            value: of this part alone.
+            batch: the shape of the batch that it is, if it is one.
+
+        Raises:
+            RecordingError: it has another shape, holds no numbers, or numbers out of the dtype's range.
+        """
+        found = np.asarray(value)
+        if found.dtype.kind not in "biuf":
+            raise self.refused(f"found {found.dtype}, expected {self.base}")
+        if found.shape != batch + self.shape:
+            if not self._is_action or found.size != math.prod(batch + self.shape):
+                raise RecordingError(
+                    f"found {self.name} of shape {found.shape}, expected {batch + self.shape} by its space."
+                )
+            found = found.reshape(batch + self.shape)
+        if found.dtype is self.base or np.can_cast(found.dtype, self.base):
+            return found
+        with np.errstate(all="ignore"):
+            kept = found.astype(self.base)
+        if not np.array_equal(kept, found, equal_nan=found.dtype.kind == "f"):
+            self._check_range(found)
+            if not self._is_rounded:
+                self._is_rounded = True
+                warn_user(
+                    f"{self.name} comes as {found.dtype} and is recorded, rounded, as the {self.base} of its "
+                    "space. This is warned of once."
+                )
+        return kept
+
+    def _check_range(self, found: NDArray[Any]) -> None:
+        """Refuse numbers that an integer dtype cannot hold at all."""
+        if self.base.kind not in "iu":
+            return
+        limits = np.iinfo(self.base)
+        if not ((found >= limits.min) & (found <= limits.max)).all():
+            raise self.refused(f"{self.base} holds {limits.min} to {limits.max}")
+
+    def refused(self, reason: object) -> RecordingError:
+        """Return the error for a value that is not of the space."""
+        what = "action" if self._is_action else "observation"
+        return RecordingError(f"found an {what} that is not of the environment's {what} space ({reason}).")
+
+
+def leaves(parts: Sequence[Part], what: str) -> list[Leaf]:
+    """Return the leaves for the parts of a space; `what` is `observation` or `action`."""
+    return [Leaf(part, what) for part in parts]
+
+
+def filler(own: Sequence[Leaf], column: NDArray[Any]) -> Callable[[int, Any], None]:
+    """Return a function that puts a value of a space into a row of a column.
 
     Raises:
-        RecordingError: (what is returned) a value is not of its space.
+        RecordingError: (from the returned function) a value is not of its space.
     """
-    if not parts:
-        return lambda _row, _value: None
-    columns = [(part.keys, _within(column, part)) for part in parts]
-
-    def put_one(row: int, value: Any) -> None:
-        try:
-            only[row] = value
-        except (TypeError, ValueError, OverflowError) as error:
-            raise _no_value(what, error) from error
+    if len(own) == 1 and not own[0].keys:
+        return _single_filler(own[0], column)
+    fillers = [(leaf, _single_filler(leaf, _within(column, leaf.part))) for leaf in own]
 
     def put(row: int, value: Any) -> None:
-        try:
-            for keys, own in columns:
-                inside = value
-                for key in keys:
+        for leaf, put_leaf in fillers:
+            inside = value
+            try:
+                for key in leaf.keys:
                     inside = inside[key]
-                own[row] = inside
-        except (TypeError, ValueError, LookupError, OverflowError) as error:
-            raise _no_value(what, error) from error
+            except (TypeError, LookupError) as error:
+                raise leaf.refused(error) from error
+            put_leaf(row, inside)
 
-    if len(columns) == 1 and not columns[0][0]:
-        only = columns[0][1]
-        return put_one
+    return put
+
+
+def _single_filler(leaf: Leaf, column: NDArray[Any]) -> Callable[[int, Any], None]:
+    base, shape, scalars, array = leaf.base, leaf.shape, leaf.exact_scalars, np.ndarray
+
+    def put(row: int, value: Any) -> None:
+        kind = value.__class__
+        try:
+            if kind is array:  # the usual case costs two comparisons
+                if value.dtype is not base or value.shape != shape:
+                    value = leaf.fit(value)
+            elif kind not in scalars:
+                value = leaf.fit(value)
+            column[row] = value
+        except (TypeError, ValueError, OverflowError) as error:
+            raise leaf.refused(error) from error
+
     return put
 
 
@@ -52,98 +144,67 @@ def _within(column: NDArray[Any], part: Part) -> NDArray[Any]:
     return column
 
 
-def _no_value(what: str, error: Exception) -> RecordingError:
-    return RecordingError(f"found an {what} that is not of the environment's {what} space ({error}).")
-
-
-def check_value(parts: Sequence[Part], value: Any, what: str = "observation", level: int = 6) -> None:
-    """Refuse a value of another shape; warn of numbers that the space's dtype cannot hold exactly.
-
-    Args:
-        parts: of its space.
-        value: the value.
-        what: `observation`, or `action`, of which the environment alone knows what shape it takes.
-        level: of the warning: how many calls away the loop is.
+def value_bytes(own: Sequence[Leaf], value: Any) -> bytes:
+    """Return a value of a space as the bytes that a recording holds.
 
     Raises:
-        RecordingError: it is one.
-    """
-    for part in parts:
-        try:
-            inside = part.of(value)
-        except (TypeError, LookupError) as error:
-            raise _no_value(what, error) from error
-        if part.dtype is None:
-            continue
-        found, expected = np.asarray(inside), part.dtype
-        name = "".join(f"[{key!r}]" for key in part.keys)
-        if found.dtype.kind not in "biuf" or (what == "action" and found.shape != expected.shape):
-            continue
-        if found.shape != expected.shape:
-            raise RecordingError(
-                f"found {what}{name} of shape {found.shape}, expected {expected.shape} by its space."
-            )
-        with np.errstate(all="ignore"):
-            kept = found.astype(expected.base)
-        if not np.array_equal(kept, found, equal_nan=found.dtype.kind == "f"):
-            warnings.warn(
-                f"{what}{name} comes as {found.dtype} and is recorded, rounded, as the {expected.base} "
-                "of its space",
-                RuntimeWarning,
-                stacklevel=level,
-            )
-
-
-def value_bytes(parts: Sequence[Part], value: Any) -> bytes:
-    """Return a value of a space as it stands in a recording.
-
-    Raises:
-        RecordingError: it is not of the space.
+        RecordingError: it is not of the space, or too large.
     """
     pieces = []
-    try:
-        for part in parts:
-            inside = part.of(value)
-            if part.dtype is None:
-                pieces.append(encode_text(inside))
+    for leaf in own:
+        try:
+            inside = leaf.part.of(value)
+            if leaf.text is not None:
+                pieces.append(encode_text(leaf.text(inside)))
             else:
-                array = np.empty(part.dtype.shape, part.dtype.base)
-                array[...] = inside
-                pieces.append(array.tobytes())
-    except (TypeError, ValueError, LookupError, AttributeError, OverflowError) as error:
-        raise _no_value("observation or action", error) from error
+                pieces.append(np.asarray(leaf.fit(inside), leaf.base, order="C").tobytes())
+        except (TypeError, ValueError, LookupError, AttributeError, OverflowError, RecursionError) as error:
+            raise leaf.refused(error) from error
+    if (size := sum(map(len, pieces))) > MAX_VALUE_BYTES:
+        raise own[0].refused(f"it takes {size:,} bytes, expected at most {MAX_VALUE_BYTES:,}")
     return b"".join(pieces)
 
 
-def put_batch(parts: Sequence[Part], value: Any, into: NDArray[Any], what: str) -> None:
+def put_batch(own: Sequence[Leaf], value: Any, into: NDArray[Any], batch: tuple[int, ...] = ()) -> None:
     """Put batched values of a space into a column, all rows at once.
+
+    Args:
+        own: the leaves of the space.
+        value: batched, as a vector environment has it; a single value for an empty batch.
+        into: the column.
+        batch: the shape of the batch.
 
     Raises:
         RecordingError: they are not of the space.
     """
-    try:
-        for part in parts:
-            _within(into, part)[...] = part.of(value)
-    except (TypeError, ValueError, LookupError, OverflowError) as error:
-        raise RecordingError(f"found {what} that is not of its space ({error}).") from error
+    for leaf in own:
+        try:
+            inside = leaf.part.of(value)
+            if inside.__class__ is not np.ndarray or (
+                inside.dtype is not leaf.base or inside.shape != batch + leaf.shape
+            ):
+                inside = leaf.fit(inside, batch)
+            _within(into, leaf.part)[...] = inside
+        except (TypeError, ValueError, LookupError, OverflowError) as error:
+            raise leaf.refused(error) from error
 
 
-def put_chosen(parts: Sequence[Part], values: Any, into: NDArray[Any], which: NDArray[np.intp]) -> None:
+def put_chosen(own: Sequence[Leaf], values: Any, into: NDArray[Any], which: NDArray[np.intp]) -> None:
     """Put values of single environments into their rows, as a vector's info holds them.
 
     Raises:
         RecordingError: they are not of the space.
     """
     for i in which.tolist():
-        own = _picked(values, i)
-        check_value(parts, own)
-        put_batch(parts, own, into[i : i + 1], "an observation")
+        put_batch(own, _picked(values, i), into[i : i + 1])
 
 
 def _picked(values: Any, i: int) -> Any:
     """Return the value of one environment out of a mapping of batches."""
     if isinstance(values, Mapping):
         return {key: _picked(part, i) for key, part in values.items() if not str(key).startswith("_")}
+    if isinstance(values, tuple):
+        return tuple(_picked(part, i) for part in values)
     return values[i]
 
 
@@ -170,3 +231,11 @@ def _lone(value: Any, what: str, kinds: str, expected: str) -> Any:
     if array.size != 1 or array.dtype.kind not in kinds:
         raise RecordingError(f"found the {what} {value!r}, expected {expected}.")
     return array.reshape(())
+
+
+def warn_user(message: str) -> None:
+    """Warn of something in the user's loop, at the line of the loop and not in this package."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_HERE):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, RuntimeWarning, stacklevel=level)

@@ -98,7 +98,7 @@ def _in_words(done: Archived) -> dict[str, str]:
     kept = "removed" if done.removed else "kept"
     state = "" if done.new else "  (it was there already, and is whole)"
     return {
-        "run": f"{done.run.run_id}  {done.run.name}, seed {done.run.seed}",
+        "run": f"{done.run.run_id}  {done.run.title}",
         "archive": done.place + state,
         "size": f"{size(done.manifest.size)}{each}; the recording: {size(done.recording_bytes)}, {kept}",
         "digest": done.manifest.digest,

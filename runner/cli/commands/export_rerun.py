@@ -62,7 +62,7 @@ def command(
     require_new(path, force)
     request = request_of(episodes, evaluations, every, everything)
     with open_recording(run.recording) as recording, announcing(), stage_line("exporting"):
-        source = Source(recording, f"{run.name}, seed {run.seed} ({run.run_id})")
+        source = Source(recording, f"{run.title} ({run.run_id})")
         (selection,) = export([source], request, path)
     tell(selection)
     took = duration(time.monotonic() - started)

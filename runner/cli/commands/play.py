@@ -64,7 +64,7 @@ def command(
     with open_recording(run.recording) as recording:
         require_steps(recording, "play")
         phase, number, title = _chosen(recording, episode, trial)
-        played = Episode(recording, phase, number, f"{run.name}, seed {run.seed}: {title}")
+        played = Episode(recording, phase, number, f"{run.title}: {title}")
     if as_json:
         for step in played.steps():
             print_json(step, indent=None)

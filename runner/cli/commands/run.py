@@ -160,7 +160,7 @@ def _watcher(config: ExperimentConfig, live: bool, every: int | None, url: str |
     address = viewer.check_address(url) if url else viewer.live_window(viewer.free_port())
     one_in = every or max(1, config.episodes // LIVE_EPISODES)
     say(f"Live: every metric, and the steps of one episode in {one_in:,}, at {address}")
-    return lambda run: LiveView(f"{run.name}, seed {run.seed} ({run.run_id})", run.run_id, one_in, address)
+    return lambda run: LiveView(f"{run.title} ({run.run_id})", run.run_id, one_in, address)
 
 
 def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch | None) -> tuple[Run, bool]:

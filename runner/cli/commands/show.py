@@ -83,7 +83,7 @@ def _draw(run: Run, told: dict[str, Any]) -> None:
 def _head(run: Run, told: dict[str, Any]) -> dict[str, str]:
     ago = age((datetime.now(UTC) - run.created).total_seconds())
     head = {
-        "run": f"{run.run_id}  {run.name}, seed {run.seed}",
+        "run": f"{run.run_id}  {run.title}",
         "status": f"{told['status']}, begun {ago} ago"
         + (f", took {duration(told['seconds'])}" if told["seconds"] is not None else ""),
     }

@@ -58,7 +58,7 @@ def cache_folder() -> Path:
 
 
 def _titles(runs: Sequence[Run]) -> list[str]:
-    return [f"{run.name}, seed {run.seed} ({run.run_id})" for run in runs]
+    return [f"{run.title} ({run.run_id})" for run in runs]
 
 
 def _key(runs: Sequence[Run], request: Request) -> str:

@@ -141,14 +141,17 @@ def test_what_an_environment_gives_wrongly_is_said(env, told, tmp_path):
     rec.close()
 
 
-def test_a_rounded_action_is_warned_of_and_the_environment_gets_it_as_it_is(tmp_path):
+def test_an_action_that_is_rounded_later_is_warned_of_once(tmp_path):
     env = Paid(1.0)
     with runner.record(env, tmp_path) as rec:
         rec.reset()
-        with pytest.warns(RuntimeWarning, match="action comes as float64") as told:
-            rec.step(np.array([0.1, 0.2]))
+        rec.step(np.zeros(2, np.float32))
         rec.step(np.array([0.5, 0.25]))
-    assert told[0].filename == __file__
+        with pytest.warns(RuntimeWarning, match="action comes as float64") as warned:
+            rec.step(np.array([0.1, 0.2]))
+        rec.step(np.array([0.3, 0.7]))
+    assert len(warned) == 1
+    assert warned[0].filename == __file__
 
 
 def test_a_seed_of_numpy_is_a_number(tmp_path):
