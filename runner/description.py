@@ -53,7 +53,7 @@ def _identity(run: Run) -> dict[str, Any]:
     return {
         "run_id": run.run_id,
         "name": run.name,
-        "seed": run.seed,
+        "seed": run.seed if run.has_seed else None,
         "status": run.status,
         "created": run.created_text,
         **({"damage": run.problem} if run.problem else {}),

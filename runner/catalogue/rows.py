@@ -119,7 +119,7 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         "name": text(run.name),
         "config": called,
         "problem": text(run.problem) or None,
-        "seed": run.file.seed,
+        "seed": run.file.seed if run.has_seed else None,
         "status": text(run.status),
         "tags": "\n".join(run.tags),
         "note": text(run.note),

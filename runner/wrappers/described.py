@@ -105,7 +105,8 @@ def describe(env: Any, observation: spaces.Space[Any], action: spaces.Space[Any]
     )
 
 
-_ADDED_BY_MAKE_VEC: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "wrappers"})
+_NOT_SETTINGS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "wrappers", "base_path"})
+"""What `gymnasium.make_vec` and EnvPool add to an environment's own settings."""
 
 
 def _registration(env: Any) -> tuple[str, dict[str, Any], int]:
@@ -117,10 +118,9 @@ def _registration(env: Any) -> tuple[str, dict[str, Any], int]:
     given = getattr(spec, "kwargs", None)
     if not isinstance(given, Mapping):
         given = getattr(spec, "config", None)
+        given = given._asdict() if hasattr(given, "_asdict") else given
     try:
-        kwargs = as_json(
-            {key: value for key, value in dict(given or {}).items() if key not in _ADDED_BY_MAKE_VEC}
-        )
+        kwargs = as_json({key: value for key, value in dict(given or {}).items() if key not in _NOT_SETTINGS})
     except (TypeError, ValueError, RecursionError):
         kwargs = {}
     name = getattr(spec, "id", None)

@@ -22,7 +22,7 @@ from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
 from runner.recording.facts import sizes_of
 from runner.recording.messages import encode, encode_image, encode_log, scalar_encoder
-from runner.recording.recorder import Recorder
+from runner.recording.recorder import FLUSH_SECONDS, Recorder
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.telling import (
     Attachments,
@@ -468,6 +468,8 @@ class Loop(Generic[R]):
         try:
             if self.closed or self.is_foreign:
                 return False
+            if time.monotonic() - self._started < FLUSH_SECONDS:
+                return True
             if self._is_undecided():
                 self.run.beat()
                 return True

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Mapping, Sequence
+import random
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
 
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.mdp import MAX_AGENTS
@@ -40,13 +42,13 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
         ended, cut = np.array(terminated, np.bool_), np.array(truncated, np.bool_)
         next_step = self._mode == AutoresetMode.NEXT_STEP
         only_reset = self._over if next_step else np.zeros_like(self._over)
-        final = infos.get("final_obs") if self._mode == AutoresetMode.SAME_STEP else None
+        final = _final_observations(infos) if self._mode == AutoresetMode.SAME_STEP else None
         with self._loop.lock:
             self._loop.activate(self._rows)
             self._rows.take(actions, observations, rewards, ended, cut, only_reset, final)
         self._over = ended | cut
         if self._loop.plan.info:
-            self._loop.info(self._phase, infos)
+            self._loop.info(self._phase, _by_environment(infos))
         return result
 
     def reset(
@@ -62,7 +64,7 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
             self._loop.activate(self._rows)
             self._rows.reset(result[0], seeds, which)
         self._over = self._over & ~which
-        self._loop.reset_info(self._phase, result[1], asked, None)
+        self._loop.reset_info(self._phase, _by_environment(result[1]), asked, None)
         return result
 
 
@@ -74,6 +76,7 @@ def record_vector(
     seed: int | None = None,
     config: object = None,
     info: Sequence[str] = (),
+    autoreset_mode: AutoresetMode | str | None = None,
     **packing: Any,
 ) -> RecordedVector:
     """Return a vector environment, recording whatever any loop does with it.
@@ -91,6 +94,8 @@ def record_vector(
         seed: what the run is listed with.
         config: your own settings.
         info: fields of the vector's infos to record.
+        autoreset_mode: how the environments reset themselves, where their metadata does not state it:
+            "NextStep", "SameStep" or "Disabled". SuperSuit's reset in the "SameStep".
         packing: as for `record`.
 
     Raises:
@@ -102,18 +107,85 @@ def record_vector(
         raise ConfigError(
             f"found {type(envs).__name__}, expected a vector environment, such as gymnasium.make_vec gives"
         )
-    mode = envs.metadata.get("autoreset_mode")
-    if not isinstance(mode, AutoresetMode):
-        raise EnvironmentNotUsable(
-            f'found metadata["autoreset_mode"] {mode!r}, expected one of gymnasium.vector.AutoresetMode: '
-            "without it nobody knows which steps are resets."
-        )
-    first = envs if envs.spec is not None else next(iter(getattr(envs.unwrapped, "envs", ())), envs)
-    described = describe(first, envs.single_observation_space, envs.single_action_space)
-    described = replace(described, environments=envs.num_envs, mdp=None, agents=("agent",))
+    mode = _autoreset_mode(envs, autoreset_mode)
+    described = _described_vector(envs)
     _require_fixed(described)
     plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
     return RecordedVector(envs, Loop(described, plan, VectorRows), mode)
+
+
+def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str | None) -> AutoresetMode:
+    """Return the way in which environments reset themselves: the chosen one, else the stated one.
+
+    Raises:
+        ConfigError: there is no such mode.
+        EnvironmentNotUsable: none is chosen and none is stated.
+    """
+    if chosen is not None:
+        try:
+            return AutoresetMode(chosen)
+        except ValueError as error:
+            modes = ", ".join(repr(mode.value) for mode in AutoresetMode)
+            raise ConfigError(f"autoreset_mode: found {chosen!r}, expected one of {modes}") from error
+    stated = (getattr(envs, "metadata", None) or {}).get("autoreset_mode")
+    if not isinstance(stated, AutoresetMode):
+        raise EnvironmentNotUsable(
+            f'found metadata["autoreset_mode"] {stated!r}, expected one of gymnasium.vector.AutoresetMode: '
+            "without it, resets cannot be told from steps. State it: record_vector(envs, "
+            'autoreset_mode="NextStep"), or "SameStep" (SuperSuit) or "Disabled".'
+        )
+    return stated
+
+
+def _described_vector(envs: VectorEnv[Any, Any, Any]) -> Described:
+    """Return the description of a vector environment.
+
+    Older ones have no `single_` spaces: their spaces are those of one environment.
+    """
+    observation = getattr(envs, "single_observation_space", None) or envs.observation_space
+    action = getattr(envs, "single_action_space", None) or envs.action_space
+    with _one_of(envs) as first:
+        described = describe(first, observation, action)
+    return replace(described, environments=envs.num_envs, mdp=None, agents=("agent",))
+
+
+@contextlib.contextmanager
+def _one_of(envs: VectorEnv[Any, Any, Any]) -> Iterator[Any]:
+    """Yield what has the registration of the environments: the vector, or one of its environments.
+
+    Those of an AsyncVectorEnv are in other processes, which end if a registration cannot be sent; so one is
+    made here, as AsyncVectorEnv itself does, without moving the global random generators.
+    """
+    unwrapped = envs.unwrapped
+    if getattr(envs, "spec", None) is not None:
+        yield envs
+    elif inside := getattr(unwrapped, "envs", None):
+        yield inside[0]
+    elif isinstance(unwrapped, AsyncVectorEnv):
+        states = random.getstate(), np.random.get_state()
+        try:
+            with contextlib.closing(unwrapped.env_fns[0]()) as own:
+                yield own
+        finally:
+            random.setstate(states[0])
+            np.random.set_state(states[1])
+    else:
+        yield envs
+
+
+def _final_observations(infos: Any) -> Any:
+    """Return the last observations of the episodes that ended in a step, by environment."""
+    if isinstance(infos, Mapping):
+        return infos.get("final_obs")
+    last = [info.get("terminal_observation") for info in infos]
+    return last if any(value is not None for value in last) else None
+
+
+def _by_environment(infos: Any) -> Mapping[str, Any]:
+    """Return infos by field; SuperSuit gives a list of them, one for each environment."""
+    if isinstance(infos, Mapping):
+        return infos
+    return _by_field({str(i): info for i, info in enumerate(infos)})
 
 
 class RecordedParallel(Recorded[AgentRows]):
@@ -188,6 +260,11 @@ def record_parallel(
         ConfigError: an argument cannot be used.
         StorageError: the recordings folder cannot be written.
     """
+    if hasattr(env, "agent_iter") and hasattr(env, "last"):
+        raise ConfigError(
+            f"found {type(env).__name__}, a game in turns (AECEnv), expected a PettingZoo ParallelEnv: "
+            "pettingzoo.utils.aec_to_parallel makes one of many games in turns."
+        )
     if not all(hasattr(env, part) for part in ("possible_agents", "observation_space", "action_space")):
         raise ConfigError(
             f"found {type(env).__name__}, expected a PettingZoo ParallelEnv with possible_agents"

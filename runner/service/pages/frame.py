@@ -31,7 +31,7 @@ def head_of(run: Run) -> dict[str, Any]:
     return {
         "id": run.run_id,
         "name": run.name,
-        "seed": run.seed,
+        "seed": run.seed if run.has_seed else None,
         "status": run.status,
         "created": run.created.isoformat(),
         "tags": run.tags,
