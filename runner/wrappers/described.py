@@ -118,7 +118,8 @@ def _registration(env: Any) -> tuple[str, dict[str, Any], int]:
     given = getattr(spec, "kwargs", None)
     if not isinstance(given, Mapping):
         given = getattr(spec, "config", None)
-        given = given._asdict() if hasattr(given, "_asdict") else given
+        if callable(as_dict := getattr(given, "_asdict", None)):
+            given = as_dict()
     try:
         kwargs = as_json({key: value for key, value in dict(given or {}).items() if key not in _NOT_SETTINGS})
     except (TypeError, ValueError, RecursionError):
