@@ -159,6 +159,11 @@ class Session:
         self._evaluated = 0
         self._last_report = 0.0
 
+    @property
+    def learners(self) -> tuple[str, ...]:
+        """The names of what learns: the agents, or `agency` for one joint table."""
+        return self._learner.agents
+
     def run(self) -> bool:
         """Do the whole job; return False if it was stopped before the end."""
         if self._observer is not None:

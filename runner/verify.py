@@ -8,6 +8,7 @@ steps make them); by the installed environment, whether the run can be reproduce
 
 from __future__ import annotations
 
+import json
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -24,6 +25,7 @@ from runner.config.sections import RunTable
 from runner.environments import load_mdp
 from runner.errors import ConfigError, Diverged, RecordingError
 from runner.execution import Report, Session, recorder_for
+from runner.frames import agents_of
 from runner.job import Job
 from runner.learning.learner import Held, Learner
 from runner.mdp import Mdp
@@ -38,6 +40,14 @@ from runner.recording.past import Past
 from runner.recording.reader import Recording, open_recording
 from runner.replay.tables import initially_held
 
+NAMES_NOT_COMPARED: Final = (
+    "how its environment is described: scene, names of actions, agents, events and landmarks, step limit; "
+    "--rerun compares them with the installed environment"
+)
+LOOP_NOT_COMPARED: Final = (
+    "how its environment is described: scene, names of actions, agents, events and landmarks, step limit"
+)
+"""What a verification leaves out: the messages do not depend on it, so that only the environment knows."""
 CIRCUMSTANCES: Final = ("command", "directory", "host", "user")
 """Provenance that cannot explain a difference."""
 
@@ -62,6 +72,8 @@ class Verification:
     provenance: dict[str, tuple[str, str]] = field(default_factory=dict)
     """Where this process and the recording's differ: key to (recording, here)."""
 
+    not_compared: str = ""
+    """What of the recording nothing was compared with."""
     nothing_yet: bool = False
     """Whether the run was interrupted before it recorded anything."""
 
@@ -189,14 +201,18 @@ def _compare(recording: Recording, rerun: bool, report: Report) -> Verification:
     session = rerun_session(job, mdp, recording, past, report)
     found = Verification(
         recording.path,
+        not_compared="" if rerun else NAMES_NOT_COMPARED,
         notes=() if complete else ("the run did not end; verified as far as it got",),
         provenance=_explanations(recording, mdp) if rerun else {},
     )
     try:
+        _compare_names(recording, list(session.learners))
         ended = session.run()
         topics = session.recorder.drain()
         if complete or ended:
             past.check_over()
+        if rerun:
+            _compare_description(recording, mdp)
     except Diverged as error:
         return replace(found, finding=str(error), difference=error)
     finally:
@@ -208,6 +224,45 @@ def _compare(recording: Recording, rerun: bool, report: Report) -> Verification:
     if not whole:
         return found
     return _compare_result(found, recording, session.summary(topics))
+
+
+def _compare_names(recording: Recording, learners: list[str] | None = None) -> None:
+    """Compare the names that stand in a recording more than once.
+
+    Raises:
+        Diverged: two of them differ.
+    """
+    described, config = recording.environment, recording.config.get("env", {})
+    for key, name in (("env_id", "id"), ("kwargs", "kwargs")):
+        if described.get(key) != config.get(name):
+            raise Diverged("environment.json", key, described.get(key), config.get(name))
+    if learners is not None and agents_of(recording) != learners:
+        raise Diverged("metadata run", "agents", agents_of(recording), learners)
+
+
+def _compare_description(recording: Recording, mdp: Mdp) -> None:
+    """Compare how a recording describes its environment with the installed environment.
+
+    Raises:
+        Diverged: they differ; the first value that does is named by its path.
+    """
+    expected = json.loads(json.dumps(mdp.description()))
+    for key in sorted(expected):
+        where, found, value = _first_difference(key, recording.environment.get(key), expected[key])
+        if where:
+            raise Diverged("environment.json", where, found, value)
+
+
+def _first_difference(where: str, found: Any, expected: Any) -> tuple[str, Any, Any]:
+    """Return the path of the first value that differs, and both values; an empty path if none does."""
+    if isinstance(found, dict) and isinstance(expected, dict) and found.keys() == expected.keys():
+        parts = [(f"{where}.{key}", found[key], expected[key]) for key in sorted(expected)]
+    elif isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
+        parts = [(f"{where}[{k}]", *pair) for k, pair in enumerate(zip(found, expected, strict=True))]
+    else:
+        return ("", None, None) if found == expected else (where, found, expected)
+    differing = (_first_difference(*part) for part in parts)
+    return next((difference for difference in differing if difference[0]), ("", None, None))
 
 
 def _tells_its_digest(recording: Recording) -> bool:
@@ -230,7 +285,12 @@ def _compare_loop(recording: Recording) -> Verification:
         train_steps=recording.count(schema.TRAIN_STEP),
         eval_steps=recording.count(schema.EVAL_STEP),
         notes=tuple(notes),
+        not_compared=LOOP_NOT_COMPARED,
     )
+    try:
+        _compare_names(recording)
+    except Diverged as error:
+        return replace(found, finding=str(error), difference=error)
     digest, odd, counts = ContentHash(), 0, {}
     for topic in recording.topics:
         wrong, others, counts[topic.name] = _check_topic(recording, topic, digest)

@@ -16,9 +16,12 @@ from runner.execution import run_job
 from runner.job import Job
 from runner.recording import open as open_recording
 from runner.recording import schema
-from runner.recording.contents import survey
+from runner.recording.chunks import Packing, encode_chunk
+from runner.recording.contents import read_chunk, survey
+from runner.recording.integrity import places
 from runner.recording.messages import decode, encode
 from runner.recording.repair import repair
+from runner.recording.writer import RecordingFile
 from runner.runs import create_run
 from runner.verify import verify
 from tests.runner.altering import altered
@@ -322,3 +325,64 @@ def test_other_files_are_no_recordings(tmp_path):
         verify(tmp_path / "missing.mcap")
     with pytest.raises(RecordingError, match="cannot be read"):
         verify(tmp_path)
+
+
+def described_as(source, target, change):
+    """Write a recording anew with another description of its environment; return where it is."""
+    with open_recording(source) as recording, RecordingFile(target, recording.topics) as file:
+        for name in recording.metadata_names:
+            if name != "result":
+                file.add_metadata(name, recording.metadata(name))
+        for name, media_type, data in recording.attachments():
+            if name == "environment.json":
+                said = json.loads(data)
+                change(said)
+                file.add_attachment(name, media_type, json.dumps(said).encode())
+                continue
+            file.add_attachment(name, media_type, data)
+        for entry in survey(source).chunks:
+            body = source.read_bytes()[entry.index.chunk_start_offset + 9 :][: entry.index.chunk_length - 9]
+            _, records = read_chunk(body, entry.index.chunk_start_offset)
+            _, times, offsets = places(records, "")
+            topic = schema.TOPIC_OF[entry.channel]
+            file.add_chunk(topic, encode_chunk(topic, records, times, offsets, Packing()))
+        file.finish("result", recording.metadata("result"))
+    return target
+
+
+def renamed(said):
+    said["scene"]["actions"][0]["name"] = "fly"
+
+
+def reordered(said):
+    said["event_names"].reverse()
+
+
+def moved(said):
+    said["scene"]["landmarks"][0]["cell"] = [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [(renamed, "scene.actions[0].name"), (reordered, "event_names"), (moved, "scene.landmarks[0].cell")],
+)
+def test_a_rerun_compares_how_the_environment_is_described(run, tmp_path, change, where):
+    made = described_as(run.recording, tmp_path / "x.mcap", change)
+    found = verify(made, rerun=True)
+    assert f"environment.json: {where}" in found.finding
+    assert verify(run.recording, rerun=True).sound
+    assert not verify(run.recording, rerun=True).not_compared
+    assert "--rerun compares" in verify(run.recording).not_compared
+
+
+def test_names_that_stand_in_a_recording_twice_are_compared(run, tmp_path):
+    def elsewhere(said):
+        said["env_id"] = "another:Game-v1"
+
+    assert "env_id" in verify(described_as(run.recording, tmp_path / "a.mcap", elsewhere)).finding
+
+    def others(entries):
+        return entries | {"agents": json.dumps([f"x{k}" for k in range(int(entries["learners"]))])}
+
+    finding = verify(altered(run.recording, tmp_path / "b.mcap", None, id, run=others)).finding
+    assert "metadata run: agents" in finding

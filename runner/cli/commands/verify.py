@@ -29,7 +29,7 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
     thing that is wrong is named: topic, episode, step, field, what was found and what was expected. With
     --rerun the job is done by the installed environment: the verdict says whether the run can be
     reproduced here, and if not, at which step it diverges and what differs from then: packages,
-    processor, code.
+    processor, code. It also compares how the recording describes its environment: scene and names.
 
     A run that was interrupted before it recorded anything is neither sound nor wrong: there is nothing to
     verify yet.
@@ -82,6 +82,8 @@ def _in_words(found: Verification, rerun: bool) -> dict[str, str]:
         told["digest"] = found.content_digest or f"{UNKNOWN} (told when a run ends properly)"
     else:
         told["first"] = found.finding
+    if found.sound and found.not_compared:
+        told["not compared"] = found.not_compared
     if found.notes:
         told["note"] = "\n".join(found.notes)
     if found.provenance:
@@ -104,6 +106,7 @@ def _as_json(found: Verification, rerun: bool) -> dict[str, Any]:
         "eval_steps": found.eval_steps,
         "content_digest": found.content_digest or None,
         "notes": list(found.notes),
+        "not_compared": found.not_compared or None,
         "provenance": {key: {"then": then, "here": here} for key, (then, here) in found.provenance.items()},
     }
 
