@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,8 @@ from runner.sweep.model import Sweep
 from runner.sweep.trials import State, Trial, Trials, best_of, recorded
 
 SHOWN: Final = 20
+CONFIRMING: Final = 10
+"""Seeds in the file of the best configuration."""
 
 
 @dataclass(frozen=True)
@@ -94,14 +97,31 @@ def ranking(sweep: Sweep, trials: Sequence[Trial]) -> list[Ranked]:
 
 
 def yaml_of(sweep: Sweep, trial: Trial) -> str:
-    """Return a trial's configuration as a file that can be run; it records steps, to be looked at."""
-    config = sweep.config(trial.values | {"name": f"{sweep.name}_best", "recording.steps": "all"})
+    """Return a trial's configuration as a file that can be run, with seeds that the search has not seen.
+
+    It records steps, to be looked at.
+    """
+    config = sweep.config(
+        trial.values
+        | {"name": f"{sweep.name}_best", "recording.steps": "all", "seeds": fresh_seeds(sweep.seeds)}
+    )
+    seeds = len(trial.results)
     head = (
         f"# Trial {trial.number} of the sweep {sweep.name}: {words(trial.values)}.\n"
-        f"# {sweep.objective.described}: {reading(trial.value)}, the median over "
-        f"{len(trial.results)} seeds.\n"
+        f"# {sweep.objective.described}: {reading(trial.value)}, the median over {seeds} seeds.\n"
+        "# The best of many trials is also the luckiest on the seeds that it was chosen by, so the seeds\n"
+        "# below are others: what comes out of them is what to expect.\n"
     )
     return head + config.to_yaml()
+
+
+def fresh_seeds(searched: Sequence[int]) -> list[int]:
+    """Return `CONFIRMING` seeds that are not among those searched: the next ones, if there are."""
+    first = max(searched) + 1
+    if first + CONFIRMING <= 2**64:
+        return list(range(first, first + CONFIRMING))
+    used = set(searched)
+    return list(itertools.islice((seed for seed in itertools.count() if seed not in used), CONFIRMING))
 
 
 def sections(results: Results, shown: int | None = SHOWN) -> list[Section]:

@@ -160,7 +160,12 @@ def start(
 @command.command("show")
 @click.argument("name")
 @click.option("--all", "every", is_flag=True, help="Show every trial, not only the best.")
-@click.option("--best", type=click.Path(path_type=Path), metavar="FILE", help="Write the best configuration.")
+@click.option(
+    "--best",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write the best configuration, with fresh seeds.",
+)
 @click.option("--force", is_flag=True, help="Replace the file if it exists.")
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for a note or an issue.")
 @json_option
@@ -213,12 +218,13 @@ def show(
     else:
         print_sections(sections(results, None if every else SHOWN), as_markdown)
         if best is None and results.best is not None:
-            say(f"--best FILE writes the configuration of trial {results.best.number}, ready to run.")
+            number = results.best.number
+            say(f"--best FILE writes the configuration of trial {number}, with fresh seeds to confirm it.")
     if best is not None:
         if results.best_yaml is None:
             raise RunnerError(f"the sweep {name!r} has no finished trial yet, so there is no best one.")
         write_text_new(best, force, results.best_yaml)
-        say(f"{best}: the best configuration; `dualtaxi run {best}` runs it.")
+        say(f"{best}: the best configuration, with fresh seeds; `dualtaxi run {best}` confirms it.")
 
 
 @command.command("ls")

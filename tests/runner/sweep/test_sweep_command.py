@@ -45,6 +45,7 @@ def test_a_sweep_is_run_shown_and_its_best_is_a_configuration(type_in, file, tmp
     best = tmp_path / "best.yaml"
     type_in("show", "small", "--best", str(best))
     assert load(best).step_size == told["best"]["values"]["step_size"]
+    assert load(best).seeds == tuple(range(2, 12))  # the search saw 0 and 1
     assert json.loads(type_in("ls", "--json").stdout) == ["small"]
 
 

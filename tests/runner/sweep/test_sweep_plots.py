@@ -18,7 +18,7 @@ from runner.sweep import state
 from runner.sweep.figure import draw_parameter
 from runner.sweep.loading import from_values
 from runner.sweep.plots import learning, panel_of, picture_of
-from runner.sweep.results import results_of
+from runner.sweep.results import fresh_seeds, results_of
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,12 @@ def test_the_page_of_a_sweep_stands_alone(done, results, tmp_path):
     assert len(ids) == len(set(ids))
 
 
-def test_the_best_configuration_gives_the_best_trials_runs_with_steps(results, done):
+def test_fresh_seeds_are_not_those_searched_even_at_the_end_of_their_range():
+    assert fresh_seeds([5, 0, 7]) == list(range(8, 18))
+    assert fresh_seeds([2**64 - 1, 1]) == [0, *range(2, 11)]
+
+
+def test_the_best_configuration_is_that_of_the_best_trial_with_steps_and_fresh_seeds(results, done):
     import yaml
 
     config = from_mapping(yaml.safe_load(results.best_yaml))
@@ -102,6 +107,7 @@ def test_the_best_configuration_gives_the_best_trials_runs_with_steps(results, d
         from_mapping(done[1].best().config).to_mapping()
         | {
             "name": "small_best",
+            "seeds": list(range(2, 12)),
             "recording": config.to_mapping()["recording"],
         }
         == config.to_mapping()
