@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -17,7 +18,11 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from runner.cli.episode import Episode
+    from runner.cli.keys import ReadKey
     from runner.recording.reader import Recording
+
+_KEYS: Final = "space: pause   arrows: back, forward   q: quit"
+_PAUSED_KEYS: Final = "paused   space: continue   arrows: back, forward   q: quit"
 
 
 @click.command("play")
@@ -44,9 +49,11 @@ def command(
 ) -> None:
     """Replay a recorded episode of RUN, frame by frame, with actions and rewards.
 
-    Without a choice it is the first trial of the last evaluation. All is drawn from the recording: its
-    environment need not be installed. Where stdout is no terminal, the frames come one after another,
-    without waiting. With --json: a line for each step. Ctrl-C ends it.
+    Without a choice it is the typical trial of the last evaluation: the median by success, return and
+    length; of a run without evaluations the last training episode. All is drawn from the recording: its
+    environment need not be installed. In a terminal the space bar pauses, the arrow keys (or b and n) step
+    back and forward, and q quits. Where stdout is no terminal, the frames come one after another, without
+    waiting. With --json: a line for each step.
 
     \b
     Examples:
@@ -79,6 +86,7 @@ def _chosen(recording: Recording, episode: int | None, trial: tuple[int, int] | 
         RecordingError: the recording has no such evaluation or trial.
     """
     from runner.analysis.evaluations import evaluation_after, evaluations_of
+    from runner.export.report_replay import last_whole_evaluation, typical_trial
     from runner.recording.schema import TRAIN_EPISODE
     from runner.words import trial_in_words
 
@@ -86,6 +94,8 @@ def _chosen(recording: Recording, episode: int | None, trial: tuple[int, int] | 
     if trial is None and not evaluations:
         number = max(recording.count(TRAIN_EPISODE) - 1, 0) if episode is None else episode
         return "train", number, f"training episode {number:,}"
+    if trial is None and last_whole_evaluation(recording) is not None:
+        trial = typical_trial(recording)
     after, number = trial or (evaluations[-1].after, 0)
     where = str(recording.path)
     index = evaluation_after(evaluations, after, where).trial(number, where)
@@ -103,15 +113,43 @@ def _show(played: Episode, speed: float) -> None:
         return
     from rich.live import Live
 
-    with Live(console=drawn, auto_refresh=False) as live:
-        for frame in _paced(played.frames(), 1 / speed):
-            live.update(frame, refresh=True)
+    from runner.cli.keys import pressed_keys
+
+    with Live(console=drawn, auto_refresh=False) as live, pressed_keys() as read_key:
+        _play(played.frames(), 1 / speed, read_key, lambda frame: live.update(frame, refresh=True))
 
 
-def _paced(frames: Iterator[Text], seconds: float) -> Iterator[Text]:
-    """Yield the frames at even intervals, the first at once."""
-    due = time.monotonic()
-    for frame in frames:
-        time.sleep(max(due - time.monotonic(), 0))
-        yield frame
-        due = max(due + seconds, time.monotonic())
+def _play(
+    frames: Iterator[Text], seconds: float, read_key: ReadKey | None, show: Callable[[Text], None]
+) -> None:
+    """Show frames at even intervals; keys pause, step back and forward, and quit.
+
+    Args:
+        frames: of the episode.
+        seconds: between two of them.
+        read_key: waits for a key; None where there are none.
+        show: draws a frame.
+    """
+    from rich.text import Text
+
+    seen = list(itertools.islice(frames, 1))
+    number, paused, due = 0, False, time.monotonic() + seconds
+    while number < len(seen):
+        keys = _PAUSED_KEYS if paused else _KEYS
+        show(Text.assemble(seen[number], ("\n" + keys, "dim")) if read_key else seen[number])
+        key = ""
+        if read_key is None:
+            time.sleep(max(due - time.monotonic(), 0))
+        else:
+            key = read_key(None if paused else max(due - time.monotonic(), 0))
+        if key == "quit":
+            return
+        if key == "pause":
+            paused = not paused
+        elif key == "back":
+            number, paused = max(number - 1, 0), True
+        elif key == "forward" or (not paused and time.monotonic() >= due):
+            if number + 1 == len(seen):
+                seen += itertools.islice(frames, 1)
+            number += 1 if number + 1 < len(seen) or not paused else 0
+        due = max(due + seconds, time.monotonic()) if key == "" else time.monotonic() + seconds

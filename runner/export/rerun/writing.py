@@ -112,7 +112,8 @@ def _saved(
     except OSError as error:
         raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
     finally:
-        fresh.unlink(missing_ok=True)
+        if os.path.lexists(fresh):
+            fresh.unlink()
 
 
 class RunExporter:

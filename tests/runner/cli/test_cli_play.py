@@ -7,6 +7,7 @@ import sys
 import pytest
 
 import runner
+from runner.export.report_replay import typical_trial
 
 
 def _frames(text):
@@ -51,8 +52,10 @@ def test_frames_come_one_after_another_without_waiting(recorded):
     assert "reward " in frames[1]
 
 
-def test_the_last_evaluation_is_played_unless_told(recorded):
-    assert "trial 0 of the evaluation after 30 episodes" in recorded("play", "tiny").stdout
+def test_the_typical_trial_of_the_last_evaluation_is_played_by_default(recorded, recorded_run):
+    with runner.open_recording(recorded_run.recording) as recording:
+        after, trial = typical_trial(recording)
+    assert f"trial {trial} of the evaluation after {after} episodes" in recorded("play", "tiny").stdout
 
 
 @pytest.mark.parametrize(("trial", "number"), [("20:3", 3), ("20", 0)])

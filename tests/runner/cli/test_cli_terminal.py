@@ -1,6 +1,7 @@
 """On a terminal: colours, a progress line, and neither with NO_COLOR or a pipe."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -15,8 +16,8 @@ from runner.recording.reader import open_recording
 pty = pytest.importorskip("pty", reason="a POSIX terminal", exc_type=ImportError)
 
 
-def _typed(words, recordings, **environment):
-    """Return what a command shows on a terminal of 80 columns."""
+def _typed(words, recordings, keys=b"", once="", **environment):
+    """Return what a command shows on a terminal of 80 columns; keys are pressed once it shows a text."""
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "runner", *map(str, words)],
@@ -37,6 +38,9 @@ def _typed(words, recordings, **environment):
         if not part:
             break
         shown += part
+        if keys and once.encode() in shown:
+            os.write(ours, keys)
+            keys = b""
     os.close(ours)
     assert process.wait(timeout=60) == 0, shown
     return shown.decode()
@@ -121,3 +125,11 @@ def test_a_kernel_serves_a_fresh_environment_and_a_recorded_one(recorded_run):
         )
         kinds = [numba.typeof(build_model(mdp, "per_agent")) for mdp in (fresh, recording.mdp)]
     assert kinds[0] == kinds[1]
+
+
+def test_play_pauses_steps_and_quits(recorded):
+    words = ["play", "tiny", "--episode", 0, "--speed", 0.01]  # a step in 100 s: only keys move it
+    shown = _typed(words, recorded.recordings, keys=b" nn\x1b[C\x1b[Dbq", once="q: quit")
+    steps = [int(step) for step in re.findall(r"step (\d+) of", shown)]
+    assert [step for i, step in enumerate(steps) if i == 0 or step != steps[i - 1]] == [0, 1, 2, 3, 2, 1]
+    assert "paused" in shown
