@@ -9,6 +9,8 @@ from typing import Final
 CACHE_VARIABLE: Final = "XDG_CACHE_HOME"
 EXPORTS: Final = "rerun"
 """The folder in it of exports for the Rerun viewer; their names begin with the ids of their runs."""
+RUN_SEPARATOR: Final = "+"
+"""What stands between the ids of several runs in the name of an export: no id has it."""
 RESTORED: Final = "restored"
 """The folder in it of recordings restored from archives; their names begin with the ids of their runs."""
 

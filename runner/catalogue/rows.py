@@ -89,6 +89,12 @@ class Row(Model):
     settings = TextField(null=True)
     """The configuration as a JSON object of paths and plain values."""
 
+    used_recording = BigIntegerField(null=True)
+    """Bytes that its folder uses of the disk, by what they are; null until somebody asks."""
+    used_other = BigIntegerField(null=True)
+    used_left_over = BigIntegerField(null=True)
+    used_freed = BigIntegerField(null=True)
+
     class Meta:
         """How the table is made."""
 

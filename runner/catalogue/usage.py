@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import stat
@@ -11,7 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from runner.cache import EXPORTS, RESTORED, cache_folder
+from peewee import DatabaseError
+
+from runner.cache import EXPORTS, RESTORED, RUN_SEPARATOR, cache_folder
+from runner.catalogue.database import keep_usage, opened
 from runner.labels import KEEP, LABELS_FILE, LOCK_FILE
 from runner.locking import RUN_LOCK
 from runner.runs import RECORDING_FILE, RUN_FILE
@@ -23,7 +27,8 @@ _OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, RUN_L
 _LEFT_OVER: Final = re.compile(
     r"recording\.(anew|repairing|rerecording|restoring)|recording\.damaged-\d+\.mcap|(run|labels)\.[0-9a-f]{8}\.tmp"
 )
-_ID: Final = re.compile(r"\w+")
+_KEY: Final = re.compile(r"-[0-9a-f]+(\.\w+)+$")
+"""What follows the ids in the name of a cached file."""
 
 
 @dataclass(slots=True)
@@ -82,8 +87,7 @@ def cached(part: str) -> Counter[str]:
     """
     found: Counter[str] = Counter()
     for name, size in _sizes(cache_folder() / part):
-        run_id = _ID.match(name)
-        found[run_id[0] if run_id else name] += size
+        found[_KEY.sub("", name).partition(RUN_SEPARATOR)[0]] += size
     return found
 
 
@@ -103,11 +107,49 @@ class Usage:
         return self.contents.recording + self.contents.other + self.exports + self.restored
 
 
+USED_BY: Final = (
+    *("root", "entry", "id", "name", "status", "tags", "digest", "problem", "fingerprint", "mark", "settled"),
+    *("used_recording", "used_other", "used_left_over", "used_freed"),
+)
+"""The columns of the index that `usages` needs."""
+
+
 def usages(rows: Sequence[dict[str, Any]]) -> list[Usage]:
-    """Return what runs use of the disk, the largest first."""
+    """Return what runs use of the disk, the largest first.
+
+    What is found in a folder is kept in the index: it is looked at again when something in it changed.
+    """
     exports, restored = cached(EXPORTS), cached(RESTORED)
-    found = [Usage(row, _contents(row), exports[row["id"]], restored[row["id"]]) for row in rows]
+    found, fresh = [], []
+    for row in rows:
+        contents = _kept_contents(row)
+        if contents is None:
+            contents = _contents(row)
+            if row["settled"] and row["status"] != "running" and not contents.strange:
+                fresh.append((row, contents))
+        found.append(Usage(row, contents, exports[row["id"]], restored[row["id"]]))
+    if fresh:
+        _keep(fresh)
     return sorted(found, key=lambda usage: (-usage.total, usage.row["id"]))
+
+
+def _kept_contents(row: dict[str, Any]) -> Contents | None:
+    if row["used_recording"] is None:
+        return None
+    return Contents(row["used_recording"], row["used_other"], row["used_left_over"], row["used_freed"])
+
+
+def _keep(fresh: Sequence[tuple[dict[str, Any], Contents]]) -> None:
+    """Keep in the index what was found in folders, where it still has them as they were; if it can be."""
+    values = [
+        (
+            *(each.recording, each.other, each.left_over, each.freed),
+            *(row["root"], row["entry"], row["mark"], row["fingerprint"]),
+        )
+        for row, each in fresh
+    ]
+    with contextlib.suppress(DatabaseError, OSError), contextlib.closing(opened(lambda _: None)) as database:
+        keep_usage(database, values)
 
 
 def totals(found: Sequence[Usage]) -> dict[str, int]:

@@ -43,12 +43,12 @@ def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as
     from runner.catalogue.columns import with_originals
     from runner.catalogue.filters import parse
     from runner.catalogue.index import look
-    from runner.catalogue.usage import freeable_of, totals, usages
+    from runner.catalogue.usage import USED_BY, freeable_of, totals, usages
 
     chosen = parse(" ".join(words))
 
     def work(index: Index) -> list[dict[str, Any]]:
-        return with_originals(index.select(chosen), index)
+        return with_originals(index.select(chosen, columns=USED_BY), index)
 
     found = usages(look(recordings, work, say))
     freeable = freeable_of(found, recordings)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from runner import __version__
-from runner.cache import CACHE_VARIABLE, EXPORTS
+from runner.cache import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR
 from runner.cache import cache_folder as users_cache
 from runner.errors import StorageError
 from runner.export.rerun.selection import Request, Selection, select
@@ -28,7 +28,7 @@ def exported(runs: Sequence[Run], request: Request) -> tuple[Path, list[Selectio
         RecordingError: a recording cannot be read, or has not what is asked for.
         StorageError: the cache cannot be written.
     """
-    path = cache_folder() / f"{'-'.join(run.run_id for run in runs)}-{_key(runs, request)}.rrd"
+    path = cache_folder() / f"{RUN_SEPARATOR.join(run.run_id for run in runs)}-{_key(runs, request)}.rrd"
     recordings = [open_recording(run.recording) for run in runs]
     try:
         if path.exists():

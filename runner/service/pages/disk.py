@@ -8,7 +8,7 @@ from fastapi import APIRouter, Request, Response
 
 from runner.catalogue.columns import with_originals
 from runner.catalogue.filters import Filter
-from runner.catalogue.usage import freeable_of, totals, usages
+from runner.catalogue.usage import USED_BY, freeable_of, totals, usages
 from runner.service.dependencies import CatalogueOf, JobsOf, SettingsOf
 from runner.service.pages.rendering import page
 
@@ -35,7 +35,7 @@ def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: J
     """Show what uses the disk, and what could be freed."""
 
     def work(index: Index) -> list[dict[str, Any]]:
-        return with_originals(index.select(Filter(None)), index)
+        return with_originals(index.select(Filter(None), columns=USED_BY), index)
 
     found = usages(catalogue.read(work))
     freeable = freeable_of(found, settings.recordings)
@@ -47,5 +47,4 @@ def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: J
         freeable=[(*FREED_BY[kind], size) for kind, size in freeable.items() if size],
         rows=[{"row": usage.row, "sizes": totals([usage])} for usage in found[:ROWS]],
         left=len(found) - ROWS,
-        folders=[str(folder) for folder in settings.recordings],
     )

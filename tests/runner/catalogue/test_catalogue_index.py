@@ -16,11 +16,13 @@ from pathlib import Path
 import pytest
 
 import runner
+from runner.cache import EXPORTS, RESTORED
 from runner.catalogue import folders
+from runner.catalogue import usage as usage_of
 from runner.catalogue.database import index_path, opened
 from runner.catalogue.filters import Filter, parse
 from runner.catalogue.finding import find_run
-from runner.catalogue.folders import Folders
+from runner.catalogue.folders import Depth, Folders
 from runner.catalogue.index import look
 from runner.config import from_mapping
 from runner.errors import RunNotFound
@@ -406,3 +408,36 @@ def test_making_the_index_anew_never_empties_it(folder, monkeypatch):
     monkeypatch.setattr(folders, "row_of", looking_on)
     assert len(look([folder], lambda index: index.select(ALL), anew=True)) == 4
     assert seen == [len(runs)] * 4
+
+
+def test_what_a_folder_uses_is_kept_until_something_in_it_changes(folder, monkeypatch):
+    run = create_run(folder, CONFIG, 1).update(status="finished")
+    run.recording.write_bytes(bytes(1000))
+    aged(folder)
+
+    def used():
+        (usage,) = usage_of.usages(look([folder], lambda index: index.select(ALL)))
+        return usage.contents.recording, usage.contents.left_over
+
+    assert used() == (1000, 0)
+    with monkeypatch.context() as patched:
+        patched.setattr(usage_of, "contents_of", pytest.fail)
+        assert used() == (1000, 0)
+    (run.folder / "recording.damaged-1.mcap").write_bytes(bytes(50))
+    for depth in (Depth.FILES, Depth.FOLDERS):
+        look([folder], lambda _: None, depth=depth)
+    assert used() == (1000, 50)
+    run.recording.write_bytes(bytes(2000))
+    assert used() == (2000, 50)
+
+
+def test_cached_files_count_for_the_run_whose_they_are(folder, tmp_path):
+    exports, restored = (tmp_path / "cache" / "dualtaxi" / part for part in (EXPORTS, RESTORED))
+    exports.mkdir(parents=True)
+    restored.mkdir()
+    (exports / "a-b-0123456789ab.rrd").write_bytes(bytes(1))
+    (exports / "a+b-0123456789ab.rrd").write_bytes(bytes(10))
+    (restored / "a-b-0123456789abcdef.mcap").write_bytes(bytes(100))
+    (restored / "a.c-0123456789abcdef.mcap").write_bytes(bytes(1000))
+    assert usage_of.cached(EXPORTS) == {"a-b": 1, "a": 10}
+    assert usage_of.cached(RESTORED) == {"a-b": 100, "a.c": 1000}

@@ -338,7 +338,7 @@ def test_du_adds_up_by_kind(command, make, tmp_path, monkeypatch):
     large, small = make(size=5000), make(size=10, status="failed")
     exports = tmp_path / "cache" / "dualtaxi" / "rerun"
     exports.mkdir(parents=True)
-    (exports / f"{large.run_id}-{small.run_id}-0123.rrd").write_bytes(bytes(700))
+    (exports / f"{large.run_id}+{small.run_id}-0123.rrd").write_bytes(bytes(700))
     (small.folder / "recording.damaged-1.mcap").write_bytes(bytes(300))
     told = command.json("du")
     first, second = told["runs"]
