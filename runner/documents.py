@@ -6,12 +6,11 @@ import json
 import math
 import os
 import secrets
-import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-_WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+from runner.files import open_regular
 
 
 def finite(value: Any) -> Any:
@@ -34,12 +33,9 @@ def read_object(path: str | os.PathLike[str], most: int) -> dict[str, Any]:
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no file, too long, or holds no JSON object.
+        ValueError: it is too long, or holds no JSON object.
     """
-    descriptor = os.open(path, os.O_RDONLY | _WITHOUT_WAITING)  # to open a pipe would wait for its writer
-    with os.fdopen(descriptor, "rb") as stream:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise ValueError("it is no file")
+    with open_regular(path) as stream:
         data = stream.read(most + 1)
     if len(data) > most:
         raise ValueError(f"it is longer than {most:,} bytes")

@@ -25,6 +25,7 @@ from runner.config.sections import RunTable
 from runner.environments import load_mdp
 from runner.errors import ConfigError, Diverged, RecordingError
 from runner.execution import Report, Session, recorder_for
+from runner.files import open_regular
 from runner.frames import agents_of
 from runner.job import Job
 from runner.learning.learner import Held, Learner
@@ -150,7 +151,7 @@ def refuse_foreign(path: Path) -> None:
         RecordingError: it is one, or it cannot be read.
     """
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             start = stream.read(4096)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error

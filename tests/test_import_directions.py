@@ -12,8 +12,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ORDER = """
-    amounts errors hashing
-    cache compiled documents extras run_file
+    amounts errors files
+    hashing cache compiled documents extras run_file
     config owner labels
     job toy_text scene estimate
     mdp

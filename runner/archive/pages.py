@@ -14,6 +14,7 @@ from typing import Any, BinaryIO, Final
 import pyarrow.parquet as pq
 
 from runner.errors import RecordingError
+from runner.files import open_regular
 
 _MAX_HEADER_BYTES: Final = 1 << 15
 _MAX_DEPTH: Final = 8
@@ -29,7 +30,7 @@ def largest_page(path: Path, about: pq.FileMetaData) -> int:
         RecordingError: the pages do not fill their column chunks.
     """
     largest = 0
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         for k in range(about.num_row_groups):
             group = about.row_group(k)
             for i in range(group.num_columns):

@@ -20,6 +20,7 @@ from runner.archive.layout import Shape
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
 from runner.archive.pages import largest_page
 from runner.errors import RecordingError
+from runner.files import open_regular
 from runner.mdp import Mdp
 from runner.recording.facts import check_run, environment_of, environment_said, json_object, kind_of
 from runner.recording.index import UNPACKED_A_BYTE
@@ -49,7 +50,7 @@ class Archive:
         self.folder = folder
         path = folder / layout.MANIFEST
         try:
-            with path.open("rb") as stream:
+            with open_regular(path) as stream:
                 data = stream.read(MAX_MANIFEST_BYTES + 1)
         except OSError as error:
             raise RecordingError(
@@ -150,9 +151,11 @@ class Archive:
     def _bytes(self, name: str) -> bytes:
         path = self.folder / name
         try:
-            if path.stat().st_size > MAX_DESCRIPTION_BYTES:
+            with open_regular(path) as stream:
+                data = stream.read(MAX_DESCRIPTION_BYTES + 1)
+            if len(data) > MAX_DESCRIPTION_BYTES:
                 raise RecordingError(f"{path}: is larger than {MAX_DESCRIPTION_BYTES:,} bytes.")
-            return path.read_bytes()
+            return data
         except OSError as error:
             raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
 
@@ -175,6 +178,7 @@ class Archive:
         path = self.folder / name
         try:
             # reading ahead would keep all that was read until the file is closed
+            open_regular(path).close()  # a pipe would be waited for
             with pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False) as file:
                 self._check(file, path, columns, rows)
                 for batch in file.iter_batches(n):

@@ -19,6 +19,7 @@ from runner.archive.manifest import MAX_MANIFEST_BYTES, Manifest, read_manifest
 from runner.documents import sync
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.extras import require
+from runner.files import open_regular
 
 ASIDE: Final = ".partial"
 """The folder of archives that are being written; one level down, where `*/steps.parquet` does not reach."""
@@ -95,7 +96,7 @@ class FolderTarget:
         """Return the manifest of a run's archive; None if there is no archive."""
         path = self._root / run_id / layout.MANIFEST
         try:
-            with path.open("rb") as stream:
+            with open_regular(path) as stream:
                 return read_manifest(stream.read(MAX_MANIFEST_BYTES + 1), str(path))
         except (FileNotFoundError, NotADirectoryError):
             return None

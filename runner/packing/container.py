@@ -23,6 +23,7 @@ from blake3 import blake3
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from runner.errors import RunnerError
+from runner.files import open_regular
 from runner.hashing import hash_of
 from runner.labels import LABELS_FILE, MAX_LABELS_BYTES
 from runner.runs import RECORDING_FILE, RUN_FILE
@@ -192,7 +193,7 @@ def opened(path: Path) -> Iterator[Pack]:
             raise PackError(f"{path}: found a folder, expected the file that `dualtaxi pack` writes.")
         if not path.is_file():  # to open a pipe would wait for its writer
             raise PackError(f"{path}: found no such file, expected a packed run.")
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             yield Pack(stream, path)
     except OSError as error:
         if error.filename is None or Path(error.filename) == path:

@@ -21,6 +21,7 @@ from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError
+from runner.files import open_regular
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head, unpack_chunk
@@ -91,7 +92,7 @@ def survey(
         RecordingError: the file cannot be read, or its chunks would exhaust whoever reads them.
     """
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             size = stream.seek(0, 2)
             refuse_exhausting(size, _declared(stream, size, str(path)), str(path))
             return _survey(stream, keep_result, check, report)

@@ -18,6 +18,7 @@ from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
+from runner.files import open_regular
 from runner.recording import schema
 from runner.recording.blocks import HEADER, HEADER_BYTES, RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head, message_index
@@ -44,7 +45,7 @@ def check_integrity(path: Path, report: Report = lambda *_: None) -> None:
         RecordingError: something is wrong; the first such thing is named with its offset.
     """
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             _check_beginning(stream, path)
         contents = survey(path, keep_result=True, check=_IndexCheck(path).take, report=report)
         if contents.reason:
@@ -65,7 +66,7 @@ def is_merely_cut_off(path: Path) -> bool:
         RecordingError: the file cannot be read, or begins as none of ours does.
     """
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             _check_beginning(stream, path)
         contents = survey(path, keep_result=True, check=_IndexCheck(path).take)
         if contents.reason:
@@ -83,7 +84,7 @@ def checked_survey(path: Path) -> Contents:
         RecordingError: the file cannot be read.
     """
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             _check_beginning(stream, path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
@@ -107,7 +108,7 @@ def may_be_cut(path: Path, contents: Contents) -> bool:
     if not contents.reason:
         return True
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             return _ends_torn(stream, contents)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
@@ -117,7 +118,7 @@ def _tails(path: Path, contents: Contents) -> tuple[bytes, bytes]:
     """Return what stands behind the data of a recording, and what should stand there."""
     with RecordingFile.inspect(path, contents) as file:
         expected = file.tail()
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         stream.seek(contents.end)
         return stream.read(len(expected) + 1), expected
 

@@ -19,6 +19,7 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from runner.errors import RecordingError, StorageError
+from runner.files import open_regular
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
 from runner.recording.contents import Report, asks_for_indexes, attachment_of, metadata_of, read_chunk
@@ -101,7 +102,7 @@ def _lost_before(path: Path) -> dict[str, list[list[int]]]:
 def _salvaged(path: Path, fresh: Path, report: Report) -> Repair:
     """Write what is good of a file into a new one."""
     try:
-        stream = path.open("rb")
+        stream = open_regular(path)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
     with stream:

@@ -13,6 +13,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
+from runner.files import open_regular
 from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import Chunk, message_index
 from runner.recording.contents import (
@@ -155,7 +156,7 @@ def _whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
     if finished:
         check_integrity(path)
     try:
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             for opcode, offset, body in walk(stream, path.stat().st_size):
                 if opcode == Opcode.DATA_END:
                     return

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -15,11 +18,13 @@ from runner.archive import layout
 from runner.archive.manifest import Entry, Manifest, entries_of
 from runner.archive.reading import Archive
 from runner.archive.restoring import check, restore
+from runner.archive.runs import archive_run
 from runner.errors import RecordingError, RunnerError
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.repair import repair
+from runner.runs import run_at
 from runner.verify import verify
 from tests.runner.altering import altered
 from tests.runner.archive.whole import archived, contents
@@ -267,3 +272,26 @@ def test_reading_a_table_keeps_nothing_of_the_groups_before(tmp_path):
     for _ in Archive(folder).batches("numbers.parquet", columns, rows * groups, 4096):
         most = max(most, pa.total_allocated_bytes() - before)
     assert most < 4 * numbers.nbytes
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "run.parquet", "steps.parquet"])
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_in_place_of_a_file_is_refused_and_not_waited_for(taxis, tmp_path, name):
+    recordings, archive = tmp_path / "recordings", tmp_path / "archive"
+    shutil.copytree(taxis.folder, recordings / taxis.run_id)
+    archive_run(run_at(recordings / taxis.run_id), str(archive), remove=True)
+    (archive / taxis.run_id / name).unlink()
+    os.mkfifo(archive / taxis.run_id / name)
+    restoring = f"""
+from pathlib import Path
+from runner.archive.runs import restore_run
+from runner.errors import RunnerError
+from runner.runs import run_at
+try:
+    restore_run(run_at(Path({str(recordings / taxis.run_id)!r})))
+except RunnerError as error:
+    print(error)
+"""
+    command = [sys.executable, "-c", restoring]
+    done = subprocess.run(command, capture_output=True, check=True, text=True, timeout=60)
+    assert str(archive) in done.stdout, done
