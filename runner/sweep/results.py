@@ -15,10 +15,13 @@ import numpy as np
 from runner.analysis.compare import statistics
 from runner.analysis.compare.statistics import Estimate
 from runner.analysis.sections import Grid, Section
+from runner.sweep.importance import Effect, effects_of
 from runner.sweep.model import Sweep
 from runner.sweep.trials import State, Trial, Trials, best_of, recorded
 
 SHOWN: Final = 20
+SMALLEST_SHOWN: Final = 0.01
+"""Interactions of a smaller share are not listed."""
 CONFIRMING: Final = 10
 """Seeds in the file of the best configuration."""
 
@@ -53,8 +56,8 @@ class Results:
     """How many there are to be."""
     ranking: list[Ranked]
     """The finished ones from the best on, then those given up, unfinished, failed and excluded."""
-    importance: dict[str, float]
-    """How much each parameter decides; summing up to 1, or empty."""
+    effects: list[Effect]
+    """How much each parameter, and each two together, explain of the completed trials; the largest first."""
     best: Trial | None
 
     @property
@@ -73,9 +76,15 @@ def results_of(sweep: Sweep, recordings: Path) -> Results:
     statistics.require_scipy()
     trials = Trials(sweep)
     found = list(recorded(trials, recordings))
-    return Results(
-        sweep, trials.search.trials, ranking(sweep, found), trials.search.importance(), best_of(found, sweep)
+    completed = [
+        (trial.values, trial.value)
+        for trial in found
+        if trial.state == "finished" and trial.value is not None and abs(trial.value) < statistics.NEVER
+    ]
+    effects = effects_of(
+        sweep.file.parameters, [values for values, _ in completed], [value for _, value in completed]
     )
+    return Results(sweep, trials.search.trials, ranking(sweep, found), effects, best_of(found, sweep))
 
 
 def ranking(sweep: Sweep, trials: Sequence[Trial]) -> list[Ranked]:
@@ -137,16 +146,36 @@ def sections(results: Results, shown: int | None = SHOWN) -> list[Section]:
     for state, title in (("failed", "Failed"), ("excluded", "Left out: these values do not go together")):
         told = _errors([entry for entry in results.ranking if entry.state == state])
         found += [Section(title, told)] if told else []
-    if results.importance:
-        shares = [(path, f"{100 * share:.0f} %") for path, share in results.importance.items()]
-        found.append(
-            Section(
-                "What mattered",
-                ["Share of what decides, over all that was tried (fANOVA)."],
-                [Grid(("parameter", "share"), shares)],
-            )
-        )
+    if results.effects:
+        found.append(_effects(results))
     return found
+
+
+def _effects(results: Results) -> Section:
+    """Return main effects and interactions as a table; small interactions are left out."""
+    shown = [
+        effect for effect in results.effects if len(effect.parameters) == 1 or effect.share >= SMALLEST_SHOWN
+    ]
+    rows = [
+        (
+            " x ".join(effect.parameters),
+            "alone" if len(effect.parameters) == 1 else "together, beyond each alone",
+            f"{100 * effect.share:.0f} %",
+            f"{100 * effect.low:.0f} to {100 * effect.high:.0f} %",
+        )
+        for effect in shown
+    ]
+    rest = 1.0 - sum(effect.share for effect in results.effects)
+    completed = sum(1 + len(entry.again) for entry in results.ranking if entry.state == "finished")
+    said = [
+        "Shares of the objective's variance over the whole search space, as random forests predict it from "
+        f"the {completed} completed trials (functional ANOVA). Trials that were given up or failed do not "
+        f"count. Shares are not normalised: about {100 * max(0.0, rest):.0f} % are left to three and more "
+        "parameters. The interval is over forests of resampled trials."
+    ]
+    left_out = len(results.effects) - len(shown)
+    said += [f"{left_out} pairs of less than {100 * SMALLEST_SHOWN:.0f} % are left out."] if left_out else []
+    return Section("What mattered", said, [Grid(("parameter", "", "share", "95 % of forests"), rows)])
 
 
 def _errors(entries: Sequence[Ranked]) -> list[str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -74,25 +73,6 @@ class Search:
             self._study.tell(trial, state=TrialState.PRUNED)
         else:
             self._study.tell(trial, value)
-
-    def importance(self) -> dict[str, float]:
-        """Return how much each parameter decides, summing up to 1; empty if too little is known.
-
-        F. Hutter, H. Hoos and K. Leyton-Brown, "An efficient approach for assessing hyperparameter
-        importance", ICML 2014 (functional ANOVA of a random forest).
-
-        Raises:
-            MissingExtra: scikit-learn is not installed.
-        """
-        require("sklearn", extra="sweep", purpose="what mattered in a sweep")  # Optuna's evaluator needs it
-        from optuna.importance import FanovaImportanceEvaluator, get_param_importances
-        from optuna.trial import TrialState
-
-        done = self._study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        if len({trial.value for trial in done}) < 2:
-            return {}
-        found = get_param_importances(self._study, evaluator=FanovaImportanceEvaluator(seed=0))
-        return {name: float(share) for name, share in found.items() if math.isfinite(share)}
 
     def _grid_point(self, number: int) -> dict[str, Any]:
         """Return a point of the grid, the last parameter changing fastest, as Optuna has it."""

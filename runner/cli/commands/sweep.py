@@ -182,7 +182,8 @@ def show(
     """Rank the trials of the sweep NAME, with intervals over seeds; tell what mattered.
 
     A trial counts by the median over its seeds; beside it stands the interquartile mean (IQM) with its
-    95 % bootstrap interval, for four seeds and more. What mattered is Optuna's fANOVA importance.
+    95 % bootstrap interval, for four seeds and more. What mattered is the share of the
+    objective's variance that each parameter, and each two, explain (functional ANOVA).
 
     \b
     Examples:
@@ -211,7 +212,7 @@ def show(
                 "objective": results.sweep.objective.model_dump(mode="json"),
                 "trials": results.trials,
                 "ranking": [dataclasses.asdict(entry) for entry in results.ranking],
-                "importance": results.importance,
+                "effects": [dataclasses.asdict(effect) for effect in results.effects],
                 "best": results.best and results.best.number,
             }
         )

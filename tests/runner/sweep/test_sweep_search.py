@@ -64,16 +64,13 @@ def test_the_same_told_gives_the_same_suggestions(strategy):
     assert len({str(values) for values in first}) > 20
 
 
-def test_a_search_finds_what_is_better_and_what_mattered():
+def test_a_search_finds_what_is_better():
     search, tried = searched(trials=60), []
     for number in range(60):
         (values,) = search.ask(1)
         tried.append(abs(values["step_size"] - 0.7))
         search.tell(number, -tried[-1], False, {})
     assert np.median(tried[40:]) < np.median(tried[:10])
-    shares = search.importance()
-    assert shares["step_size"] > shares["discount"]
-    assert sum(shares.values()) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,142 @@
+"""What mattered in a search: shares of variance of parameters and of their pairs (functional ANOVA).
+
+F. Hutter, H. Hoos and K. Leyton-Brown, "An efficient approach for assessing hyperparameter importance",
+ICML 2014: random forests predict the objective at every point of a grid, and the variance over the grid is
+taken apart into that of each parameter on its own (main effects) and of each two of them beyond that
+(interactions). Shares are of the whole variance and are not normalised: what they leave is due to three and
+more.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import MissingExtra
+from runner.sweep.model import Range
+
+FORESTS: Final = 30
+TREES: Final = 32
+MAX_POINTS: Final = 20_000
+"""Points of the grid that forests predict; it is coarser where there are many parameters."""
+MAX_LEVELS: Final = 12
+MIN_TRIALS: Final = 4
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What one parameter, or two together beyond what each does alone, has to do with the objective."""
+
+    parameters: tuple[str, ...]
+    share: float
+    """Of the variance: the median over forests."""
+    low: float
+    high: float
+    """The interval in which 95 % of the forests have it; each forest is of other resampled trials."""
+
+
+def effects_of(
+    parameters: Mapping[str, Range | list[Any]],
+    trials: Sequence[Mapping[str, Any]],
+    values: Sequence[float],
+) -> list[Effect]:
+    """Return main effects and interactions, the largest first; none if too little is known.
+
+    Args:
+        parameters: by path: what was tried.
+        trials: the values of the parameters in each completed trial.
+        values: the objective of each, finite.
+
+    Raises:
+        MissingExtra: scikit-learn is not installed.
+    """
+    try:
+        from sklearn.ensemble import RandomForestRegressor
+    except ImportError as error:
+        raise MissingExtra("scikit-learn", "sweep", "what mattered in a sweep") from error
+    names = list(parameters)
+    if len(trials) < MIN_TRIALS or len(set(values)) < 2 or 2 ** len(names) > MAX_POINTS:
+        return []
+    levels = {name: _levels(parameter, len(names)) for name, parameter in parameters.items()}
+    grid = list(itertools.product(*levels.values()))
+    coded = _coded(parameters, [dict(zip(names, point, strict=True)) for point in grid])
+    known, objective = _coded(parameters, trials), np.asarray(values, np.float64)
+    shape = tuple(len(own) for own in levels.values())
+    rng = np.random.default_rng(0)
+    found: list[dict[tuple[int, ...], float]] = []
+    for forest in range(FORESTS):
+        drawn = rng.integers(0, len(trials), len(trials))
+        trained = RandomForestRegressor(n_estimators=TREES, random_state=forest)
+        trained.fit(known[drawn], objective[drawn])
+        shares = shares_of_variance(trained.predict(coded).reshape(shape))
+        if shares:
+            found.append(shares)
+    return _summed_up(names, found)
+
+
+def shares_of_variance(values: NDArray[np.float64]) -> dict[tuple[int, ...], float]:
+    """Return the share of the variance over a full grid of each axis, (i,), and of each two, (i, j).
+
+    The interaction of two axes is what their joint means vary beyond the two main effects. Empty if the
+    values do not vary.
+    """
+    total = float(values.var())
+    axes = range(values.ndim)
+    if total <= 1e-12 * max(1.0, float(np.abs(values).max()) ** 2):
+        return {}
+
+    def explained(*kept: int) -> float:
+        others = tuple(axis for axis in axes if axis not in kept)
+        return float(values.mean(axis=others).var()) / total
+
+    shares: dict[tuple[int, ...], float] = {(i,): explained(i) for i in axes}
+    for i, j in itertools.combinations(axes, 2):
+        shares[i, j] = max(0.0, explained(i, j) - shares[i,] - shares[j,])
+    return shares
+
+
+def _summed_up(names: Sequence[str], found: Sequence[Mapping[tuple[int, ...], float]]) -> list[Effect]:
+    if not found:
+        return []
+    effects = []
+    for axes in found[0]:
+        shares = [shares[axes] for shares in found]
+        low, middle, high = np.quantile(shares, [0.025, 0.5, 0.975]).tolist()
+        effects.append(Effect(tuple(names[axis] for axis in axes), middle, low, high))
+    return sorted(effects, key=lambda effect: -effect.share)
+
+
+def _levels(parameter: Range | list[Any], parameters: int) -> list[Any]:
+    """Return values that stand for a parameter in the grid, evenly over it; all of them if there is room."""
+    most = max(2, min(MAX_LEVELS, int(MAX_POINTS ** (1 / parameters) + 1e-9)))
+    if not isinstance(parameter, Range):
+        chosen = np.unique(np.linspace(0, len(parameter) - 1, min(most, len(parameter))).round().astype(int))
+        return [parameter[i] for i in chosen]
+    low, high = float(parameter.low), float(parameter.last)
+    if parameter.log:
+        return list(np.geomspace(low, high, most).tolist())
+    count = min(most, parameter.steps + 1) if parameter.step is not None or parameter.whole else most
+    return list(np.linspace(low, high, count).tolist())
+
+
+def _coded(
+    parameters: Mapping[str, Range | list[Any]], points: Sequence[Mapping[str, Any]]
+) -> NDArray[np.float64]:
+    """Return points as columns of numbers: those of a range as they are, or a column for each choice."""
+    columns = []
+    for name, parameter in parameters.items():
+        if isinstance(parameter, Range):
+            numbers = [float(point[name]) for point in points]
+            columns.append([math.log(number) for number in numbers] if parameter.log else numbers)
+        else:
+            texts = [json.dumps(point[name], sort_keys=True) for point in points]
+            choices = dict.fromkeys(json.dumps(each, sort_keys=True) for each in parameter)
+            columns += [[float(text == choice) for text in texts] for choice in choices]
+    return np.array(columns, np.float64).T

@@ -1,0 +1,55 @@
+"""What mattered: the variance taken apart as it can be by hand, and found again from trials."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from runner.sweep.importance import effects_of, shares_of_variance
+from runner.sweep.model import Range
+
+
+def test_the_variance_of_a_sum_is_that_of_its_terms():
+    a, b = np.array([0.0, 1.0, 2.0]), np.array([0.0, 3.0])
+    shares = shares_of_variance(a[:, None] + b[None, :])
+    total = a.var() + b.var()
+    assert shares[0,] == pytest.approx(a.var() / total)
+    assert shares[1,] == pytest.approx(b.var() / total)
+    assert shares[0, 1] == pytest.approx(0.0)
+
+
+def test_of_an_exclusive_or_nothing_is_due_to_one_alone():
+    shares = shares_of_variance(np.array([[0.0, 1.0], [1.0, 0.0]]))
+    assert shares == {(0,): 0.0, (1,): 0.0, (0, 1): 1.0}
+    thrice = np.array([[[i ^ j ^ k for k in (0, 1)] for j in (0, 1)] for i in (0, 1)], float)
+    assert sum(shares_of_variance(thrice).values()) == 0.0  # it is all due to three
+
+
+def test_values_that_do_not_vary_have_no_shares():
+    assert shares_of_variance(np.full((2, 3), 7.0)) == {}
+
+
+def test_main_effects_and_interactions_are_found_from_trials():
+    parameters = {"x": Range(low=0.0, high=1.0), "on": [True, False], "idle": ["a", "b", "c"]}
+    rng = np.random.default_rng(0)
+    trials = [
+        {"x": float(rng.random()), "on": bool(rng.integers(2)), "idle": "abc"[rng.integers(3)]}
+        for _ in range(150)
+    ]
+    values = [trial["x"] * (1.0 if trial["on"] else -1.0) for trial in trials]
+    effects = {effect.parameters: effect for effect in effects_of(parameters, trials, values)}
+    # over the square: variance 1/3, of which E[x]^2 = 1/4 is due to `on`, the rest, 1/12, to both together
+    assert effects["on",].share == pytest.approx(0.75, abs=0.06)
+    assert effects["x", "on"].share == pytest.approx(0.25, abs=0.06)
+    assert max(effects["x",].share, effects["idle",].share) < 0.03
+    for effect in effects.values():
+        assert 0 <= effect.low <= effect.share <= effect.high <= 1
+
+
+def test_of_too_few_trials_or_equal_ones_nothing_is_said():
+    grid = [{"x": a, "y": b} for a, b in itertools.product((0, 1), repeat=2)]
+    parameters = {"x": [0, 1], "y": [0, 1]}
+    assert effects_of(parameters, grid[:3], [1.0, 2.0, 3.0]) == []
+    assert effects_of(parameters, grid, [1.0] * 4) == []
