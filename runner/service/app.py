@@ -35,6 +35,9 @@ THREADS: Final = 8
 PROCESSES: Final = 2
 """Comparisons, pictures and exports that are made at the same time, each in a process of its own."""
 
+SWEEP_SECONDS: Final = 60.0
+"""How long a process for a sweep's page is kept: loading SciPy, scikit-learn and Matplotlib takes seconds."""
+
 
 def create_app(settings: Settings) -> FastAPI:
     """Return the application.
@@ -124,6 +127,9 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
         )
         app.state.apart = stack.enter_context(
             ProcessPool(PROCESSES, settings.limits.work_seconds, settings.limits.work_bytes)
+        )
+        app.state.sweep_processes = stack.enter_context(
+            ProcessPool(PROCESSES, settings.limits.work_seconds, settings.limits.work_bytes, SWEEP_SECONDS)
         )
         LOG.info("started", extra=settings.told())
         yield {}

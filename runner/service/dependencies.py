@@ -47,9 +47,16 @@ def apart_of(request: Request) -> ProcessPool:
     return found
 
 
+def sweep_processes_of(request: Request) -> ProcessPool:
+    """Return the child processes that compute what pages show of sweeps."""
+    found: ProcessPool = request.app.state.sweep_processes
+    return found
+
+
 SettingsOf = Annotated[Settings, Depends(settings_of)]
 CatalogueOf = Annotated[Catalogue, Depends(catalogue_of)]
 ApartOf = Annotated[ProcessPool, Depends(apart_of)]
+SweepProcesses = Annotated[ProcessPool, Depends(sweep_processes_of)]
 KeptOf = Annotated[Kept, Depends(kept_of)]
 JobsOf = Annotated[Jobs, Depends(jobs_of)]
 RunName = Annotated[

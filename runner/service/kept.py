@@ -35,6 +35,14 @@ class Kept:
         """Return the answer of a key, made in a thread if it must be; see `awaited`."""
         return await self.awaited(key, lambda: run_in_threadpool(make))
 
+    def found(self, key: Hashable) -> bytes | None:
+        """Return the answer of a key if it is kept, however old; None if it must be made."""
+        kept = self._answers.get(key)
+        if kept is None:
+            return None
+        self._answers.move_to_end(key)
+        return kept.body
+
     async def awaited(
         self, key: Hashable, make: Callable[[], Awaitable[bytes]], seconds: float = SECONDS
     ) -> bytes:

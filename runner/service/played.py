@@ -119,12 +119,29 @@ def spot(run: Run, at: tuple[int, ...]) -> bytes:
     return str(with_spot(run, Request(), at or None).time).encode()
 
 
-def sweep(name: str, recordings: Path) -> bytes:
-    """Return what came of a sweep, as JSON: sections as `dualtaxi sweep show` prints them, pictures, runs."""
+def sweep_results(name: str, recordings: Path) -> bytes:
+    """Return what came of a sweep, as JSON: sections as `dualtaxi sweep show` prints them, and the runs."""
+    from runner.sweep.results import results_of, sections
+    from runner.sweep.state import read_sweep
+
+    results = results_of(read_sweep(name, recordings), recordings)
+    told = {
+        "sections": [
+            asdict(section) | {"sentences": [without_folders(text, recordings) for text in section.sentences]}
+            for section in sections(results, None)
+        ],
+        "runs": {entry.number: entry.runs for entry in results.ranking},
+        "best": results.best_yaml,
+    }
+    return json.dumps(told, default=str).encode()
+
+
+def sweep_pictures(name: str, recordings: Path) -> bytes:
+    """Return the pictures of a sweep, as JSON: its parameters, and how some of its trials learned."""
     from runner.errors import RunnerError
     from runner.sweep.figure import parallel_svg, parameter_svgs
     from runner.sweep.plots import picture_of
-    from runner.sweep.results import results_of, sections
+    from runner.sweep.results import results_of
     from runner.sweep.state import read_sweep
 
     results = results_of(read_sweep(name, recordings), recordings)
@@ -132,18 +149,12 @@ def sweep(name: str, recordings: Path) -> bytes:
     try:
         picture = picture_of(results)
         pictures, note = [*parameter_svgs(picture), parallel_svg(picture)], picture.footnote
-    except RunnerError:  # no trial is finished yet, as the sections say
+    except RunnerError:  # no trial is finished yet, as the results say
         pass
     told = {
-        "sections": [
-            asdict(section) | {"sentences": [without_folders(text, recordings) for text in section.sentences]}
-            for section in sections(results, None)
-        ],
         "pictures": pictures,
         "note": note,
         "learning": _learning(results, recordings),
-        "runs": {entry.number: list(entry.runs.values()) for entry in results.ranking},
-        "best": results.best_yaml,
         "parameters": list(results.sweep.file.parameters),
     }
     return json.dumps(told, default=str).encode()

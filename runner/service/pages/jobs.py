@@ -58,7 +58,7 @@ def job(request: Request, jobs: JobsOf, number: Number) -> Response:
     return page(
         request,
         "job.html",
-        job=_told(found, jobs),
+        job=shown_job(found, jobs),
         log=log,
         place=place,
         submitted=jobs.queue.submitted(number),
@@ -89,7 +89,7 @@ def _queue(jobs: Jobs, number: int) -> dict[str, Any]:
     found = list(reversed(jobs.queue.jobs()))
     shown = found[(number - 1) * ROWS : number * ROWS]
     return {
-        "jobs": [_told(job, jobs) for job in shown],
+        "jobs": [shown_job(job, jobs) for job in shown],
         "standing": queue_told(jobs.standing()),
         "active": any(job.state in ("queued", "running") for job in found),
         "page": number,
@@ -98,7 +98,7 @@ def _queue(jobs: Jobs, number: int) -> dict[str, Any]:
     }
 
 
-def _told(job: Job, jobs: Jobs) -> dict[str, Any]:
+def shown_job(job: Job, jobs: Jobs) -> dict[str, Any]:
     """Return what is shown of a job."""
     facts = told(job, jobs).model_dump()
     progress = facts["progress"] or {}

@@ -39,6 +39,7 @@ _OWN: Final = (
         "charts.js",
         "episode.js",
         "job.js",
+        "later.js",
         "live.js",
         "parts.js",
         "rerun.css",

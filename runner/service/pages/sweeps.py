@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import asyncio
+import hashlib
 import json
+import os
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
+from fastapi.responses import HTMLResponse
+from starlette.concurrency import run_in_threadpool
 
 from runner.catalogue.filters import parse
 from runner.errors import RunnerError, RunNotFound
 from runner.service import played
-from runner.service.dependencies import ApartOf, CatalogueOf, JobsOf, KeptOf, SettingsOf
+from runner.service.catalogue import Catalogue
+from runner.service.dependencies import CatalogueOf, JobsOf, KeptOf, SettingsOf, SweepProcesses
+from runner.service.kept import ALWAYS, Kept
+from runner.service.pages.jobs import shown_job
 from runner.service.pages.problems import message_of
-from runner.service.pages.rendering import page, picture_address
-from runner.sweep.state import read_sweep, sweeps_in, tag_of
+from runner.service.pages.rendering import page, picture_address, templates
+from runner.service.processes import ProcessPool
+from runner.sweep.state import folder_of, read_sweep, sweeps_in, tag_of
 
 router = APIRouter(prefix="/sweeps", include_in_schema=False)
 
-SWEEP_SECONDS: Final = 20.0
-"""So old may what is told of a sweep be."""
 Name = Annotated[str, InPath(max_length=100)]
 
 
@@ -50,25 +58,115 @@ def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
 
 @router.get("/{name}")
 async def sweep(
-    request: Request, name: Name, settings: SettingsOf, kept: KeptOf, apart: ApartOf, jobs: JobsOf
+    request: Request,
+    name: Name,
+    settings: SettingsOf,
+    catalogue: CatalogueOf,
+    kept: KeptOf,
+    apart: SweepProcesses,
+    jobs: JobsOf,
+    whole: Annotated[bool, Query(description="Wait for results and pictures.")] = False,
 ) -> Response:
-    """Show what came of a sweep."""
-    folder = _folder_of(name, settings.recordings)
-    key = ("sweep", name, folder)
-    body = await kept.awaited(key, lambda: apart(played.sweep, name, folder), SWEEP_SECONDS)
-    made_by = [job.number for job in jobs.queue.jobs() if job.kind == "sweep" and job.name == name]
-    found = json.loads(body)
-    pictures = [picture_address(picture) for picture in found["pictures"]]
-    for panel in found["learning"]["panels"]:
-        panel["address"] = picture_address(panel["svg"])
-    shown = {"told": found, "pictures": pictures, "jobs": made_by[-1:], "tag": tag_of(name)}
-    return page(request, "sweep.html", name=name, **shown)
+    """Show what came of a sweep: at once, with what is not ready yet announced in its place."""
+    seen = await run_in_threadpool(_look, name, settings.recordings, catalogue)
+    results: bytes | None
+    pictures: bytes | None
+    if whole:
+        results, pictures = await asyncio.gather(
+            _made(seen, "results", kept, apart), _made(seen, "pictures", kept, apart)
+        )
+    else:
+        results, pictures = (kept.found((part, seen)) for part in ("sweep results", "sweep pictures"))
+
+    def shown() -> Response:
+        made_by = [job for job in jobs.queue.jobs() if job.kind == "sweep" and job.name == name]
+        return page(
+            request,
+            "sweep.html",
+            name=name,
+            tag=tag_of(name),
+            runs=seen.runs,
+            parameters=list(read_sweep(name, seen.folder).file.parameters),
+            job=shown_job(made_by[-1], jobs) if made_by else None,
+            results=_results_html(results) if results else "",
+            pictures=_pictures_html(pictures) if pictures else "",
+        )
+
+    return await run_in_threadpool(shown)
+
+
+@router.get("/{name}/results")
+async def results(
+    name: Name, settings: SettingsOf, catalogue: CatalogueOf, kept: KeptOf, apart: SweepProcesses
+) -> Response:
+    """Return the comparison of a sweep's trials, as a part of its page."""
+    seen = await run_in_threadpool(_look, name, settings.recordings, catalogue)
+    body = await _made(seen, "results", kept, apart)
+    return HTMLResponse(await run_in_threadpool(_results_html, body))
+
+
+@router.get("/{name}/pictures")
+async def pictures(
+    name: Name, settings: SettingsOf, catalogue: CatalogueOf, kept: KeptOf, apart: SweepProcesses
+) -> Response:
+    """Return the pictures of a sweep, as a part of its page."""
+    seen = await run_in_threadpool(_look, name, settings.recordings, catalogue)
+    body = await _made(seen, "pictures", kept, apart)
+    return HTMLResponse(await run_in_threadpool(_pictures_html, body))
 
 
 # --- inside -------------------------------------------------------------------------------------------
 
 
-def _runs_tagged(catalogue: CatalogueOf, name: str) -> int:
+@dataclass(frozen=True)
+class _Seen:
+    """A sweep as it was found: what is made of it is the same as long as this is."""
+
+    name: str
+    folder: Path
+    """The recordings folder."""
+    runs: int
+    digest: str
+    """Of the catalogue's rows of its runs, and of the files of the sweep itself."""
+
+
+def _look(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _Seen:
+    """Return a sweep as it is now.
+
+    Raises:
+        RunNotFound: there is none of this name.
+    """
+    folder = _folder_of(name, folders)
+    chosen = parse(f'tag:"{tag_of(name)}"')
+    rows = catalogue.read(lambda index: index.select(chosen))
+    files = sorted(
+        (entry.name, facts.st_size, facts.st_mtime_ns)
+        for entry in os.scandir(folder_of(name, folder))
+        if (facts := entry.stat())
+    )
+    digest = hashlib.sha256(json.dumps([files, rows], default=str, sort_keys=True).encode()).hexdigest()
+    return _Seen(name, folder, len(rows), digest)
+
+
+async def _made(seen: _Seen, part: str, kept: Kept, apart: ProcessPool) -> bytes:
+    """Return a part of a sweep's page as data, made by a child process unless it is kept."""
+    make = played.sweep_results if part == "results" else played.sweep_pictures
+    return await kept.awaited((f"sweep {part}", seen), lambda: apart(make, seen.name, seen.folder), ALWAYS)
+
+
+def _results_html(body: bytes) -> str:
+    return templates().get_template("sweep_results.html").render(told=json.loads(body))
+
+
+def _pictures_html(body: bytes) -> str:
+    told = json.loads(body)
+    for panel in told["learning"]["panels"]:
+        panel["address"] = picture_address(panel["svg"])
+    pictures = [picture_address(picture) for picture in told["pictures"]]
+    return templates().get_template("sweep_pictures.html").render(told=told, pictures=pictures)
+
+
+def _runs_tagged(catalogue: Catalogue, name: str) -> int:
     chosen = parse(f'tag:"{tag_of(name)}"')
     return catalogue.read(lambda index: index.count(chosen))
 

@@ -156,8 +156,15 @@ def test_a_sweep_is_done_and_may_use_the_workers_that_nobody_waits_for(client, s
     assert len(runs) == 6
     best = progress[-1]["best"]
     assert any(f"trial {best['trial']} is the best so far" in data.get("text", "") for _, _, data in seen)
-    page = client.get("/sweeps/small").text
+    first = client.get("/sweeps/small").text
+    assert "Comparing the trials of 6 runs …" in first
+    assert 'data-later="/sweeps/small/pictures"' in first
+    table = client.get("/sweeps/small/results").text
+    assert all(f'href="/runs/{run.run_id}"' in table for run in runs)
+    page = client.get("/sweeps/small?whole=true").text
     assert 'alt="Length of evaluation trials over training episodes"' in page
+    assert table in page
+    assert client.get("/sweeps/small").text == page, "nothing has changed, so all of it is at hand"
 
 
 def test_a_job_whose_worker_dies_is_tried_again_and_then_fails(client, submit):
