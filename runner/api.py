@@ -177,6 +177,21 @@ def checked_name(name: str | None) -> str | None:
     return name
 
 
+def checked_run_name(name: str | None) -> str | None:
+    """Return the name of a recorded loop, or a run's new name, if it can be one: as of `ALE/Pong-v5__ppo+1`.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    import re
+
+    from runner.labels import RUN_NAME_EXPECTED, RUN_NAME_PATTERN
+
+    if name is not None and not re.fullmatch(RUN_NAME_PATTERN, name):
+        raise ConfigError(f"name: found {name!r}, expected {RUN_NAME_EXPECTED}")
+    return name
+
+
 class Interrupt:
     """Whether the process was told to stop."""
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Final, Protocol, TypeVar
 
 from runner.errors import RunNotFound, nearest
+from runner.labels import RUN_NAME_PATTERN
 from runner.runs import Run, list_runs, run_at, run_of_id
 
 LATEST: Final = "@latest"
@@ -64,10 +66,15 @@ def find_run(name: str, recordings: Path, but: str = "") -> Run:
 def run_at_once(name: str, recordings: Path) -> Run | None:
     """Return the run at a path, or in the folder called like its id; None if others must be looked at.
 
+    What looks like a path may also be a name with a slash, such as `ALE/Pong-v5`, if nothing is there.
+
     Raises:
         RunNotFound: it is a path, and there is no run.
     """
     if os.sep in name or name.endswith(".mcap") or (os.altsep and os.altsep in name):
+        stem = name.removesuffix(LATEST)
+        if re.fullmatch(RUN_NAME_PATTERN, stem) and not name.endswith(".mcap") and not os.path.lexists(name):
+            return None
         return run_at(Path(name))
     return run_of_id(name, recordings)
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from runner.config.model import NAME_EXPECTED, NAME_PATTERN
 from runner.documents import sync, write_whole
 from runner.errors import RecordingError
-from runner.labels import LABELS_FILE, Labels, as_json
+from runner.labels import LABELS_FILE, RUN_NAME_EXPECTED, RUN_NAME_PATTERN, Labels, as_json
 from runner.packing.packing import facts_bytes, run_facts
 from runner.packing.present import Occupied, known, link, met, settled
 from runner.packing.unpacking import workplace
@@ -95,10 +94,10 @@ def _checked_facts(recording: Recording, said: Mapping[str, Any]) -> dict[str, A
         raise RecordingError(
             f"{recording.path}: what it says of its run makes no sense ({'; '.join(problems)})."
         )
-    named = all(re.fullmatch(NAME_PATTERN, facts[key]) for key in ("run_id", "name"))
+    named = all(re.fullmatch(RUN_NAME_PATTERN, facts[key]) for key in ("run_id", "name"))
     if not named or not 0 <= facts["seed"] < 1 << 64:
         raise RecordingError(
             f"{recording.path}: found the run {facts['run_id'][:100]!r} ({facts['name'][:100]!r}, seed "
-            f"{facts['seed']}), expected {NAME_EXPECTED}; a seed of 64 bits."
+            f"{facts['seed']}), expected {RUN_NAME_EXPECTED}; a seed of 64 bits."
         )
     return facts | {"provenance": {key: made_by[key] for key in MADE_BY if key in made_by}}

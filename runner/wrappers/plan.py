@@ -71,7 +71,7 @@ class Plan:
         return settings
 
     def _check(self) -> None:
-        from runner.api import checked_name
+        from runner.api import checked_run_name
 
         expectations = (
             ("name", "text", self.name is None or isinstance(self.name, str)),
@@ -91,7 +91,7 @@ class Plan:
         for key, expected, holds in expectations:
             if not holds:
                 raise ConfigError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
-        checked_name(self.name)
+        checked_run_name(self.name)
 
 
 def plan_of(

@@ -58,7 +58,7 @@ def command(
 
     started = time.monotonic()
     run = find_recorded(run_name, recordings)
-    path = output or EXPORTS / f"{run.name}-{run.run_id}.rrd"
+    path = output or EXPORTS / f"{run.file_stem}.rrd"
     require_new(path, force)
     request = request_of(episodes, evaluations, every, everything)
     with open_recording(run.recording) as recording, announcing(), stage_line("exporting"):

@@ -28,12 +28,12 @@ def command(run_name: str, name: str | None, original: bool, recordings: Path | 
       dualtaxi rename @latest patient
       dualtaxi rename patient --original
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.api import checked_name
+    from runner.api import checked_run_name
     from runner.runs import relabel
 
     if original == (name is not None):
         raise click.UsageError("expected a NAME, or --original.")
-    called = checked_name(name) or ""
+    called = checked_run_name(name) or ""
     run = find(run_name, recordings)
     before, first = run.name, run.file.name
     labels = relabel(run, lambda was: replace(was, name="" if called == first else called))

@@ -43,7 +43,7 @@ class _File(FileResponse):
 @router.head("/recording", response_class=Response, responses=FILE, include_in_schema=False)
 def recording(run: RecordedRun, if_none_match: IfNoneMatch = None) -> Response:
     """Return the MCAP file. Its ETag holds the content digest, and changes with every byte of the file."""
-    return _file(run.recording, f"{run.name}-{run.run_id}.mcap", tag_of(run), if_none_match)
+    return _file(run.recording, f"{run.file_stem}.mcap", tag_of(run), if_none_match)
 
 
 @router.get(
@@ -71,7 +71,7 @@ async def replay(
     Of the steps, unless told otherwise, those of 20 training episodes and of the last evaluation are in it.
     """
     path = await replay_of([run], kept, apart, episodes, tuple(evaluations or ()), every)
-    return _file(path, f"{run.name}-{run.run_id}.rrd", path.stem, if_none_match)
+    return _file(path, f"{run.file_stem}.rrd", path.stem, if_none_match)
 
 
 async def replay_of(

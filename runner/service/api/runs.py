@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from runner.api import checked_name
+from runner.api import checked_run_name
 from runner.catalogue.columns import PROGRAMS, columns_of, with_originals
 from runner.catalogue.columns import as_json as row_as_json
 from runner.catalogue.filters import parse
@@ -164,7 +164,7 @@ def relabelled(run: Run, labels: Labels, catalogue: Catalogue) -> dict[str, Any]
         StorageError: the run's folder cannot be written.
     """
     first = run.file.name
-    name = checked_name(labels.name) if labels.name else labels.name
+    name = checked_run_name(labels.name) if labels.name else labels.name
 
     def change(was: Said) -> Said:
         called = was.name if name is None else "" if name == first else name
