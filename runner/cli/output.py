@@ -33,6 +33,9 @@ __all__ = [
     "title",
 ]
 
+SHRUNK: Final = 10
+"""Characters that a shrinking column of a table keeps."""
+
 UNBOUNDED: Final = 1000
 """The width where there is no terminal to fit."""
 
@@ -75,12 +78,31 @@ def draw(*parts: RenderableType) -> None:
     drawn = console()
     if drawn.is_terminal:
         for part in parts:
-            drawn.print(part)
+            # Lines too long for the terminal are broken by it: no figure is cut short.
+            drawn.print(part, width=max(drawn.width, _least_width(part)), crop=False)
         return
     with drawn.capture() as captured:
         for part in parts:
             drawn.print(part)
     click.echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
+
+
+def _least_width(part: RenderableType) -> int:
+    """Return the width that a table needs so that only its shrinking columns are shortened."""
+    from rich.cells import cell_len
+    from rich.table import Table
+
+    if not isinstance(part, Table) or not part.columns or part.show_header is False:
+        return 0
+    widths = [
+        max(cell_len(line) for cell in (column.header, *column.cells) for line in str(cell).split("\n"))
+        for column in part.columns
+    ]
+    shown = [
+        width if column.no_wrap else min(width, SHRUNK)
+        for width, column in zip(widths, part.columns, strict=True)
+    ]
+    return sum(shown) + 2 * len(shown)
 
 
 def title(text: str) -> Text:

@@ -79,13 +79,15 @@ def _sweep(document: Document, name: str | None, stem: str, beside: Path | None)
             (), f"found {found(document.value)}, expected keys and values, such as base and trials"
         )
         raise refuse([*document.problems, problem], document)
+    if "base" not in document.value and "episodes" in document.value:
+        raise ConfigError(f"{stem}: found an experiment, expected a sweep: `dualtaxi run` runs it.")
     try:
         file = SweepFile.model_validate(dict(document.value))
+        problems = document.problems
     except ValidationError as error:
-        problems = problems_in(error, document.value, _schema())
-        raise refuse([*document.problems, *problems], document) from None
-    if document.problems:
-        raise refuse(document.problems, document)
+        problems = [*document.problems, *problems_in(error, document.value, _schema())]
+    if problems:
+        raise _all_of([refuse(problems, document), *_mistakes_in_base(document, stem)])
     called = name or file.name or stem
     if len(called) > MAX_NAME:
         raise ConfigError(
@@ -96,6 +98,23 @@ def _sweep(document: Document, name: str | None, stem: str, beside: Path | None)
     sweep = Sweep(called, spelled, base)
     _check_parameters(sweep, document)
     return sweep
+
+
+def _mistakes_in_base(document: Document, name: str) -> list[ConfigError]:
+    """Return the error of a base that stands in the file itself, if there is one."""
+    if not isinstance(document.value.get("base"), Mapping):
+        return []
+    try:
+        experiment_in(_below(document, "base"), (), name, named_by=repr(name))
+    except ConfigError as error:
+        return [error]
+    return []
+
+
+def _all_of(errors: list[ConfigError]) -> ConfigError:
+    """Return one error with the problems of several."""
+    problems = [problem for error in errors for problem in error.problems]
+    return ConfigError("\n".join(map(str, errors)), problems)
 
 
 def _base(

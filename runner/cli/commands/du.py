@@ -74,24 +74,28 @@ def _as_json(usage: Usage) -> dict[str, Any]:
 def _draw(found: Sequence[Usage], freeable: dict[str, int], limit: int) -> None:
     from runner.catalogue.usage import totals
 
-    kinds = ("recording", "exports", "restored", "other", "total")
+    every = dict(
+        zip(("recording", "exports", "restored", "other", "total"), totals(found).values(), strict=True)
+    )
+    kinds = [kind for kind, number in every.items() if number or kind == "total"]  # none of nothing
+
+    def sizes(usages: Sequence[Usage]) -> list[str]:
+        numbers = dict(zip(every, totals(usages).values(), strict=True))
+        return [_bytes(numbers[kind]) for kind in kinds]
+
+    same = ["same as"] if any(usage.row["same_as"] for usage in found) else []
     drawn = table(
-        "id",
-        "name",
-        "status",
-        *kinds,
-        "same as",
+        *("id", "name", "status", *kinds, *same),
         left=("id", "name", "status", "same as"),
         shrinking=("name",),
     )
     for usage in found[:limit]:
         row = usage.row
-        bytes_of = [_bytes(number) for number in totals([usage]).values()]
-        drawn.add_row(row["id"], row["name"], row["status"], *bytes_of, row["same_as"] or "")
+        others = [row["same_as"] or ""] if same else []
+        drawn.add_row(row["id"], row["name"], row["status"], *sizes([usage]), *others)
     if found[limit:]:
-        others = [_bytes(number) for number in totals(found[limit:]).values()]
-        drawn.add_row(f"{len(found) - limit:,} more", "", "", *others, "")
-    drawn.add_row("all", "", "", *[_bytes(number) for number in totals(found).values()], "", style="bold")
+        drawn.add_row(f"{len(found) - limit:,} more", "", "", *sizes(found[limit:]))
+    drawn.add_row("all", "", "", *sizes(found), style="bold")
     draw(drawn)
     told = {
         _FREED_BY[kind][0]: f"{size(number)}  {_FREED_BY[kind][1]}"

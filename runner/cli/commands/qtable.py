@@ -123,8 +123,9 @@ def _draw(told: dict[str, Any]) -> None:
 def _drawn(rows: list[dict[str, Any]]) -> Any:
     policy = ("policy",) if "policy" in rows[0] else ()
     drawn = table(
-        *("action", "", "value", *policy, "greedy", "visits", "last changed by step", "in episode"),
+        *("action", "", "value", *policy, "greedy", "visits", "changed\nby step", "in\nepisode"),
         left=("", "greedy"),
+        shrinking=("",),
     )
     for row in rows:
         changed = row["changed_step"] is not None

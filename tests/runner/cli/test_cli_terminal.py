@@ -133,3 +133,11 @@ def test_play_pauses_steps_and_quits(recorded):
     steps = [int(step) for step in re.findall(r"step (\d+) of", shown)]
     assert [step for i, step in enumerate(steps) if i == 0 or step != steps[i - 1]] == [0, 1, 2, 3, 2, 1]
     assert "paused" in shown
+
+
+@pytest.mark.parametrize(
+    "words", [["qtable", "tiny", "--state", 300], ["du"], ["ls"]], ids=lambda words: words[0]
+)
+def test_a_narrow_terminal_cuts_no_figure_and_no_heading(recorded, words):
+    shown = _typed(words, recorded.recordings, COLUMNS="60")
+    assert "…" not in shown
