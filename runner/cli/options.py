@@ -7,7 +7,7 @@ from typing import Final
 
 import click
 
-from runner.cli.parameters import ConfigName, RunName, TrialName
+from runner.cli.parameters import ConfigName, FilterWord, RunName, Setting, TrialName
 
 EXPORTS: Final = Path("exports")
 """Where commands write files unless -o says where; in a clone, Git ignores it."""
@@ -45,7 +45,7 @@ folders_option: Final = click.option(
     help="A folder of runs; may be repeated.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
 )
 
-filter_argument: Final = click.argument("words", metavar="[FILTER]...", nargs=-1)
+filter_argument: Final = click.argument("words", metavar="[FILTER]...", nargs=-1, type=FilterWord())
 
 json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs to read.")
 
@@ -53,6 +53,7 @@ set_option: Final = click.option(
     "--set",
     "overrides",
     multiple=True,
+    type=Setting(),
     metavar="KEY=VALUE",
     help="Put another value in the configuration, such as evaluation.trials=50; may be repeated.",
 )

@@ -56,6 +56,62 @@ class ShippedName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # g
         ]
 
 
+class FilterWord(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+    """A word of a filter such as `status:finished`; completes fields and statuses."""
+
+    name = "filter"
+
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        """Return the fields that begin so, each with its colon; after `status:` the statuses."""
+        from runner.catalogue.fields import FIELDS, SETTING, STATUSES
+
+        words = {f"{name}:": field.meaning for name, field in FIELDS.items()}
+        words[SETTING] = "a value of the configuration, such as config.discount"
+        if incomplete.startswith("status:"):
+            words = {f"status:{status}": "" for status in STATUSES}
+        return [
+            CompletionItem(word, help=text) for word, text in words.items() if word.startswith(incomplete)
+        ]
+
+
+class Setting(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+    """`KEY=VALUE` of a configuration; completes the keys."""
+
+    name = "setting"
+
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        """Return the keys that begin so, each with its equals sign."""
+        from runner.config import json_schema
+
+        keys = _keys(json_schema())
+        return [
+            CompletionItem(f"{key}=", help=text) for key, text in keys.items() if key.startswith(incomplete)
+        ]
+
+
+def _keys(schema: dict[str, Any], part: dict[str, Any] | None = None, prefix: str = "") -> dict[str, str]:
+    """Return the paths of a schema's values, sections included, and what each means."""
+    keys = {}
+    for name, value in (schema if part is None else part).get("properties", {}).items():
+        path = f"{prefix}{name}"
+        keys[path] = str(value.get("description", ""))
+        for kind in (value, *value.get("anyOf", ())):
+            if reference := kind.get("$ref"):
+                section = schema["$defs"][reference.rpartition("/")[2]]
+                keys |= _keys(schema, section, f"{path}.")
+    return keys
+
+
 class ConfigName(click.Path):
     """A file, or the name of a shipped experiment; completes both.
 

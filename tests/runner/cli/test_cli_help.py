@@ -10,6 +10,7 @@ import sys
 
 import click
 import pytest
+from click.shell_completion import ShellComplete
 from click.testing import CliRunner
 
 from runner.cli import COMMANDS, cli, commands
@@ -138,3 +139,19 @@ def test_the_module_can_be_run():
         [sys.executable, "-m", "runner", "--version"], capture_output=True, text=True, check=True
     )
     assert done.stdout.startswith("dualtaxi ")
+
+
+@pytest.mark.parametrize(
+    ("words", "incomplete", "expected"),
+    [
+        (["run", "quick", "--set"], "evaluation.tr", ["evaluation.trials="]),
+        (["run", "quick", "--set"], "disc", ["discount="]),
+        (["ls"], "mean_l", ["mean_length:"]),
+        (["ls", "seed:1"], "status:fi", ["status:finished"]),
+        (["config", "copy"], "qu", ["quick"]),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else value,
+)
+def test_completion_knows_settings_fields_and_shipped_experiments(words, incomplete, expected):
+    completed = ShellComplete(cli, {}, "dualtaxi", "_DUALTAXI_COMPLETE").get_completions(words, incomplete)
+    assert [item.value for item in completed] == expected
