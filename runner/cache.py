@@ -13,6 +13,8 @@ RUN_SEPARATOR: Final = "+"
 """What stands between the ids of several runs in the name of an export: no id has it."""
 RESTORED: Final = "restored"
 """The folder in it of recordings restored from archives; their names begin with the ids of their runs."""
+TABLES: Final = "tables"
+"""The folder in it of Q-tables along long runs; their names begin with the ids of their runs."""
 
 
 def cache_folder() -> Path:

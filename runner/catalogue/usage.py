@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from peewee import DatabaseError
 
-from runner.cache import EXPORTS, RESTORED, RUN_SEPARATOR, cache_folder
+from runner.cache import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
 from runner.catalogue.database import keep_usage, opened
 from runner.labels import KEEP, LABELS_FILE, LOCK_FILE
 from runner.locking import RUN_LOCK
@@ -83,7 +83,7 @@ def cached(part: str) -> Counter[str]:
     """Return the bytes cached for each run, by its id; what is for several counts for the first.
 
     Args:
-        part: the folder in the cache, `EXPORTS` or `RESTORED`.
+        part: the folder in the cache: `EXPORTS`, `TABLES` or `RESTORED`.
     """
     found: Counter[str] = Counter()
     for name, size in _sizes(cache_folder() / part):
@@ -119,7 +119,7 @@ def usages(rows: Sequence[dict[str, Any]]) -> list[Usage]:
 
     What is found in a folder is kept in the index: it is looked at again when something in it changed.
     """
-    exports, restored = cached(EXPORTS), cached(RESTORED)
+    exports, restored = cached(EXPORTS) + cached(TABLES), cached(RESTORED)
     found, fresh = [], []
     for row in rows:
         contents = _kept_contents(row)

@@ -24,6 +24,7 @@ from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
+from runner.replay.checkpoints import CHECKPOINT_STEPS, Checkpoints
 from runner.replay.checks import check_steps
 
 NEAR_STEPS: Final = 200_000
@@ -177,7 +178,10 @@ class TableReplay(StepReplay):
         super().__init__(recording.config, recording.mdp, int(recording.run["seed"]), str(recording.path))
         self._recording = recording
         self._recorded = recording.count(schema.TRAIN_STEP)
-        self.rewind(*self._nearest_snapshot(step))
+        self._checkpoints = Checkpoints(recording)
+        self._origin: int | None = None
+        """The step from which the recording alone moved the tables; None if they were set by hand."""
+        self._load(*self._nearest(step))
         self.advance(step)
 
     def advance(self, step: int) -> None:
@@ -211,17 +215,30 @@ class TableReplay(StepReplay):
         lost = self._recording.lost.get(schema.TRAIN_STEP.name, [])
         gap = any(start < step and stop > self.step for start, stop in lost)
         if gap or not self.step <= step <= self.step + NEAR_STEPS:
-            nearest, held = self._nearest_snapshot(step)
+            nearest, held = self._nearest(step)
             if not self.step <= step or nearest > self.step:
-                self.rewind(nearest, held)
+                self._load(nearest, held)
         self.advance(step)
 
-    def _nearest_snapshot(self, step: int) -> tuple[int, list[Held]]:
+    def rewind(self, step: int, held: list[Held]) -> None:
+        """Set the tables to what the learners held at a step; from there on no checkpoints are kept."""
+        super().rewind(step, held)
+        self._origin = None
+
+    def _load(self, step: int, held: list[Held]) -> None:
+        super().rewind(step, held)
+        self._origin = step
+
+    def _nearest(self, step: int) -> tuple[int, list[Held]]:
+        """Return the last snapshot at or before a step, or a checkpoint between them; and its step."""
         nearest = _snapshot_before(self._recording, step, self.kinds)
         if nearest is None:
             raise RecordingError(f"{self._recording.path}: has no Q-table at or before step {step}.")
         _check_shapes(self._recording, nearest[1], self.held)
-        return nearest
+        if step - nearest[0] <= CHECKPOINT_STEPS:
+            return nearest
+        at, tables = self._checkpoints.nearest(step, [table.shape for table in self.snapshot()])
+        return (at, held_of(tables, self.kinds)) if at > nearest[0] else nearest
 
     def _advance(self, stop: int, seen: NDArray[np.float64] | None) -> None:
         first = self.step
@@ -230,10 +247,20 @@ class TableReplay(StepReplay):
         if stop > max(self._recorded, first):
             raise self._missing(stop)
         for block in self._recording.blocks(schema.TRAIN_STEP, first, stop) if stop > first else ():
-            at = self.step - first
-            self.apply(block, _NO_ROWS if seen is None else seen[at : at + len(block)])
+            for part in np.split(block, [-self.step % CHECKPOINT_STEPS] if len(block) else []):
+                at = self.step - first
+                self.apply(part, _NO_ROWS if seen is None else seen[at : at + len(part)])
+                self._keep_checkpoint()
+        self._checkpoints.prune()
         if self.step < stop:
             raise self._lost(stop)
+
+    def _keep_checkpoint(self) -> None:
+        """Keep the tables for later replays where no snapshot is near before them."""
+        if self._origin is None or self.step % CHECKPOINT_STEPS or self.step == self._origin:
+            return
+        if self.step - self._origin >= CHECKPOINT_STEPS:
+            self._checkpoints.save(self.step, self.snapshot())
 
     def _missing(self, stop: int) -> RecordingError:
         recording = self._recording

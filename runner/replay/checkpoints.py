@@ -1,0 +1,129 @@
+"""Q-tables in the user's cache, one set every million steps of a replay, so that the next one begins nearby.
+
+A recording has snapshots by episodes, which may lie a hundred million steps apart. The first replay
+over such a stretch leaves checkpoints behind; from then on the tables at any step are a short replay away.
+They can be removed at any time: the recording alone is the truth.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import re
+import tempfile
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import zstandard
+from blake3 import blake3
+from numpy.typing import NDArray
+
+import runner.learning
+from runner.cache import TABLES, cache_folder
+from runner.recording.reader import Recording
+
+CHECKPOINT_STEPS: Final = 1 << 20
+"""Training steps between checkpoints: replayed in well under half a second."""
+MAX_CACHE_BYTES: Final = 2 << 30
+"""Size of all checkpoints of all runs; those not used for longest are removed beyond it."""
+
+
+class Checkpoints:
+    """The checkpoints of one recording.
+
+    Args:
+        recording: the run; unless it is finished, there are no checkpoints, as it may still change.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self._folder = cache_folder() / TABLES
+        run_id = re.sub(r"[^\w-]", "_", recording.run["run_id"])[:80]  # whatever the file says, a plain name
+        self._prefix = f"{run_id}-{_key(recording)}" if recording.finished else ""
+        self._saved = False
+
+    def nearest(self, step: int, shapes: Sequence[tuple[int, ...]]) -> tuple[int, list[NDArray[np.float64]]]:
+        """Return the last checkpoint at or before a step, and its tables; step -1 if there is none.
+
+        Args:
+            step: training steps taken.
+            shapes: of the tables, in the order of a snapshot.
+        """
+        for found in sorted((found for found in self._steps() if found <= step), reverse=True):
+            tables = self._load(found, shapes)
+            if tables is not None:
+                return found, tables
+        return -1, []
+
+    def save(self, step: int, tables: Sequence[NDArray[np.float64]]) -> None:
+        """Keep the tables at a step, unless they are there."""
+        path = self._path(step)
+        if not self._prefix or path.exists():
+            return
+        data = b"".join(np.ascontiguousarray(table, "<f8").tobytes() for table in tables)
+        with contextlib.suppress(OSError):  # a cache that cannot be written costs time only
+            self._folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=self._folder, prefix=".", delete=False) as file:
+                file.write(zstandard.ZstdCompressor(level=1, write_checksum=True).compress(data))
+            Path(file.name).replace(path)
+            self._saved = True
+
+    def prune(self) -> None:
+        """Remove the checkpoints not used for longest, of any run, where they take too much space."""
+        if not self._saved:
+            return
+        self._saved = False
+        with contextlib.suppress(OSError):
+            files = sorted((f.stat().st_mtime, f.stat().st_size, f) for f in self._folder.iterdir())
+            excess = sum(size for _, size, _ in files) - MAX_CACHE_BYTES
+            for _, size, file in files:
+                if excess <= 0:
+                    return
+                file.unlink(missing_ok=True)
+                excess -= size
+
+    def _steps(self) -> list[int]:
+        if not self._prefix or not self._folder.is_dir():
+            return []
+        names = [path.name for path in self._folder.iterdir() if path.name.startswith(self._prefix)]
+        steps = [name.removeprefix(self._prefix).removesuffix(".zst") for name in names]
+        return [int(step) for step in steps if step.isdecimal()]
+
+    def _load(self, step: int, shapes: Sequence[tuple[int, ...]]) -> list[NDArray[np.float64]] | None:
+        """Return the tables of a checkpoint; None if it is damaged, and then it is removed."""
+        path, sizes = self._path(step), [math.prod(shape) for shape in shapes]
+        try:
+            data = path.read_bytes()
+            if zstandard.frame_content_size(data) != 8 * sum(sizes):
+                raise ValueError
+            values = np.frombuffer(zstandard.ZstdDecompressor().decompress(data), "<f8")
+            os.utime(path)
+        except (OSError, ValueError, zstandard.ZstdError):
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+            return None
+        parts = np.split(values, np.cumsum(sizes)[:-1])
+        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+    def _path(self, step: int) -> Path:
+        return self._folder / f"{self._prefix}{step:015}.zst"
+
+
+def _key(recording: Recording) -> str:
+    """Return what tells the tables of this file, replayed by this code, from any others."""
+    facts = recording.path.stat()
+    parts = [str(recording.path.absolute()), str(facts.st_size), str(facts.st_mtime_ns)]
+    parts += [str(recording.result.get("content_digest")), _code()]
+    return blake3("\n".join(parts).encode()).hexdigest()[:16]
+
+
+@cache
+def _code() -> str:
+    """Return a hash of the code that learns: tables made by other code may be others."""
+    digest = blake3()
+    for file in sorted(Path(next(iter(runner.learning.__path__))).glob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
