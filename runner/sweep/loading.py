@@ -217,7 +217,7 @@ def _placed(sweep: Sweep, values: Mapping[str, Any], document: Document) -> Expe
         within,
         [
             (tuple(path.split(".")), Document(value, {(): place} if (place := places[path]) else {}))
-            for path, value in values.items()
+            for path, value in sweep.applicable(values).items()
         ],
     )
     return experiment_in(within, (), sweep.name, named_by=repr(sweep.name))

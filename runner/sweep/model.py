@@ -13,7 +13,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.file import SeveralSeeds
-from runner.config.model import Name, Seed
+from runner.config.model import OWN_SECTIONS, Name, Seed
 from runner.config.values import Count, Section, refusal
 
 Strategy = Literal["grid", "random", "tpe", "genetic"]
@@ -178,6 +178,11 @@ class SweepFile(Section):
     seeds: SeveralSeeds = Field(
         default=(0,), description="Each trial is run with each: a list, or the first and how many."
     )
+    repeats: bool = Field(
+        default=False,
+        description="Whether tpe may suggest values that it has suggested before, as it did in sweeps begun "
+        "before there was this key.",
+    )
     search_seed: Seed = Field(default=0, description="What the suggestions follow from.")
     objective: Objective = Field(default=Objective(), description="What is looked for.")
     pruning: Pruning | None = Field(default=None, description="Hopeless runs are given up; null: never.")
@@ -251,8 +256,16 @@ class Sweep:
         Raises:
             ConfigError: they do not go together.
         """
-        changes = [f"{path}={json.dumps(value)}" for path, value in values.items()]
+        changes = [f"{path}={json.dumps(value)}" for path, value in self.applicable(values).items()]
         return from_mapping(self.start_of_trials, changes)
+
+    def applicable(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values without those in the section of another algorithm than the one they name."""
+        algorithm = values.get("algorithm", self.base.algorithm)
+        others = {key for key, (owner, _) in OWN_SECTIONS.items() if owner != algorithm}
+        if "algorithm" not in values:
+            others = set()  # then it is a mistake, which the configuration reports
+        return {path: value for path, value in values.items() if path.partition(".")[0] not in others}
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, fit for JSON and YAML, which `from_values` takes back to an equal sweep."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -28,6 +28,10 @@ def require_optuna() -> Any:
     return optuna
 
 
+_TRIES: Final = 20
+"""How often values are drawn again that were suggested before; of a small space all may have been."""
+
+
 class Search:
     """Suggests values for trials.
 
@@ -44,6 +48,7 @@ class Search:
         self._space = {path: distribution(parameter) for path, parameter in file.parameters.items()}
         self._study = optuna.create_study(sampler=_sampler(file), direction=file.objective.direction)
         self._asked: dict[int, Any] = {}
+        self._suggested: set[str] = set()
         self.trials = file.trials or file.grid_points
         """How many there are to be."""
 
@@ -54,10 +59,30 @@ class Search:
         for number in range(start, min(start + count, self.trials)):
             if self._file.strategy == "grid":
                 self._study.enqueue_trial(self._grid_point(number))
-            trial = self._study.ask(self._space)
+            trial = self._ask_once()
             self._asked[number] = trial
-            suggested.append(_plain(self._file.parameters, trial.params))
+            values = _plain(self._file.parameters, trial.params)
+            self._suggested.add(json.dumps(values, sort_keys=True))
+            suggested.append(values)
         return suggested
+
+    def _ask_once(self) -> Any:
+        """Return a trial of Optuna's; of TPE one whose values are new, if a few tries find any.
+
+        A trial whose values were suggested before teaches nothing: the same values give the same runs.
+        """
+        from optuna.trial import TrialState
+
+        trial = self._study.ask(self._space)
+        if self._file.strategy != "tpe" or self._file.repeats:
+            return trial
+        for _ in range(_TRIES):
+            values = _plain(self._file.parameters, trial.params)
+            if json.dumps(values, sort_keys=True) not in self._suggested:
+                break
+            self._study.tell(trial, state=TrialState.FAIL)
+            trial = self._study.ask(self._space)
+        return trial
 
     def tell(self, number: int, value: float | None, pruned: bool, curve: Mapping[int, float]) -> None:
         """Say what came of a trial: its value, that it was given up, or (None) that it failed."""

@@ -72,7 +72,8 @@ def read_sweep(name: str, recordings: Path) -> Sweep:
         raise RunnerError(f"no sweep {name!r} in {recordings}.{nearest(name, known) or listed}")
     path = folder_of(name, recordings) / FILE
     try:
-        return from_values(read_yaml(read_text(path), str(path)).value)
+        # What a sweep suggests follows from its file; one that was begun before `repeats` existed has none.
+        return from_values({"repeats": True} | read_yaml(read_text(path), str(path)).value)
     except (ConfigError, TypeError, ValueError) as error:
         raise RunnerError(f"{path}: is no sweep any more: {error}") from error
 

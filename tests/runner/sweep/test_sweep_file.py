@@ -152,3 +152,27 @@ def test_algorithms_with_sections_of_their_own_can_be_searched_over(file):
     assert searched.config({"algorithm": "q_learning"}).wolf_phc is None
     assert searched.config({"algorithm": "wolf_phc"}).wolf_phc.win == 0.01
     assert searched.config({"algorithm": "hysteretic_q_learning"}).hysteretic is not None
+
+
+def test_parameters_of_one_algorithm_count_only_in_its_trials(file):
+    searched = load_sweep(
+        file(
+            strategy="grid",
+            trials=None,
+            base=BASE | {"env": {}, "mode": "competitive"},
+            parameters={
+                "algorithm": ["q_learning", "hysteretic_q_learning"],
+                "hysteretic.decrease": [0.01, 0.1],
+            },
+        )
+    )
+    config = searched.config({"algorithm": "hysteretic_q_learning", "hysteretic.decrease": 0.1})
+    assert config.hysteretic.decrease == 0.1
+    plain = searched.config({"algorithm": "q_learning", "hysteretic.decrease": 0.1})
+    assert plain == searched.config({"algorithm": "q_learning", "hysteretic.decrease": 0.01})
+    assert plan_of(searched).excluded == 0
+
+
+def test_a_parameter_of_another_algorithm_than_the_base_names_is_refused(file):
+    told = refused(file, parameters={"hysteretic.decrease": [0.1, 0.2]})
+    assert "goes with algorithm: hysteretic_q_learning" in told

@@ -9,6 +9,8 @@ import pytest
 from sweeping import described
 
 from runner.recording.reader import Recording, open_recording
+from runner.sweep import state
+from runner.sweep.loading import from_values
 from runner.sweep.model import Objective, SweepFile
 from runner.sweep.readings import curve_of, hopeless, value_of
 from runner.sweep.search import Search, bounds
@@ -123,3 +125,28 @@ def test_exact_measures_belong_to_their_own_evaluation(done, monkeypatch):
     monkeypatch.setattr(Recording, "optimality", lambda _: iter(measures[1:]))
     with open_recording(recording_path) as recording:
         assert curve_of(recording, "exact.finish_percent") == {20: 10.0, 40: 20.0, 60: 30.0}
+
+
+def test_tpe_tries_no_values_twice_while_there_are_others():
+    def tried(**changes):
+        parameters = {"step_size": [0.1, 0.2, 0.3, 0.4], "discount": [0.5, 0.7, 0.9]}
+        search = Search(from_values(described(trials=12, batch=4, parameters=parameters, **changes)).file)
+        found = []
+        while batch := search.ask(4):
+            for values in batch:
+                search.tell(len(found), values["step_size"], False, {})
+                found.append(str(values))
+        return found
+
+    assert len(tried()) == 12
+    assert len(set(tried())) > len(set(tried(repeats=True)))
+    assert tried() == tried()
+
+
+def test_a_sweep_that_was_begun_before_goes_on_as_it_began(tmp_path):
+    sweep = from_values(described())
+    state.begin(sweep, tmp_path, resume=False, accept_changes=False)
+    stored = state.folder_of(sweep.name, tmp_path) / state.FILE
+    stored.write_text(stored.read_text().replace("repeats: false\n", ""))
+    assert not sweep.file.repeats
+    assert state.read_sweep(sweep.name, tmp_path).file.repeats
