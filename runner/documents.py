@@ -83,12 +83,13 @@ def write_whole(path: Path, value: dict[str, Any], mode: int = 0o666) -> None:
     Raises:
         OSError: it cannot be written; it is as before.
     """
+    data = (json.dumps(value, indent=1, ensure_ascii=False) + "\n").encode()
     fresh = path.with_suffix(f".{secrets.token_hex(4)}.tmp")
     try:
         fresh.touch(mode, exist_ok=False)
-        fresh.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        fresh.write_bytes(data)
         fresh.replace(path)
-    except OSError:
+    except BaseException:
         fresh.unlink(missing_ok=True)
         raise
 

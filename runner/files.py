@@ -1,4 +1,4 @@
-"""Files that others may have put there: opened only if they are regular files."""
+"""Files that others may have put there, opened only if they are regular; and texts that files can hold."""
 
 from __future__ import annotations
 
@@ -24,3 +24,20 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
         os.close(descriptor)
         raise OSError(errno.EINVAL, "it is not a regular file", os.fspath(path))
     return stream
+
+
+def is_utf8(text: str) -> bool:
+    """Return whether UTF-8 can hold a text.
+
+    It cannot if the text was made from bytes that are none, such as an argument or a file name in Latin-1.
+    """
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def as_utf8(text: str) -> str:
+    r"""Return a text such that UTF-8 can hold it: of bytes that are none, `\\xe9` is left."""
+    return text.encode(errors="surrogateescape").decode(errors="backslashreplace")

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from runner.documents import read_object, write_whole
 from runner.errors import RunnerError, StorageError
+from runner.files import is_utf8
 
 LABELS_FILE: Final = "labels.json"
 LOCK_FILE: Final = "labels.lock"
@@ -116,6 +117,8 @@ def _check(labels: Labels) -> None:
             raise RunnerError(f"tag: found {tag!r}, expected {TAG_EXPECTED}.")
     if len(labels.tags) > MAX_TAGS:
         raise RunnerError(f"tag: found {len(labels.tags)} tags, expected at most {MAX_TAGS}.")
+    if not is_utf8(labels.note):
+        raise RunnerError(f"note: found {labels.note[:100]!r}, expected text in UTF-8.")
     if len(labels.note) > MAX_NOTE:
         raise RunnerError(f"note: found {len(labels.note):,} characters, expected at most {MAX_NOTE:,}.")
 

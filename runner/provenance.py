@@ -13,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from runner import __version__
+from runner.files import as_utf8
 
 PACKAGES = ("numpy", "numba", "llvmlite", "gymnasium", "mcap", "protobuf", "zstandard", "blake3", "pydantic")
 
@@ -21,9 +22,9 @@ def provenance() -> dict[str, str]:
     """Return versions, host, processor, git state and command line, as text by key."""
     return _installed() | {
         "host": socket.gethostname(),
-        "user": _user(),
-        "command": " ".join(sys.argv),
-        "directory": _directory(),
+        "user": as_utf8(_user()),
+        "command": as_utf8(" ".join(sys.argv)),
+        "directory": as_utf8(_directory()),
     }
 
 

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runner.documents import read_object, write_whole
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
+from runner.files import as_utf8, is_utf8
 from runner.labels import Labels, change_labels, read_labels
 from runner.owner import lives, owner
 from runner.run_file import RUN_ID, ArchiveReference, RunFile, Summary, parse_run_file
@@ -224,6 +225,7 @@ def new_run(
     Raises:
         StorageError: the recordings folder cannot be written.
     """
+    check_folder_name(recordings)
     try:
         recordings.mkdir(parents=True, exist_ok=True)
         while True:
@@ -279,6 +281,20 @@ def unless_empty(run: Run) -> Iterator[None]:
 def recordings_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
     """Return the recordings folder: the chosen one, else the variable's, else ./recordings."""
     return Path(chosen or os.environ.get(RECORDINGS_VARIABLE) or "recordings")
+
+
+def check_folder_name(recordings: str | os.PathLike[str]) -> None:
+    """Refuse a recordings folder whose path is not UTF-8: neither the index nor JSON can hold it.
+
+    Raises:
+        StorageError: it is one.
+    """
+    path = os.path.abspath(recordings)  # noqa: PTH100 - links stay what they are
+    if not is_utf8(path):
+        raise StorageError(
+            f"{as_utf8(path)}: found a path that is not UTF-8; rename the folder, or choose another by "
+            f"--recordings or {RECORDINGS_VARIABLE}."
+        )
 
 
 def list_runs(recordings: Path) -> list[Run]:

@@ -27,6 +27,7 @@ from runner.catalogue.fields import FIELDS, SETTING, STATUSES, Field, Kind, fiel
 from runner.catalogue.rows import Row
 from runner.catalogue.values import Span, date_span, number_of, size_of, span_seconds, whole_of
 from runner.errors import RunnerError, nearest
+from runner.files import is_utf8
 
 if TYPE_CHECKING:
     from luqum.tree import Item
@@ -71,6 +72,8 @@ def parse(text: str, now: datetime | None = None) -> Filter:
     """
     if not text.strip():
         return Filter(None)
+    if not is_utf8(text):
+        raise RunnerError(f"filter: found {text[:100]!r}, expected text in UTF-8.")
     if len(text) > MAX_LENGTH:
         raise RunnerError(f"filter: found {len(text):,} characters, expected at most {MAX_LENGTH:,}.")
     from luqum.exceptions import ParseError

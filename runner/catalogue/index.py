@@ -20,6 +20,7 @@ from runner.catalogue.filters import Filter, matches, setting_path
 from runner.catalogue.folders import Depth, Folders
 from runner.catalogue.rows import Row, text
 from runner.errors import RunnerError, nearest
+from runner.runs import check_folder_name
 
 Found = TypeVar("Found")
 
@@ -196,6 +197,8 @@ def look(
     """
     paths = (os.path.abspath(root) for root in roots)  # noqa: PTH100 - links stay what they are
     places = list(dict.fromkeys(paths))
+    for place in places:
+        check_folder_name(place)
     for _ in range(2):
         before = version()
         try:

@@ -11,6 +11,7 @@ import click
 from runner.cli.finding import find
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import print_json
+from runner.errors import RunnerError
 
 
 @click.command("note")
@@ -37,7 +38,10 @@ def command(run_name: str, text: str | None, clear: bool, recordings: Path | Non
     run = find(run_name, recordings)
     labels = run.labels
     if clear or text is not None:
-        note = (sys.stdin.read() if text == "-" else text or "").strip()
+        try:
+            note = (sys.stdin.read() if text == "-" else text or "").strip()
+        except UnicodeDecodeError as error:
+            raise RunnerError(f"stdin: found bytes that are not UTF-8 ({error}), expected text.") from error
         labels = relabel(run, lambda was: replace(was, note=note))
     if as_json:
         print_json({"run_id": run.run_id, "note": labels.note})
