@@ -20,6 +20,7 @@ from runner.archive.manifest import Entry, Manifest
 from runner.archive.reading import Archive
 from runner.archive.rows import message_payload
 from runner.config import from_mapping
+from runner.config.loading import packing_from
 from runner.config.sections import Recording as Plan
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
@@ -266,8 +267,8 @@ def _plan_of(archive: Archive) -> Plan:
         return from_mapping(config).recording
     parts = json_object(json.dumps(config.get("recording")), f"{archive.folder}: 'recording' in its config")
     if parts.get("compression") != "zstd":
-        parts.pop("level", None)  # a loop is told it all the same
-    return from_mapping({"episodes": 1, "recording": parts}).recording
+        parts.pop("level", None)  # loops recorded before had one with any compression
+    return packing_from(parts)
 
 
 def _in_words(entry: Entry | None) -> str:

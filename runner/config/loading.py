@@ -27,6 +27,7 @@ from runner.config.model import (
 )
 from runner.config.overrides import override
 from runner.config.problems import found, problems_in, refuse
+from runner.config.sections import Recording
 from runner.config.shipped import config_path, suggestion
 from runner.errors import ConfigError
 
@@ -92,6 +93,21 @@ def from_mapping(
             "and no table is known of it."
         )
     return experiment_in(Document(values), overrides, name, named_by=repr(name))
+
+
+def packing_from(values: Mapping[str, Any]) -> Recording:
+    """Return how a recording is packed, as the `recording` section of a configuration says it.
+
+    Raises:
+        ConfigError: there is no such option, or a value is out of its bounds.
+    """
+    try:
+        return from_mapping({"episodes": 1, "recording": dict(values)}).recording
+    except ConfigError as error:
+        parts = (problem.message for problem in error.problems)
+        keys = (problem.path.removeprefix("recording.") for problem in error.problems)
+        lines = "\n".join(f"{key}: {part}" for key, part in zip(keys, parts, strict=True))
+        raise ConfigError(lines or str(error), error.problems) from None
 
 
 def read_text(file: FilePath) -> str:

@@ -10,6 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from runner.config.loading import packing_from
+from runner.config.sections import Recording
 from runner.errors import ConfigError
 from runner.scene import is_whole
 from runner.wrappers.described import Described, as_json, as_mapping
@@ -30,10 +32,7 @@ class Plan:
     info: tuple[str, ...] = ()
     frames_every: int = 0
     frame_format: str = "png"
-    compression: str = "zstd"
-    level: int = 3
-    index: str = "message"
-    chunk_steps: int = 16_384
+    packing: Recording = field(default_factory=Recording)
 
     def mapping(self, described: Described) -> dict[str, Any]:
         """Return the configuration that the recording carries.
@@ -50,13 +49,7 @@ class Plan:
             "config": self._settings(),
             "info": list(self.info),
             "frames": {"every": self.frames_every, "format": self.frame_format},
-            "recording": {
-                "compression": self.compression,
-                "level": self.level,
-                "index": self.index,
-                "chunk_steps": self.chunk_steps,
-                "steps": "all",
-            },
+            "recording": self.packing.model_dump(mode="json"),
         }
 
     def _settings(self) -> Any:
@@ -83,10 +76,6 @@ class Plan:
             ("info", "names of fields", all(isinstance(name, str) for name in self.info)),
             ("frames_every", "a whole number from 0", is_whole(self.frames_every, 0, 2**31)),
             ("frame_format", "png or jpeg", self.frame_format in ("png", "jpeg")),
-            ("compression", "zstd, lz4 or none", self.compression in ("zstd", "lz4", "none")),
-            ("level", "1 to 19", is_whole(self.level, 1, 19)),
-            ("index", "message or chunk", self.index in ("message", "chunk")),
-            ("chunk_steps", "256 to 65,536", is_whole(self.chunk_steps, 256, 65_536)),
         )
         for key, expected, holds in expectations:
             if not holds:
@@ -132,5 +121,5 @@ def plan_of(
         info=tuple(info),
         frames_every=frames_every,
         frame_format=frame_format,
-        **packing,
+        packing=packing_from(packing),
     )

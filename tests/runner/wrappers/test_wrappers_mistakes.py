@@ -13,7 +13,8 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 import runner
-from runner.errors import RunnerError, StorageError
+from runner.config import from_mapping
+from runner.errors import ConfigError, RunnerError, StorageError
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
 from runner.runs import list_runs
@@ -214,3 +215,32 @@ def test_settings_that_json_cannot_hold_are_refused_before_there_is_a_run(tmp_pa
     with pytest.raises(RunnerError, match="config: found what JSON cannot hold"):
         runner.record(pole(), tmp_path, config=settings)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "packing",
+    [
+        *({"level": level} for level in (-8, -7, 0, 1, 19, 20, None, "x")),
+        *({"compression": name, "level": 3} for name in ("lz4", "none", "zstd")),
+        *({"compression": name} for name in ("lz4", "none", "brotli")),
+        *({"chunk_steps": steps} for steps in (255, 256, 65_536, 65_537)),
+        *({"index": index} for index in ("message", "chunk", "none")),
+    ],
+    ids=str,
+)
+def test_packing_has_the_bounds_that_a_configuration_has(packing, tmp_path):
+    def outcome(work):
+        try:
+            return work()
+        except ConfigError as error:
+            return str(error).rpartition("recording.")[2].splitlines()[0]
+
+    def record():
+        with runner.record(make("CartPole-v1"), tmp_path, **packing) as env:
+            env.reset(seed=0)
+        with open_recording(env.run.recording) as recording:
+            return recording.config["recording"]
+
+    config = {"episodes": 1, "recording": packing}
+    expected = outcome(lambda: from_mapping(config).to_mapping()["recording"])
+    assert outcome(record) == expected
