@@ -46,7 +46,7 @@ def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
     if config.evaluation is not None:
         evaluations = _occasions(config.episodes, config.evaluation.every)
         trials = evaluations * config.evaluation.trials
-    snapshots = _occasions(config.episodes, config.snapshots.every or config.episodes)
+    snapshots = _occasions(config.episodes, config.snapshots.every or max(config.episodes, 1))
     learns = config.algorithm != "random"
     clumsy = min(config.episodes, CLUMSY_EPISODES) if learns else config.episodes
     typical = round(step_limit * (CLUMSY * (clumsy + trials) + SKILLED * (config.episodes - clumsy)))

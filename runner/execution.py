@@ -245,7 +245,7 @@ class Session:
         self._progress.evaluations.append(metrics)
         if plan.exact:
             self._measure_exactly(metrics)
-        self._log(f"evaluation after {episode} episodes: {metrics['finish_percent']:.1f} % finished")
+        self._log(f"evaluation after {episode} episodes: {metrics['finish_percent']:.1f} % success")
         self._tell(now=True)
         return True
 

@@ -27,7 +27,7 @@ PROGRAMS: Final = (
 )
 """What programs are told of a run, unless they ask for other columns."""
 HEADINGS: Final = {
-    "finish_percent": "finished %",
+    "finish_percent": "success %",
     "mean_return": "return",
     "bytes": "size",
     "tag": "tags",

@@ -139,10 +139,10 @@ class _Speed:
 
 
 def facts_in_words(progress: Progress, speed: float | None) -> str:
-    """Return steps a second, the latest finish percent and the size so far."""
+    """Return steps a second, the latest success percent and the size so far."""
     facts = []
     if speed is not None:
         facts.append(f"{speed / 1e6:.1f}M steps/s" if speed >= 1e6 else f"{speed / 1e3:.0f}k steps/s")
     if progress.evaluations:
-        facts.append(f"finish {number(progress.evaluations[-1]['finish_percent'], 0)} %")
+        facts.append(f"success {number(progress.evaluations[-1]['finish_percent'], 0)} %")
     return "  ".join([*facts, size(progress.bytes_written)])

@@ -93,7 +93,7 @@ def _as_json(removals: Sequence[Removal], kept: dict[str, str], dry_run: bool) -
 def _draw(removals: Sequence[Removal]) -> None:
     from runner.cli.listing import aligned, printable
 
-    headings = ("id", "name", "seed", "status", "finished %", "age", "frees")
+    headings = ("id", "name", "seed", "status", "success %", "age", "frees")
     left = ("id", "name", "status")
     if console().is_terminal and len(removals) <= _MOST_DRAWN:
         drawn = table(*headings, left=left, shrinking=("name",))

@@ -130,7 +130,7 @@ def _exactly(run: Run, measures: dict[str, Any]) -> dict[str, str]:
         for agent, own, best in zip(agents, measures["values"], measures["best_responses"], strict=True)
     )
     told = {
-        "finishes": f"{measures['finish_percent']:.1f} % of {measures['starts']:,} start states "
+        "succeeds": f"{measures['finish_percent']:.1f} % of {measures['starts']:,} start states "
         f"(the optimum {measures['optimal_finish_percent']:.1f} %)",
         "length": f"{measures['mean_length']:.2f} steps (the optimum {measures['optimal_mean_length']:.2f})",
         "value": f"{sum(measures['values']):.3f} of {measures['optimal_value']:.3f} that are possible",

@@ -107,13 +107,13 @@ def test_the_table_of_evaluations_fits(width):
 def test_successes_are_told_apart_and_other_events_summed():
     events = dict.fromkeys(NAMES, 4) | {"taxi_1.drop_off": 12, "taxi_2.drop_off": 9, "collision": 3}
     *_, line = _lines([_record(events)], ["taxi_1.drop_off", "taxi_2.drop_off"], 200)
-    assert line.split() == ["50,000", "98.5", "1500.0", "1499.9", "12/9", "3", "8", "8", "8", "78/78"]
+    assert line.split() == ["50,000", "98.5", "1,500.0", "1,499.9", "12/9", "3", "8", "8", "8", "78/78"]
 
 
 def test_an_environment_without_events():
     record = _record({}) | {"finish_percent": None, "training": {"percent_filled": {"agent": 12.34}}}
     *_, line = _lines([record], [], 80)
-    assert line.split() == ["50,000", "–", "1500.0", "1499.9", "12.3"]
+    assert line.split() == ["50,000", "–", "1,500.0", "1,499.9", "12.3"]
 
 
 def test_some_evaluations_stand_for_many():

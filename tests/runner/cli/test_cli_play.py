@@ -24,7 +24,8 @@ def test_json_is_a_line_for_each_step(recorded, recorded_run):
     assert [line["t"] for line in lines] == list(range(len(steps)))
     assert lines[0]["state_in_words"].startswith("taxi 1 (")
     assert " + " in lines[0]["action_in_words"]
-    assert lines[0]["explored"] == ["taxi_1", "taxi_2"]
+    masks = [sum(1 << ["taxi_1", "taxi_2"].index(agent) for agent in line["explored"]) for line in lines]
+    assert masks == steps["explored"].tolist()
 
 
 def test_events_are_those_that_the_episode_counts(recorded, recorded_run):

@@ -30,7 +30,7 @@ from runner.recording import schema
 from runner.recording.reader import open_recording
 
 PLOTS = {
-    "Trials finished (%)",
+    "Success (% of trials)",
     "Episode length (mean)",
     "Return of an episode (mean)",
     "Penalties an episode",
