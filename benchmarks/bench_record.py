@@ -61,6 +61,8 @@ def measure(quick: bool) -> list[Figure]:
             figures += _environment(name, Path(folder), steps, repetitions)
         for name, kind, count in (("Blackjack-v1", "short", steps // 20), ("Taxi-v4", "long", steps // 2)):
             figures += _against_minari(name, kind, Path(folder), count, repetitions)
+        figures += _short(Path(folder), 100 if quick else 1_000, repetitions)
+        figures += _logging(Path(folder), steps, repetitions)
         figures += _memory(Path(folder), 10_000_000 if not quick else 1_000_000)
     return figures
 
@@ -151,6 +153,34 @@ def _whole(make: Callable[[], Any], steps: int) -> float:
         drive(env, steps)
         stack.close()
     return time.process_time() - begin
+
+
+def _short(folder: Path, loops: int, repetitions: int) -> list[Figure]:
+    """Return what the start and the end of a recorded loop cost, of loops that log one value."""
+    spent = []
+    for _ in range(repetitions):
+        begin = time.process_time()
+        for _ in range(loops):
+            with runner.record(gymnasium.make("CartPole-v1"), folder / "recordings") as env:
+                env.log("value", 1.0)
+        whole = time.process_time() - begin
+        begin = time.process_time()
+        for _ in range(loops):
+            gymnasium.make("CartPole-v1").close()
+        spent.append((whole - (time.process_time() - begin)) / loops * 1e3)
+    return [figure("start and end of a loop", spent, "ms", (4, 2), higher_is_better=False)]
+
+
+def _logging(folder: Path, steps: int, repetitions: int) -> list[Figure]:
+    """Return what logging a number costs."""
+    spent = []
+    for _ in range(repetitions):
+        with runner.record(gymnasium.make("CartPole-v1"), folder / "recordings") as env:
+            begin = time.process_time()
+            for k in range(steps):
+                env.log("value", k + 0.5)
+            spent.append((time.process_time() - begin) / steps * 1e6)
+    return [figure("log of a number", spent, "us", (4, 2), higher_is_better=False)]
 
 
 def _memory(folder: Path, steps: int) -> list[Figure]:

@@ -11,6 +11,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 from runner.recording.schema import LOG_LEVELS, MessageType
 
 
+@cache
 def file_descriptor_set(message: MessageType) -> bytes:
     """Return the schema of a message as MCAP wants it: a serialized FileDescriptorSet with its imports."""
     return descriptor_pb2.FileDescriptorSet(file=_files(message)).SerializeToString(deterministic=True)

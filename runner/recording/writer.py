@@ -10,6 +10,7 @@ import os
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Self
@@ -298,10 +299,15 @@ def storage_error(file: RecordingFile, error: OSError) -> StorageError:
     )
 
 
-def schema_and_channel_bytes(topics: Sequence[Topic]) -> bytes:
-    """Return the records that stand behind the header of a recording with these topics."""
+@cache
+def _schema_and_channel_bytes(topics: tuple[Topic, ...]) -> bytes:
     schemas, channels = schemas_and_channels(topics)
     return _bytes_of(*schemas, *channels)
+
+
+def schema_and_channel_bytes(topics: Sequence[Topic]) -> bytes:
+    """Return the records that stand behind the header of a recording with these topics."""
+    return _schema_and_channel_bytes(tuple(topics))
 
 
 def _bytes_of(*records: McapRecord) -> bytes:
