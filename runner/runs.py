@@ -64,7 +64,7 @@ class Run:
         if not self.file.problems:
             return ""
         return (
-            f"run {self.run_id} is damaged, as says {self.folder / RUN_FILE}: "
+            f"run {self.run_id} is damaged: {self.folder / RUN_FILE}: "
             f"{'; '.join(self.file.problems)}. Correct that file, or remove the run by "
             f"`dualtaxi rm {self.run_id}`."
         )
