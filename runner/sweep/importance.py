@@ -13,7 +13,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -24,6 +24,7 @@ from runner.sweep.model import Range
 
 FORESTS: Final = 30
 TREES: Final = 32
+RESAMPLES: Final = 200
 MAX_POINTS: Final = 20_000
 """Points of the grid that forests predict; it is coarser where there are many parameters."""
 MAX_LEVELS: Final = 12
@@ -36,10 +37,12 @@ class Effect:
 
     parameters: tuple[str, ...]
     share: float
-    """Of the variance: the median over forests."""
+    """Of the variance; from forests, the median over them."""
     low: float
     high: float
-    """The interval in which 95 % of the forests have it; each forest is of other resampled trials."""
+    """The interval in which 95 % of the forests have it, each of resampled trials; of a whole grid, 95 % of
+    the resamples of its seeds.
+    """
 
 
 def effects_of(
@@ -79,6 +82,30 @@ def effects_of(
         if shares:
             found.append(shares)
     return _summed_up(names, found)
+
+
+def effects_of_grid(
+    parameters: Mapping[str, Range | list[Any]], seed_values: Sequence[Sequence[float]]
+) -> list[Effect]:
+    """Return main effects and interactions of a grid whose points were all completed: no forest is needed.
+
+    Args:
+        parameters: by path.
+        seed_values: of each point, the last parameter changing fastest: the objective at each seed, finite.
+            The interval is over resampled seeds.
+    """
+    shape = tuple(each.steps + 1 if isinstance(each, Range) else len(each) for each in parameters.values())
+    exact = shares_of_variance(np.array([np.median(own) for own in seed_values]).reshape(shape))
+    rng = np.random.default_rng(0)
+    resampled = []
+    for _ in range(RESAMPLES):
+        medians = [np.median(rng.choice(own, len(own))) for own in map(np.asarray, seed_values)]
+        resampled.append(shares_of_variance(np.array(medians).reshape(shape)))
+    effects = _summed_up(list(parameters), [shares for shares in resampled if shares]) if exact else []
+    names = list(parameters)
+    shares = {tuple(names[axis] for axis in axes): share for axes, share in exact.items()}
+    effects = [replace(effect, share=shares[effect.parameters]) for effect in effects]
+    return sorted(effects, key=lambda effect: -effect.share)
 
 
 def shares_of_variance(values: NDArray[np.float64]) -> dict[tuple[int, ...], float]:

@@ -15,7 +15,7 @@ import numpy as np
 from runner.analysis.compare import statistics
 from runner.analysis.compare.statistics import Estimate
 from runner.analysis.sections import Grid, Section
-from runner.sweep.importance import Effect, effects_of
+from runner.sweep.importance import Effect, effects_of, effects_of_grid
 from runner.sweep.model import Sweep
 from runner.sweep.trials import State, Trial, Trials, best_of, recorded
 
@@ -81,10 +81,24 @@ def results_of(sweep: Sweep, recordings: Path) -> Results:
         for trial in found
         if trial.state == "finished" and trial.value is not None and abs(trial.value) < statistics.NEVER
     ]
-    effects = effects_of(
-        sweep.file.parameters, [values for values, _ in completed], [value for _, value in completed]
-    )
+    if _is_whole_grid(sweep, found):
+        seed_values = [list(trial.seed_values.values()) for trial in found]
+        effects = effects_of_grid(sweep.file.parameters, seed_values)
+    else:
+        effects = effects_of(
+            sweep.file.parameters, [values for values, _ in completed], [value for _, value in completed]
+        )
     return Results(sweep, trials.search.trials, ranking(sweep, found), effects, best_of(found, sweep))
+
+
+def _is_whole_grid(sweep: Sweep, trials: Sequence[Trial]) -> bool:
+    """Return whether every point of a grid was completed, each seed with a finite value."""
+    return (
+        sweep.file.strategy == "grid"
+        and len(trials) == sweep.file.grid_points
+        and all(trial.state == "finished" for trial in trials)
+        and all(abs(value) < statistics.NEVER for trial in trials for value in trial.seed_values.values())
+    )
 
 
 def ranking(sweep: Sweep, trials: Sequence[Trial]) -> list[Ranked]:
@@ -165,17 +179,27 @@ def _effects(results: Results) -> Section:
         )
         for effect in shown
     ]
-    rest = 1.0 - sum(effect.share for effect in results.effects)
+    rest = max(0.0, 1.0 - sum(effect.share for effect in results.effects))
     completed = sum(1 + len(entry.again) for entry in results.ranking if entry.state == "finished")
+    whole = results.sweep.file.strategy == "grid" and completed == results.sweep.file.grid_points
+    source = (
+        "over the grid, all of whose points were completed; the interval is over resampled seeds"
+        if whole
+        else f"over the whole search space, as random forests predict it from the {completed} completed "
+        "trials; trials that were given up or failed do not count, and the interval is over forests of "
+        "resampled trials"
+    )
     said = [
-        "Shares of the objective's variance over the whole search space, as random forests predict it from "
-        f"the {completed} completed trials (functional ANOVA). Trials that were given up or failed do not "
-        f"count. Shares are not normalised: about {100 * max(0.0, rest):.0f} % are left to three and more "
-        "parameters. The interval is over forests of resampled trials."
+        f"Shares of the objective's variance (functional ANOVA) {source}. Shares are not normalised"
+        + (
+            f": about {100 * rest:.0f} % are left to three and more parameters."
+            if len(results.sweep.file.parameters) > 2
+            else "."
+        )
     ]
     left_out = len(results.effects) - len(shown)
     said += [f"{left_out} pairs of less than {100 * SMALLEST_SHOWN:.0f} % are left out."] if left_out else []
-    return Section("What mattered", said, [Grid(("parameter", "", "share", "95 % of forests"), rows)])
+    return Section("What mattered", said, [Grid(("parameter", "", "share", "95 %"), rows)])
 
 
 def _errors(entries: Sequence[Ranked]) -> list[str]:

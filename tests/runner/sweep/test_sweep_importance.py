@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from runner.sweep.importance import effects_of, shares_of_variance
+from runner.sweep.importance import effects_of, effects_of_grid, shares_of_variance
 from runner.sweep.model import Range
 
 
@@ -53,3 +53,13 @@ def test_of_too_few_trials_or_equal_ones_nothing_is_said():
     parameters = {"x": [0, 1], "y": [0, 1]}
     assert effects_of(parameters, grid[:3], [1.0, 2.0, 3.0]) == []
     assert effects_of(parameters, grid, [1.0] * 4) == []
+
+
+def test_a_whole_grid_is_taken_apart_exactly():
+    seed_values = [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, 0.9, 1.0], [0.0, 0.1, 0.0]]
+    effects = {
+        effect.parameters: effect for effect in effects_of_grid({"x": [0, 1], "y": [0, 1]}, seed_values)
+    }
+    assert effects["x", "y"].share == pytest.approx(1.0)
+    assert effects["x",].share == effects["y",].share == 0.0
+    assert effects["x", "y"].low <= 1.0
