@@ -34,6 +34,12 @@ SUFFIXES: Final = (".png", ".svg", ".pdf")
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
 DASHES: Final = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
+_PANEL: Final = 2.3
+_LEFT: Final = 0.68
+_RIGHT: Final = 0.14
+_ABOVE: Final = 0.44
+_BELOW: Final = 0.48
+"""Height of a panel with its texts, and the room for them around its axes, in inches."""
 _LETTERS_AN_INCH: Final = 17
 """Letters of a footnote that fit on an inch."""
 _BAND_OPACITY: Final = 0.2
@@ -111,14 +117,20 @@ def draw_figure(groups: Sequence[Group], panels: Sequence[Panel]) -> Figure:
     width = max(3.4 * columns, 6.8)
     notes = textwrap.wrap(footnote(groups), round(width * _LETTERS_AN_INCH))
     head, foot = 0.55 + 0.19 * len(groups), 0.08 + 0.14 * len(notes)
-    height = head + 2.2 * rows + foot
+    height = head + _PANEL * rows + foot
     with mpl.rc_context(STYLE):
-        room = (0, foot / height, 1, 1 - (head + foot) / height)
-        figure: Figure = mpl.figure.Figure(
-            figsize=(width, height),
-            layout=mpl.layout_engine.ConstrainedLayoutEngine(rect=room, h_pad=0.08, w_pad=0.08),
+        figure: Figure = mpl.figure.Figure(figsize=(width, height))
+        # The places are computed here: a layout engine would draw everything once more to find them.
+        grid = figure.add_gridspec(
+            rows,
+            columns,
+            left=_LEFT / width,
+            right=1 - _RIGHT / width,
+            bottom=(foot + _BELOW) / height,
+            top=1 - (head + _ABOVE) / height,
+            wspace=(_LEFT + _RIGHT) / (width / columns - _LEFT - _RIGHT),
+            hspace=(_ABOVE + _BELOW) / (_PANEL - _ABOVE - _BELOW),
         )
-        grid = figure.add_gridspec(rows, columns)
         for number, panel in enumerate(narrow):
             draw_panel(figure.add_subplot(grid[divmod(number, columns)]), panel, len(groups))
         for number, panel in enumerate(wide):  # the last column is for its legend
@@ -188,7 +200,7 @@ def _draw_curve(axes: Axes, panel: Panel, curve: Curve, groups: int) -> None:
     line = panel.lines.index(curve.line)
     by_line = groups == 1 and len(panel.lines) > 1
     colour = COLOURS[(line if by_line else curve.group) % len(COLOURS)]
-    marker = MARKERS[(line if by_line else curve.group) % len(MARKERS)]
+    marker = _marker(line if by_line else curve.group)
     axes.plot(
         curve.episodes,
         curve.median,
@@ -203,6 +215,11 @@ def _draw_curve(axes: Axes, panel: Panel, curve: Curve, groups: int) -> None:
         axes.fill_between(
             curve.episodes, curve.low, curve.high, color=colour, alpha=_BAND_OPACITY, linewidth=0
         )
+
+
+def _marker(number: int) -> str:
+    """Return the marker of a line; one that has the colour of an earlier line has another marker."""
+    return MARKERS[(number + number // len(COLOURS)) % len(MARKERS)]
 
 
 def _draw_shares(axes: Axes, panel: Panel) -> None:
@@ -283,7 +300,7 @@ def _legend(axes: Axes, panel: Panel, groups: int) -> None:
             [],
             color=COLOURS[number % len(COLOURS)] if groups == 1 else INK,
             linestyle=DASHES[number % len(DASHES)],
-            marker=MARKERS[number % len(MARKERS)] if groups == 1 else "",
+            marker=_marker(number) if groups == 1 else "",
             markersize=3.2,
             label=spoken(line) or "all",
         )
@@ -305,7 +322,7 @@ def _heading(figure: Figure, groups: Sequence[Group], height: float) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], color=COLOURS[i % len(COLOURS)], marker=MARKERS[i % len(MARKERS)], markersize=4)
+        Line2D([], [], color=COLOURS[i % len(COLOURS)], marker=_marker(i), markersize=4)
         for i in range(len(groups))
     ]
     figure.text(

@@ -9,7 +9,7 @@ import contextlib
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -49,20 +49,26 @@ BROAD: Final = 8.5 * svg.CELL
 TEMPLATES: Final = files("runner.export") / "templates"
 
 
-def write_report(path: Path, recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> list[str]:
+def write_report(
+    path: Path,
+    recordings: Sequence[Path],
+    chosen: Sequence[Choice] = (),
+    progress: Callable[[str], None] = lambda _: None,
+) -> list[str]:
     """Write the page about these recordings, and return what is missing from it, a sentence each.
 
     Args:
         path: where to.
         recordings: the MCAP files.
         chosen: episodes to show beside those that are always there.
+        progress: called with what is done next.
 
     Raises:
         MissingExtra: Jinja2 or Matplotlib is not installed.
         RecordingError: a recording cannot be read, or has no such episode.
         OSError: the page cannot be written.
     """
-    page, said = render_report(recordings, chosen)
+    page, said = render_report(recordings, chosen, progress)
     path.write_text(page, encoding="utf-8")
     return said
 
@@ -77,15 +83,21 @@ def require_packages() -> None:
     templates()
 
 
-def render_report(recordings: Sequence[Path], chosen: Sequence[Choice] = ()) -> tuple[str, list[str]]:
+def render_report(
+    recordings: Sequence[Path],
+    chosen: Sequence[Choice] = (),
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[str, list[str]]:
     """Return the page about these recordings, and what is missing from it; see `write_report`."""
     require_packages()
     series: list[RunSeries] = []
     runs: list[dict[str, Any]] = []
-    for path in recordings:
+    for number, path in enumerate(recordings):
+        progress(f"reading run {number + 1} of {len(recordings)}")
         with open_recording(path) as recording:
             series.append(read_series(recording))
             runs.append(_run(recording, len(runs), chosen))
+    progress("drawing")
     page = (
         templates()
         .get_template("report.html")

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Final
 
 from blake3 import blake3
 
+from runner.cache import cache_folder
+from runner.documents import finite, read_object, write_whole
 from runner.mdp import Mdp
 from runner.planning.evaluation import evaluate_stochastic_policy, random_policy
 
 MAX_WORK: Final = 1_000_000_000
 """Outcomes of joint actions times the step limit; DualTaxi has a third of it, and takes about a second."""
 _MAX_REMEMBERED: Final = 32
+_MAX_BYTES: Final = 4096
+_VERSION: Final = 1
+"""Of the computation; results of another version are not read from the cache."""
 _remembered: OrderedDict[bytes, RandomBaseline] = OrderedDict()
 
 
@@ -57,10 +64,29 @@ def random_baseline(mdp: Mdp) -> RandomBaseline | None:
         digest.update(getattr(mdp, name).tobytes())
     key = digest.digest()
     if key not in _remembered:
-        outcome = evaluate_stochastic_policy(mdp, random_policy(mdp), mdp.rewards.shape[-1], discount=1.0)
-        _remembered[key] = RandomBaseline(
-            outcome.finish_percent, outcome.mean_length, sum(outcome.mean_returns), mdp.step_limit
-        )
+        _remembered[key] = _cached(cache_folder() / "baselines" / f"{_VERSION}-{key.hex()}.json", mdp)
         if len(_remembered) > _MAX_REMEMBERED:
             _remembered.popitem(last=False)
     return _remembered[key]
+
+
+def _cached(path: Path, mdp: Mdp) -> RandomBaseline:
+    """Return the baseline from a file of the user's cache; computed, and written there, if it is missing."""
+    with contextlib.suppress(OSError, ValueError):
+        stored = read_object(path, _MAX_BYTES)
+        length, returned, finish = (
+            stored.get(name) for name in ("mean_length", "mean_return", "finish_percent")
+        )
+        if isinstance(length, float) and isinstance(returned, float) and isinstance(finish, float | None):
+            return RandomBaseline(math.nan if finish is None else finish, length, returned, mdp.step_limit)
+    outcome = evaluate_stochastic_policy(mdp, random_policy(mdp), mdp.rewards.shape[-1], discount=1.0)
+    baseline = RandomBaseline(
+        float(outcome.finish_percent),
+        float(outcome.mean_length),
+        float(sum(outcome.mean_returns)),
+        mdp.step_limit,
+    )
+    with contextlib.suppress(OSError):  # a cache that cannot be written costs time only
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, finite(asdict(baseline)))
+    return baseline

@@ -9,6 +9,7 @@ import click
 from runner.cli.finding import find_all_recorded
 from runner.cli.options import EXPORTS, recordings_option, runs_argument
 from runner.cli.output import say
+from runner.cli.progress import counting, stage_line
 
 
 @click.command("plot")
@@ -58,18 +59,22 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
         _draw_sweep(run_names[0], folder, output, force)
         return
     series = []
-    for run in find_all_recorded(run_names, folder):
-        with open_recording(run.recording) as recording:
-            series.append(read_series(recording))
-            for shortcoming in shortcomings(recording):
-                say(shortcoming)
+    runs = find_all_recorded(run_names, folder)
+    with counting("runs read", len(runs)) as progress:
+        for run in runs:
+            with open_recording(run.recording) as recording:
+                series.append(read_series(recording))
+                for shortcoming in shortcomings(recording):
+                    say(shortcoming)
+            progress(len(series))
     groups = groups_of(series)
     for note in left_out(groups):
         say(f"{note[0].upper()}{note[1:]}.")
     for sentence in values_left_out(series):
         say(sentence)
     panels = panels_of(groups)
-    write_new(output, force, lambda path: save_figure(path, groups, panels))
+    with stage_line("drawing"):
+        write_new(output, force, lambda path: save_figure(path, groups, panels))
     drawn = sum(len(group.runs) for group in groups)
     click.echo(f"{output}: {len(panels)} metrics of {drawn} run{'s' if drawn > 1 else ''}")
 
@@ -85,5 +90,6 @@ def _draw_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
     picture = picture_of(results)
     groups, panels = learning(results, recordings)
     panel = panel_of(results.sweep.objective.metric, panels)
-    write_new(output, force, lambda path: save_figure(path, f"Sweep {name}", picture, groups, panel))
+    with stage_line("drawing"):
+        write_new(output, force, lambda path: save_figure(path, f"Sweep {name}", picture, groups, panel))
     click.echo(f"{output}: the sweep {name}, {len(picture.trials)} trials")

@@ -10,6 +10,7 @@ from runner.cli.finding import find_all_recorded
 from runner.cli.options import EXPORTS, recordings_option, runs_argument
 from runner.cli.output import say, size
 from runner.cli.parameters import TrialName
+from runner.cli.progress import stage_line
 
 
 @click.command("report")
@@ -81,7 +82,8 @@ def command(
     chosen += [("eval", *trial) for trial in trials]
     paths = [run.recording for run in find_all_recorded(run_names, folder)]
     said: list[str] = []
-    write_new(output, force, lambda path: said.extend(write_report(path, paths, chosen)))
+    with stage_line("reading") as progress:
+        write_new(output, force, lambda path: said.extend(write_report(path, paths, chosen, progress)))
     for sentence in said:
         say(sentence)
     click.echo(f"{output}: {size(output.stat().st_size)}, {len(paths)} run{'s' if len(paths) > 1 else ''}")
@@ -94,5 +96,6 @@ def _report_sweep(name: str, recordings: Path, output: Path, force: bool) -> Non
     from runner.sweep.state import read_sweep
 
     results = results_of(read_sweep(name, recordings), recordings)
-    write_text_new(output, force, render_sweep(results, recordings))
+    with stage_line("drawing"):
+        write_text_new(output, force, render_sweep(results, recordings))
     click.echo(f"{output}: {size(output.stat().st_size)}, the sweep {name}")

@@ -99,10 +99,22 @@ def link(path: str, values: Mapping[str, Any]) -> str:
 
 
 def picture_address(picture: str) -> str:
-    """Return an SVG of a page as the address of a picture, in which styles are its own."""
+    """Return an SVG of a page as the address of a picture.
+
+    A picture knows nothing of the page's styles, so it gets the colours for light and dark of its own.
+    """
     space = "" if "xmlns=" in picture[:300] else ' xmlns="http://www.w3.org/2000/svg"'
-    body = picture.replace("<svg", f"<svg{space}", 1).encode()
+    start, tag, rest = picture.partition(">")
+    start = start.replace("<svg", f"<svg{space}", 1)
+    body = f"{start}{tag}<style>{_picture_style()}</style>{rest}".encode()
     return f"data:image/svg+xml;base64,{base64.b64encode(body).decode()}"
+
+
+@functools.cache
+def _picture_style() -> str:
+    dark = (static.REPORT / "report_dark.css").read_text("utf-8")
+    light = (static.REPORT / "report.css").read_text("utf-8").partition("\n")[0]
+    return f"{light} :root {{ color: var(--ink); }} @media (prefers-color-scheme: dark) {{ {dark} }}"
 
 
 def _source(name: str) -> str | None:

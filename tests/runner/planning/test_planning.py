@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import OrderedDict
 from fractions import Fraction
 
 import numpy as np
@@ -14,6 +15,7 @@ from runner.environments import load_mdp
 from runner.errors import EnvironmentNotUsable
 from runner.mdp import Mdp
 from runner.planning import (
+    baseline,
     best_response,
     best_response_to_stochastic,
     evaluate_policy,
@@ -309,3 +311,18 @@ def test_values_need_a_discount_below_one(discount):
     mdp = load_mdp("CliffWalking-v1", {}, None)
     with pytest.raises(EnvironmentNotUsable, match="expected one from 0 up to below 1"):
         optimal_values(mdp, discount)
+
+
+def test_the_random_baseline_is_computed_once_and_a_damaged_cache_is_not_believed(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    mdp = load_mdp("FrozenLake-v1", {}, "team")
+    monkeypatch.setattr(baseline, "_remembered", OrderedDict())
+    computed = baseline.random_baseline(mdp)
+    (file,) = tmp_path.rglob("*.json")
+    for damage in ("", "{}", '{"mean_length": "1", "mean_return": 1.0, "finish_percent": 1.0}'):
+        file.write_text(damage)
+        baseline._remembered.clear()
+        assert baseline.random_baseline(mdp) == computed
+    baseline._remembered.clear()
+    monkeypatch.setattr(baseline, "evaluate_stochastic_policy", None)
+    assert baseline.random_baseline(mdp) == computed
