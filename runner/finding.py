@@ -11,7 +11,7 @@ from typing import Final, Protocol, TypeVar
 
 from runner.errors import RunNotFound, nearest
 from runner.labels import RUN_NAME_PATTERN
-from runner.runs import Run, list_runs, run_at, run_of_id
+from runner.runs import Run, list_runs, recordings_folder, run_at, run_of_id
 
 LATEST: Final = "@latest"
 """What stands for the newest run, after a name for the newest of that name."""
@@ -44,23 +44,24 @@ class Named(Protocol):
 AnyNamed = TypeVar("AnyNamed", bound=Named)
 
 
-def find_run(name: str, recordings: Path, but: str = "") -> Run:
+def find_run(name: str, recordings: str | os.PathLike[str] | None = None, but: str = "") -> Run:
     """Return the one run that answers to an id, a unique prefix of it, a name, a path or `@latest`.
 
     `NAME@latest` is the newest run of that name.
 
     Args:
         name: what it must answer to.
-        recordings: the folder to look in.
+        recordings: the folder to look in: $DUALTAXI_RECORDINGS, or ./recordings, unless given.
         but: the id of a run that does not answer: the one that is asking.
 
     Raises:
         RunNotFound: none does, or several do.
     """
-    known = run_at_once(name, recordings)
+    folder = recordings_folder(recordings)
+    known = run_at_once(name, folder)
     if known is not None and known.run_id != but:
         return known
-    return the_one(name, [run for run in list_runs(recordings) if run.run_id != but], recordings)
+    return the_one(name, [run for run in list_runs(folder) if run.run_id != but], folder)
 
 
 def run_at_once(name: str, recordings: Path) -> Run | None:

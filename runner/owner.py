@@ -10,6 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from runner.documents import read_object
+
+_MAX_BYTES: Final = 8 << 20
 HEARTBEAT_SECONDS: Final = 15.0
 """On another host, a run without a heartbeat for this long counts as interrupted."""
 
@@ -38,6 +41,18 @@ def lives(owner: Mapping[str, Any], heart: Path) -> bool:
     with contextlib.suppress(OSError):
         return time.time() - heart.stat().st_mtime < HEARTBEAT_SECONDS
     return False
+
+
+def is_owned(folder: Path) -> bool:
+    """Return whether a living process is at the run in a folder, as its `run.json` says."""
+    try:
+        facts = read_object(folder / "run.json", _MAX_BYTES)
+    except (OSError, ValueError):
+        return False
+    process = facts.get("owner")
+    if facts.get("status") != "running" or not isinstance(process, dict):
+        return False
+    return lives(process, folder / "run.json")
 
 
 def boot_id() -> str:

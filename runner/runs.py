@@ -43,7 +43,7 @@ _ALPHABET: Final = "abcdefghjkmnpqrstvwxyz23456789"
 _ID_LENGTH: Final = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Run:
     """A run in a recordings folder."""
 
@@ -52,6 +52,12 @@ class Run:
     """The contents of `run.json`."""
     restored: Path | None = None
     """Where its recording was restored to, if it is in an archive alone."""
+
+    def __repr__(self) -> str:
+        """Return id, first name and folder; `facts` has the rest."""
+        return (
+            f"Run({str(self.facts.get('run_id'))!r}, {str(self.facts.get('name'))!r}, {str(self.folder)!r})"
+        )
 
     @cached_property
     def file(self) -> RunFile:
@@ -81,8 +87,8 @@ class Run:
 
     @property
     def file_stem(self) -> str:
-        """What files made from it are called by default: its first name and its id."""
-        name = re.sub(r"[^\w.+=@ -]", "_", self.file.name)
+        """What files made from it are called by default: its name and its id."""
+        name = re.sub(r"[^\w.+=@ -]", "_", self.name)
         return f"{name}-{self.run_id}"
 
     @property
@@ -297,13 +303,17 @@ def check_folder_name(recordings: str | os.PathLike[str]) -> None:
         )
 
 
-def list_runs(recordings: Path) -> list[Run]:
+def list_runs(recordings: str | os.PathLike[str] | None = None) -> list[Run]:
     """Return the runs of a folder, the newest first; what is no run is left alone.
+
+    Args:
+        recordings: the folder: $DUALTAXI_RECORDINGS, or ./recordings, unless given.
 
     Raises:
         StorageError: the folder is there and cannot be read.
     """
-    runs = [run for entry in run_entries(recordings) for run in runs_in(recordings / entry)]
+    folder = recordings_folder(recordings)
+    runs = [run for entry in run_entries(folder) for run in runs_in(folder / entry)]
     return sorted(runs, key=lambda run: (run.created, run.run_id), reverse=True)
 
 

@@ -31,7 +31,7 @@ def read_series(recording: Recording) -> RunSeries:
     exact = {measures["evaluation"]: exact_readings(measures, agents) for measures in recording.optimality()}
     return RunSeries(
         run_id=recording.run["run_id"],
-        name=recording.run["name"],
+        name=recording.name,
         seed=int(recording.run["seed"]),
         status=recording.status,
         config=recording.config,
@@ -63,7 +63,7 @@ def loop_series(recording: Recording) -> RunSeries:
         not_finite["mean_return"] = left_out
     return RunSeries(
         run_id=recording.run["run_id"],
-        name=recording.run["name"],
+        name=recording.name,
         seed=int(recording.run["seed"]),
         status=recording.status,
         config=_without_seed(recording.config, int(recording.run["seed"])),

@@ -21,7 +21,8 @@ def shortcomings(recording: Recording) -> list[str]:
             planned = recording.config.get("episodes")
             of = f" of {planned:,}" if is_whole(planned, 0, 2**63) else ""
             done = f"there are {recording.count(schema.TRAIN_EPISODE):,}{of} training episodes"
-        said.append(f"Run {recording.run['run_id']} did not finish ({status}): {done}.")
+        how = "is still running" if status == "running" else f"did not finish ({status})"
+        said.append(f"Run {recording.run['run_id']} {how}: {done}.")
     said += [f"Of {topic} some messages were lost in a repair; they are missing." for topic in recording.lost]
     return said
 

@@ -17,14 +17,14 @@ from typing import Any, Final
 
 from runner.errors import RunnerError
 from runner.export.contents import flat_text
-from runner.export.scalars import created, measures, seconds_of
+from runner.export.scalars import Measures, created, episodes, measures, seconds_of
 from runner.extras import require
 from runner.recording.reader import Recording
 
 RUN_TAG: Final = "dualtaxi.run_id"
 DIGEST_TAG: Final = "dualtaxi.content_digest"
 _SQLITE: Final = "sqlite:///"
-_STATUS: Final = {"finished": "FINISHED", "interrupted": "KILLED", "failed": "FAILED"}
+_STATUS: Final = {"finished": "FINISHED", "interrupted": "KILLED", "failed": "FAILED", "running": "RUNNING"}
 _AT_ONCE: Final = 1000
 _PARAMS_AT_ONCE: Final = 100
 _LONGEST: Final = 6000
@@ -130,7 +130,7 @@ def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) 
     began, written, last = created(recording), 0, 0.0
     rows = (
         (f"{found.phase}/{name}", value, began + seconds_of(found.position), found.step)
-        for found in measures(recording)
+        for found in _measured(recording)
         for name, value in found.values.items()
     )
     while some := list(islice(rows, _AT_ONCE)):
@@ -155,6 +155,14 @@ def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) 
     return Exported(run_id, written, False, tuple(notes))
 
 
+def _measured(recording: Recording) -> Iterator[Measures]:
+    """Yield the measures of a run; of a loop, which has few, also length and return of its episodes."""
+    yield from measures(recording)
+    if recording.kind != "job":
+        for phase in ("train", "eval"):
+            yield from episodes(recording, phase)
+
+
 def _name(name: str, known: dict[str, str]) -> str:
     """Return what MLflow takes for a name, another one for each; `known` is what was taken so far."""
     if name not in known:
@@ -176,7 +184,7 @@ def _digest(recording: Recording) -> str:
 def _tags(recording: Recording) -> dict[str, str]:
     run = recording.run
     return {
-        "mlflow.runName": f"{run['name']}, seed {run['seed']}",
+        "mlflow.runName": f"{recording.name}, seed {run['seed']}",
         "mlflow.source.name": "dualtaxi",
         "mlflow.user": "",
         RUN_TAG: run["run_id"],

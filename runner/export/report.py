@@ -126,7 +126,7 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
     return {
         "number": number,
         "id": recording.run["run_id"],
-        "name": recording.run["name"],
+        "name": recording.name,
         "seed": recording.run["seed"],
         "state": recording.status,
         "agents": [spoken(agent) for agent in environment["agents"]],

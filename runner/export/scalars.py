@@ -4,6 +4,7 @@
     eval/finish_percent, eval/mean_return/taxi_1, eval/events/taxi_1.drop_off, eval/training/epsilon, ...
     eval/exact/value/taxi_1, eval/exact/optimal_value, ... with `evaluation: {exact: true}`
     train/logged/loss, ... what somebody's own loop logged
+    train/episode/length, train/episode/return/taxi_1, ... of each episode: in TensorBoard; of loops in MLflow
 
 What is unknown (a mean over no episode, success where the environment does not say what it is) is left
 out, so every number is one that was recorded, unchanged.
@@ -20,7 +21,7 @@ from typing import Any
 from runner.errors import RecordingError
 from runner.frames import agents_of, event_names_of
 from runner.recording.reader import Recording
-from runner.recording.schema import SCALAR_TOPIC, STEP_NANOSECONDS
+from runner.recording.schema import EVAL_EPISODE, SCALAR_TOPIC, STEP_NANOSECONDS, TRAIN_EPISODE
 
 _OF_TRAINING = ("mean_length", "zero_cells", "percent_filled", "epsilon", "step_size", "discount")
 _EXACT = {
@@ -78,6 +79,26 @@ def _logged(recording: Recording) -> Iterator[Measures]:
             step = scalar["step"] if scalar["phase"] == "train" else position - scalar["step"]
             values = {f"logged/{scalar['name']}": scalar["value"]}
             yield Measures(scalar["phase"], position, step, scalar["episode"], values)
+
+
+def episodes(recording: Recording, phase: str) -> Iterator[Measures]:
+    """Yield length and return of each episode of a phase, at its last step: `episode/return/AGENT`.
+
+    Raises:
+        RecordingError: the recording is damaged.
+    """
+    names = [f"episode/return/{agent}" for agent in agents_of(recording)]
+    topic = TRAIN_EPISODE if phase == "train" else EVAL_EPISODE
+    for block in recording.blocks(topic):
+        columns = (
+            block[field].tolist() for field in ("log_time", "episode", "last_step", "length", "returns")
+        )
+        for time, episode, last_step, length, returns in zip(*columns, strict=True):
+            position = time // STEP_NANOSECONDS
+            step = last_step + 1 if phase == "train" else position - last_step - 1
+            found = {"episode/length": float(length), **dict(zip(names, returns, strict=True))}
+            finite = {name: value for name, value in found.items() if math.isfinite(value)}
+            yield Measures(phase, position, step, episode, finite)
 
 
 def training_values(metrics: Mapping[str, Any], agents: Sequence[str]) -> dict[str, float]:

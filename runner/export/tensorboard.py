@@ -9,11 +9,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from runner.export.scalars import created, measures, seconds_of
+from runner.export.scalars import created, episodes, measures, seconds_of
 from runner.extras import require
-from runner.frames import agents_of
 from runner.recording.reader import Recording
-from runner.recording.schema import STEP_NANOSECONDS, TRAIN_EPISODE
 
 OURS: Final = ("events.out.tfevents.*",)
 
@@ -59,9 +57,5 @@ def _moments(recording: Recording) -> Iterator[tuple[int, int, Mapping[str, floa
     """Yield position, training step and named numbers of each moment."""
     for found in measures(recording):
         yield found.position, found.step, {f"{found.phase}/{k}": v for k, v in found.values.items()}
-    names = [f"train/episode/return/{agent}" for agent in agents_of(recording)]
-    for block in recording.blocks(TRAIN_EPISODE):
-        for record in block:
-            values = {"train/episode/length": float(record["length"])}
-            values |= dict(zip(names, record["returns"].tolist(), strict=True))
-            yield int(record["log_time"]) // STEP_NANOSECONDS, int(record["last_step"]) + 1, values
+    for found in episodes(recording, "train"):
+        yield found.position, found.step, {f"{found.phase}/{k}": v for k, v in found.values.items()}

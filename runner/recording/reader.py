@@ -24,7 +24,9 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError, RunnerError
+from runner.labels import read_labels
 from runner.mdp import Mdp
+from runner.owner import is_owned
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
 from runner.recording.chunks import MAX_CHUNK_BYTES
@@ -161,8 +163,20 @@ class Recording:
 
     @property
     def status(self) -> str:
-        """How the run ended: `finished`, `failed`, or `interrupted`, also if it could not say so."""
+        """How the run stands: `finished`, `failed`, `running`, or else `interrupted`."""
+        if self.result.status is None and self._is_in_run_folder and is_owned(self.path.parent):
+            return "running"
         return self.result.status or "interrupted"
+
+    @property
+    def name(self) -> str:
+        """What the run is called now: the name in its labels if it was renamed, else the first one."""
+        renamed = read_labels(self.path.parent).name if self._is_in_run_folder else ""
+        return renamed or self.run["name"]
+
+    @property
+    def _is_in_run_folder(self) -> bool:
+        return self.path.name == "recording.mcap"
 
     def run_facts(self) -> dict[str, Any]:
         """Return what `run.json` says, from the recording alone; the result in it is unchecked."""

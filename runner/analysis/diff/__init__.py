@@ -192,7 +192,7 @@ def can_compare_steps(a: Recording, b: Recording) -> bool:
 
 def _who(recording: Recording) -> dict[str, Any]:
     run = recording.run
-    named = {"run_id": run["run_id"], "name": run["name"], "seed": int(run["seed"])}
+    named = {"run_id": run["run_id"], "name": recording.name, "seed": int(run["seed"])}
     return named | {"status": recording.status}
 
 

@@ -282,6 +282,26 @@ def test_mlflow_takes_whatever_a_loop_calls_its_numbers(export, tmp_path):
     assert found["params"]["config.a b_c"] == "1"
 
 
+def test_mlflow_gets_lengths_and_returns_of_a_loops_episodes(export, tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "loops") as env:
+        lengths = []
+        for seed in range(3):
+            env.reset(seed=seed)
+            env.action_space.seed(seed)
+            lengths.append(0)
+            ended = False
+            while not ended:
+                _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+                ended, lengths[-1] = terminated or truncated, lengths[-1] + 1
+    export("mlflow", env.run.recording)
+    (found,) = read_mlflow()
+    history = found["history"]
+    assert [value for _, _, value in history["train/episode/length"]] == lengths
+    assert [step for _, step, _ in history["train/episode/length"]] == list(np.cumsum(lengths))
+    (returns,) = [points for name, points in history.items() if name.startswith("train/episode/return/")]
+    assert [value for _, _, value in returns] == lengths
+
+
 def test_a_loop_without_steps_is_not_told_to_be_done_again(export, tmp_path):
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "loops") as env:
         env.reset(seed=0)

@@ -20,6 +20,7 @@ import runner
 from runner import frames
 from runner.analysis.readings import read_series
 from runner.cli import cli
+from runner.export.contents import shortcomings
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.run_file import Summary
@@ -492,3 +493,41 @@ def test_values_that_are_not_finite_are_left_out_of_curves_and_counted(value, tm
     assert np.isfinite(drawn).all()
     assert 0.25 in drawn
     assert series.not_finite["training.mean_return"] >= 1
+
+
+def test_a_new_name_is_in_every_picture_report_and_export(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "runs")
+    dualtaxi(tmp_path / "runs", "rename", "lake", "mountain")
+    run = runner.find_run("mountain", tmp_path / "runs")
+    with open_recording(run.recording) as recording:
+        assert recording.name == read_series(recording).name == "mountain"
+    for words in (("plot", "mountain", "-o", "plot.svg"), ("report", "mountain", "-o", "report.html")):
+        made = tmp_path / words[-1]
+        assert dualtaxi(tmp_path / "runs", *words[:-1], str(made)).exit_code == 0
+        assert "mountain" in made.read_text()
+        assert "lake, seed" not in made.read_text()
+    told = json.loads(dualtaxi(tmp_path / "runs", "diff", "mountain", "other", "--json").stdout)
+    assert (told["a"]["name"], told["b"]["name"]) == ("mountain", "other")
+
+
+def test_a_loop_that_runs_is_told_as_running(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path / "runs", name="now") as env:
+        list(play(env, 300, 0))
+        env.commit() if hasattr(env, "commit") else None
+        run = runner.find_run("now", str(tmp_path / "runs"))
+        assert run.status == "running"
+        if run.recording.exists():
+            with open_recording(run.recording) as recording:
+                assert recording.status == "running"
+                assert "is still running" in shortcomings(recording)[0]
+    with open_recording(run.recording) as recording:
+        assert recording.status == "finished"
+
+
+def test_a_run_is_found_by_text_and_in_the_usual_folder(folder, monkeypatch):
+    found = runner.find_run("lake", str(folder))
+    monkeypatch.setenv("DUALTAXI_RECORDINGS", str(folder))
+    assert runner.find_run("lake") == found
+    assert {run.run_id for run in runner.list_runs()} == {run.run_id for run in runner.list_runs(folder)}
+    assert found.run_id in repr(found)
+    assert len(repr(found)) < 300
