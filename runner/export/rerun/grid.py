@@ -23,6 +23,10 @@ TITLE_Y: Final = -0.62
 FACTS_BELOW: Final = 0.35
 LINE: Final = 0.3
 """Between the lines below the grid."""
+MOVER_LABEL: Final = -0.5
+"""From a mover to its label, which is written below that point: above what is drawn."""
+OTHER_LABEL: Final = 0.12
+"""From a passenger to its label: below what is drawn."""
 
 
 class GridWriter(Sender):
@@ -39,16 +43,24 @@ class GridWriter(Sender):
         self._scene = scene
         self._marks = marks
         self._words = words
+        self._label_offsets = np.array(
+            [[0.0, MOVER_LABEL]] * len(scene.movers) + [[0.0, OTHER_LABEL]] * len(scene.passengers),
+            np.float32,
+        )
 
     def dress(self) -> None:
         """Log sizes and colours."""
         movers = len(self._scene.movers)
         colours = [MOVER_COLOURS[i % len(MOVER_COLOURS)] for i in range(movers)]
-        facts = 1 + len(self._words.rewards)
-        radii = [0.15] * movers + [0.1] * len(self._scene.passengers) + [0.0] * facts
+        shapes = self._scene.shapes
         self.static(
             "grid/things",
-            rr.Points2D.from_fields(radii=radii, show_labels=True, draw_order=40.0),
+            rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=50.0),
+            rr.Boxes2D.from_fields(
+                radii=[shape.radius for shape in shapes],
+                colors=[rgba(shape.colour) for shape in shapes],
+                draw_order=40.0,
+            ),
             rr.Arrows2D.from_fields(colors=[rgba(c) for c in colours], radii=0.035, draw_order=45.0),
             rr.LineStrips2D.from_fields(colors=[rgba(c, 120) for c in colours], radii=0.05, draw_order=30.0),
         )
@@ -60,9 +72,20 @@ class GridWriter(Sender):
     def write(self, batch: Batch, phase: str) -> None:
         """Send the grid of each step of a batch."""
         self.send("grid/things", batch.times(), self._things(batch))
+        self._send_sizes(batch)
         rows = np.flatnonzero(batch.records["t"] == 0)
         if len(rows):
             self._episodes(batch, rows, phase)
+
+    def _send_sizes(self, batch: Batch) -> None:
+        """Send the sizes of what is drawn where it may have been cleared; if static, they stayed for ever."""
+        begins = batch.records["t"] == 0
+        begins[0] = True
+        begins[1:] |= np.diff(batch.time) != 1
+        rows = np.flatnonzero(begins)
+        sizes = np.array([shape.half_size for shape in self._scene.shapes], np.float32).reshape(-1, 2)
+        each = np.broadcast_to(sizes, (len(rows), *sizes.shape))
+        self.send("grid/things", batch.times(rows), instances(rr.Boxes2D, len(rows), half_sizes=each))
 
     def _things(self, batch: Batch) -> list[Any]:
         """Return the columns of what moves, its trail and its arrows."""
@@ -72,9 +95,11 @@ class GridWriter(Sender):
         vectors = scene.arrows(
             state, records["action"].astype(np.int64), records["next_state"].astype(np.int64)
         )
-        positions = np.concatenate((points, self._fact_points(n)), axis=1)
+        labels = points + self._label_offsets
+        positions = np.concatenate((labels, self._fact_points(n)), axis=1)
         return [
             *instances(rr.Points2D, n, positions=positions, class_ids=self._classes(records, state)),
+            *instances(rr.Boxes2D, n, centers=scene.shape_centres[state]),
             *instances(rr.Arrows2D, n, vectors=vectors, origins=points[:, :movers]),
             *strips(trails(scene, batch)),
         ]

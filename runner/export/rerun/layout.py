@@ -230,7 +230,7 @@ def _draw_scene(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
         stream.log(
             f"{path}/names",
             rr.Points2D(
-                [(c + 0.14, r + 0.06) for r, c in (mark["cell"] for mark in marks)],
+                [(c + 0.14, r + 0.72) for r, c in (mark["cell"] for mark in marks)],
                 labels=[mark["name"] for mark in marks],
                 colors=[rgb(mark["colour"]) for mark in marks],
                 radii=0.0,

@@ -5,6 +5,7 @@ Coordinates of the grid are cells: x to the right, y down, the first cell from (
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -38,6 +39,34 @@ def rgb(colour: str) -> tuple[int, int, int]:
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
+@dataclass(frozen=True)
+class Shape:
+    """A box with a thick, rounded line, which fills it; lengths are in cells."""
+
+    offset: tuple[float, float]
+    half_size: tuple[float, float]
+    radius: float
+    colour: str = ""
+    """Empty for the colour of its mover."""
+    thing: int = 0
+    """Index of the drawn point that it belongs to."""
+
+
+DRIVEN: Final = ("taxi", "car", "bus", "truck")
+CAR: Final = (
+    Shape((-0.02, -0.1), (0.07, 0.025), 0.05),
+    Shape((0.0, 0.02), (0.15, 0.025), 0.055),
+    Shape((-0.1, 0.1), (0.01, 0.01), 0.04, INK),
+    Shape((0.1, 0.1), (0.01, 0.01), 0.04, INK),
+)
+PAWN: Final = (Shape((0.0, -0.12), (0.02, 0.02), 0.07), Shape((0.0, 0.05), (0.05, 0.05), 0.06))
+PERSON: Final = (
+    Shape((0.0, -0.09), (0.01, 0.01), 0.04, PASSENGER_COLOUR),
+    Shape((0.0, 0.03), (0.02, 0.03), 0.045, PASSENGER_COLOUR),
+)
+"""A car, any other mover, and a passenger, by their boxes."""
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Tables of S states; movers come first among the drawn points, then the passengers."""
@@ -59,13 +88,39 @@ class Scene:
         drawn = [movers[:, i] for i in range(len(self.movers))]
         carriers = self.mdp.scene_carriers
         for thing in self.passengers:
-            place = self.centres[self._cells((thing,))[:, 0]] + np.array([0.0, 0.3], np.float32)
+            place = self.centres[self._cells((thing,))[:, 0]] + np.array([0.2, 0.26], np.float32)
             for i, mover in enumerate(self.movers):
                 if carriers is not None:
                     rides = (carriers[:, thing] == mover)[:, None]
                     place = np.where(rides, movers[:, i], place)
             drawn.append(place)
         return np.stack(drawn, axis=1).astype(np.float32)
+
+    @cached_property
+    def shapes(self) -> tuple[Shape, ...]:
+        """The boxes that the drawn points are made of: those of the movers first, then the passengers'."""
+        drawn: list[Shape] = []
+        for i, mover in enumerate(self.movers):
+            colour = MOVER_COLOURS[i % len(MOVER_COLOURS)]
+            driven = str(self.description["things"][mover]["label"]).split(" ")[0] in DRIVEN
+            drawn += [
+                dataclasses.replace(part, thing=i, colour=part.colour or colour)
+                for part in (CAR if driven else PAWN)
+            ]
+        for i in range(len(self.passengers)):
+            drawn += [dataclasses.replace(part, thing=len(self.movers) + i) for part in PERSON]
+        return tuple(drawn)
+
+    @cached_property
+    def shape_things(self) -> NDArray[np.int64]:
+        """[shapes]: the drawn point that each shape belongs to."""
+        return np.array([shape.thing for shape in self.shapes], np.int64)
+
+    @cached_property
+    def shape_centres(self) -> NDArray[np.float32]:
+        """[S, shapes, 2]: the centre of each shape."""
+        offsets = np.array([shape.offset for shape in self.shapes], np.float32).reshape(-1, 2)
+        return np.asarray(self.points[:, self.shape_things] + offsets)
 
     @cached_property
     def goal_points(self) -> NDArray[np.float32]:

@@ -112,10 +112,14 @@ class TestSteps:
                 [a] for a in steps["action"].tolist()
             ]
             return
-        table = exported.table(f"/{phase}/grid/things")
-        points = np.array(table["Points2D:positions"])
+        table = exported.table(f"/{phase}/grid/things", "Points2D:positions")
+        boxes = np.array(table["Boxes2D:centers"])
+        points = np.array(table["Arrows2D:origins"])
         for i, mover in enumerate(scene.movers):
             cells = mdp.scene_cells[steps["state"], mover]
+            for shape in np.flatnonzero(scene.shape_things == i):
+                inside = np.floor(boxes[:, shape]).astype(int)
+                assert np.array_equal(inside[:, 1] * scene.columns + inside[:, 0], cells)
             drawn = np.floor(points[:, i]).astype(int)
             assert np.array_equal(drawn[:, 1] * scene.columns + drawn[:, 0], cells)
             tips = np.floor(points[:, i] + np.array(table["Arrows2D:vectors"])[:, i]).astype(int)
@@ -127,7 +131,7 @@ class TestSteps:
         scene, steps = scene_of(exported.recording.mdp), exported.steps(phase)
         if scene is None:
             return
-        strips = exported.table(f"/{phase}/grid/things")["LineStrips2D:strips"]
+        strips = exported.table(f"/{phase}/grid/things", "LineStrips2D:strips")["LineStrips2D:strips"]
         for k in (0, 1, 3, 7, len(steps) - 1):
             back = [max(k - j, k - int(steps["t"][k])) for j in range(5, -1, -1)]
             expected = scene.points[steps["state"][back], : len(scene.movers)].swapaxes(0, 1)
