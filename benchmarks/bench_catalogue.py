@@ -41,7 +41,7 @@ def measure(quick: bool) -> list[Figure]:
 
         first = timed("ls", "--limit", "50", place=described, times=1)
         lists = timed("ls", "--limit", "50", place=described)
-        filtered = timed("ls", "--limit", "50", "--sort", "-finish_percent", FILTER, place=described)
+        filtered = timed("ls", "--limit", "50", "--sort", "-success_percent", FILTER, place=described)
         shown = timed("show", "r00042", place=described)
         reindexed = timed("reindex", place=recorded)
     note = f"{LISTED:,} runs, each in its folder; processor time of the whole command"
@@ -82,7 +82,7 @@ def many(small: Path, folder: Path, count: int, recordings: bool) -> Path:
         facts |= {"run_id": place.name, "seed": number % 10, "name": f"experiment{number % 37}"}
         facts["created"] = f"2026-{1 + number % 12:02}-{1 + number % 28:02}T10:00:00.{number % 1000:03}+00:00"
         facts["config"] |= {"discount": rng.random(), "name": facts["name"]}
-        facts["summary"]["last_evaluation"] = {"finish_percent": rng.uniform(0, 100)}
+        facts["summary"]["last_evaluation"] = {"success_percent": rng.uniform(0, 100)}
         facts["summary"]["content_digest"] = f"{rng.getrandbits(256):064x}"
         (place / RUN_FILE).write_text(json.dumps(facts, indent=1))
         age(place.iterdir())

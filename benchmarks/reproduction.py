@@ -120,7 +120,7 @@ def volatility(outcomes: list[Outcome]) -> str:
     """Return by how many points finish percent changes between evaluations: mean over the last half."""
     changes = []
     for outcome in outcomes:
-        percent = [e["finish_percent"] for _, e in sorted(outcome.evaluations.items())]
+        percent = [e["success_percent"] for _, e in sorted(outcome.evaluations.items())]
         changes += [abs(after - before) for before, after in pairwise(percent[len(percent) // 2 :])]
     return f"{statistics.mean(changes):.1f}"
 
@@ -162,7 +162,7 @@ def print_curves(found: dict[str, list[Outcome]]) -> None:
     rows = []
     for job, outcomes in found.items():
         medians = [
-            f"{statistics.median(o.evaluations[episode]['finish_percent'] for o in outcomes):.1f}"
+            f"{statistics.median(o.evaluations[episode]['success_percent'] for o in outcomes):.1f}"
             if episode in outcomes[0].evaluations
             else ""
             for episode in at
@@ -189,7 +189,7 @@ def print_slips(seeds: int) -> None:
             changes = [f"quirks.{name}={str(value).lower()}" for name, value in mended.items()]
             outcomes = run(job, ["evaluation={every: 100000, trials: 2880, start: each}", *changes], seeds)
             last = [outcome.evaluations[max(outcome.evaluations)] for outcome in outcomes]
-            percent = spread([evaluation["finish_percent"] for evaluation in last], 1)
+            percent = spread([evaluation["success_percent"] for evaluation in last], 1)
             length = spread([evaluation["mean_length"] for evaluation in last], 1)
             rows.append((job, " and ".join(mended) or "nothing", percent, length))
     heads = ("job", "mended", "finished, %", "mean length")

@@ -245,7 +245,7 @@ class Session:
         self._progress.evaluations.append(metrics)
         if plan.exact:
             self._measure_exactly(metrics)
-        self._log(f"evaluation after {episode} episodes: {metrics['finish_percent']:.1f} % success")
+        self._log(f"evaluation after {episode} episodes: {metrics['success_percent']:.1f} % success")
         self._tell(now=True)
         return True
 
@@ -313,7 +313,7 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> dict[s
         "evaluation": evaluation,
         "trials": len(trials),
         "successes": successes if known else -1,
-        "finish_percent": 100.0 * successes / len(trials) if known else float("nan"),
+        "success_percent": 100.0 * successes / len(trials) if known else float("nan"),
         "eval_mean_length": float(trials["length"].mean()),
         "mean_penalties": float(trials["penalties"].mean()),
         "terminations": int(trials["terminated"].sum()),
@@ -324,10 +324,10 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> dict[s
 
 def evaluation_brief(metrics: dict[str, Any]) -> dict[str, Any]:
     """Return the four figures of an evaluation that people quote; finish percent None if unknown."""
-    finished = metrics["finish_percent"]
+    finished = metrics["success_percent"]
     return {
         "episode": metrics["episode"],
-        "finish_percent": None if math.isnan(finished) else finished,
+        "success_percent": None if math.isnan(finished) else finished,
         "mean_length": metrics["eval_mean_length"],
         "mean_penalties": metrics["mean_penalties"],
     }

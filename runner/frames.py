@@ -3,7 +3,7 @@
     import runner
 
     run = runner.run("quick")
-    runner.frames.evaluations(run).plot("episode", "finish_percent")
+    runner.frames.evaluations(run).plot("episode", "success_percent")
 
 A run is a `Run`, an open `Recording`, or the path of a recording. pandas comes with the extra `frames`;
 the records need nothing.
@@ -48,7 +48,7 @@ _BEHIND: Final = ("terminated", "truncated", "explored", "acted", "agents_termin
 def evaluations(run: Source) -> pd.DataFrame:
     """Return a row for each evaluation: how the greedy policy did, and how training stood.
 
-    Columns: episode, finish_percent (NaN where the environment does not say what success is),
+    Columns: episode, success_percent (NaN where the environment does not say what success is),
     mean_length, mean_penalties, ...; a column for each event, such as `taxi_1.drop_off`: how often it came
     in all trials; `mean_return.AGENT` and `training.…` for training at that moment.
 
@@ -214,7 +214,7 @@ def step_columns(
 def evaluation_records(recording: Recording) -> list[dict[str, Any]]:
     """Return the evaluations of a recording, in order, as JSON can hold them.
 
-    Each has `episode` (training episodes before it), `finish_percent` (None where the environment does
+    Each has `episode` (training episodes before it), `success_percent` (None where the environment does
     not say what success is), `mean_length`, `mean_penalties`, ..., `events` by name, summed over the
     trials, and under `training` what `training_records` has.
 
@@ -231,7 +231,7 @@ def evaluation_records(recording: Recording) -> list[dict[str, Any]]:
 def loop_summary(recording: Recording) -> dict[str, Any]:
     """Return the last results of a loop, computed from its recording.
 
-    Keys: `last_evaluation` (None if there was none) with `episode`, `trials`, `finish_percent`,
+    Keys: `last_evaluation` (None if there was none) with `episode`, `trials`, `success_percent`,
     `mean_length`, `mean_penalties` and `mean_return` (summed over agents); `recent_training` with
     `episodes`, `mean_length` and `mean_return` of the last `RECENT_EPISODES`; `logged`, the last value logged
     under each name. A value that is unknown or not finite is None.
@@ -318,7 +318,7 @@ def evaluation_record(
         "step": metrics["step"],
         "trials": metrics["trials"],
         "successes": metrics["successes"] if known else None,
-        "finish_percent": metrics["finish_percent"] if known else None,
+        "success_percent": metrics["success_percent"] if known else None,
         "mean_length": metrics["eval_mean_length"],
         "mean_penalties": metrics["mean_penalties"],
         "terminations": metrics["terminations"],
@@ -345,7 +345,7 @@ def _loop_evaluations(
     environment = recording.environment
     return [
         _loop_evaluation(number, episode, np.concatenate(found[episode]), agents, events)
-        | ({} if environment["success_events"] else {"successes": None, "finish_percent": None})
+        | ({} if environment["success_events"] else {"successes": None, "success_percent": None})
         | ({} if environment["penalty_below"] is not None else {"mean_penalties": None})
         for number, episode in enumerate(sorted(found))
     ]
@@ -360,7 +360,7 @@ def _loop_evaluation(
         "episode": episode,
         "trials": len(trials),
         "successes": int(trials["success"].sum()),
-        "finish_percent": 100 * float(trials["success"].mean()),
+        "success_percent": 100 * float(trials["success"].mean()),
         "mean_length": float(trials["length"].mean()),
         "mean_penalties": float(trials["penalties"].mean()),
         "terminations": int(trials["terminated"].sum()),
@@ -374,7 +374,7 @@ def _brief(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a summary has of an evaluation of a loop."""
     returns = list(record["mean_returns"].values())
     brief = {
-        key: record[key] for key in ("episode", "trials", "finish_percent", "mean_length", "mean_penalties")
+        key: record[key] for key in ("episode", "trials", "success_percent", "mean_length", "mean_penalties")
     }
     return brief | {"mean_return": None if None in returns else sum(returns)}
 

@@ -38,7 +38,7 @@ class EvaluationMetrics:
 
     episode: int | None = None
     """Training episodes before it."""
-    finish_percent: float | None = None
+    success_percent: float | None = None
     mean_length: float | None = None
     mean_penalties: float | None = None
     mean_return: float | None = None
@@ -173,6 +173,10 @@ def parse_summary(stated: Mapping[str, Any], where: str, problems: list[str]) ->
         problems.append(f"found values nested more than {MAX_DEPTH} deep")
         stated = {key: value for key, value in stated.items() if not is_too_deep(value, 1)}
     known = _fitting(stated, _SUMMARY, where, problems)
+    if isinstance(known.get("last_evaluation"), dict):
+        known["last_evaluation"] = {
+            _RENAMED.get(key, key): value for key, value in known["last_evaluation"].items()
+        }
     fields = {key: known[key] for key in _SUMMARY if known.get(key) is not None}
     for key, record, checks in _RECORDS:
         if key in fields:
@@ -279,7 +283,7 @@ _STATUS: Final = Check(lambda value: value in STATED_STATUSES, f"one of {', '.jo
 
 _EVALUATION: Final = {
     "episode": _optional(_COUNT),
-    "finish_percent": _optional(
+    "success_percent": _optional(
         Check(lambda value: _is_number(value) and 0 <= value <= 100, "a number from 0 to 100")
     ),
     "mean_length": _optional(_LENGTH),
@@ -287,6 +291,8 @@ _EVALUATION: Final = {
     "mean_return": _optional(_NUMBER),
     "trials": _optional(_COUNT),
 }
+_RENAMED: Final = {"finish_percent": "success_percent"}
+"""Keys of an evaluation as earlier versions wrote them."""
 _RECENT: Final = {
     "episodes": _optional(_COUNT),
     "mean_length": _optional(_LENGTH),

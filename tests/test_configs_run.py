@@ -42,6 +42,6 @@ def test_the_optimum_is_learned_to_the_last_bit_that_counts(tmp_path):
     run = run_job(next(jobs_of(config)), create_run(tmp_path, config, config.seeds[0]))
     with open_recording(run.recording) as recording:
         last = list(recording.optimality())[-1]
-    assert (last["starts"], last["finish_percent"]) == (2880, 100.0)
+    assert (last["starts"], last["success_percent"]) == (2880, 100.0)
     assert last["mean_length"] == last["optimal_mean_length"] == pytest.approx(9.172916666666667)
     assert sum(last["values"]) == pytest.approx(last["optimal_value"], abs=1e-9)

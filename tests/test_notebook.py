@@ -85,4 +85,4 @@ def test_the_notebook_runs_from_random_taxis_to_trained_ones(path, tmp_path):
     }
     assert runs["random"]["mean_length"] > 300
     assert runs["together"]["mean_length"] < 60
-    assert runs["together"]["finish_percent"] > 90
+    assert runs["together"]["success_percent"] > 90

@@ -77,7 +77,7 @@ def loop_series(recording: Recording) -> RunSeries:
 def evaluation_readings(record: Mapping[str, Any]) -> Readings:
     """Return the readings of a record of `runner.frames.evaluation_records`."""
     trials = record["trials"]
-    known = {} if record["finish_percent"] is None else {"finish_percent": {"": record["finish_percent"]}}
+    known = {} if record["success_percent"] is None else {"success_percent": {"": record["success_percent"]}}
     events: Readings = {}
     for name, count in record["events"].items():
         agent, _, kind = name.rpartition(".")
@@ -103,7 +103,7 @@ def exact_readings(measures: Mapping[str, Any], agents: Sequence[str]) -> Readin
     """Return exact measures beside the optimum's."""
     readings = {
         name: {"": measures[name], "optimum": measures[f"optimal_{name}"]}
-        for name in ("finish_percent", "mean_length")
+        for name in ("success_percent", "mean_length")
     }
     readings["value"] = {"": sum(measures["values"]), "optimum": measures["optimal_value"]}
     readings["to_gain"] = {

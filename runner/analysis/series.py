@@ -49,11 +49,11 @@ _TITLE: Final = 40
 """Letters of a name for which there is room above a panel."""
 
 TITLES: Final = {
-    "finish_percent": ("Evaluation trials that succeed", "percent of trials"),
+    "success_percent": ("Evaluation trials that succeed", "percent of trials"),
     "mean_length": ("Length of evaluation trials", "steps, mean"),
     "mean_penalties": ("Penalties in evaluation trials", "a trial, mean"),
     "mean_return": ("Return of evaluation trials", "summed reward, mean"),
-    "exact.finish_percent": ("Start states that succeed, exactly", "percent of start states"),
+    "exact.success_percent": ("Start states that succeed, exactly", "percent of start states"),
     "exact.mean_length": ("Length of an episode, exactly", "steps, mean over start states"),
     "exact.value": ("Value of the greedy policy", "discounted, mean"),
     "exact.to_gain": ("To gain by a best response", "discounted, mean"),
@@ -92,7 +92,7 @@ def has_goal(run: RunSeries) -> bool:
 
     Of a loop it is known where its environment says what success is; a pole is to be held as long as can be.
     """
-    return not is_loop(run) or any("finish_percent" in readings for _, readings in run.evaluation)
+    return not is_loop(run) or any("success_percent" in readings for _, readings in run.evaluation)
 
 
 def title_of(metric: str) -> tuple[str, str]:

@@ -73,7 +73,7 @@ def _metrics(topic: Topic) -> pa.Schema:
     fields = [("run_id", TEXT), ("position", pa.int64())]
     for one in topic.message.fields:
         kind = kinds["d" if one.kind == FieldDescriptorProto.TYPE_DOUBLE else "q"]
-        fields.append((one.name, pa.list_(kind) if one.repeated else kind))
+        fields.append((one.stored_name, pa.list_(kind) if one.repeated else kind))
     return pa.schema(fields)
 
 

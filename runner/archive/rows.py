@@ -54,6 +54,8 @@ def message_row(topic: Topic, payload: bytes, shape: Shape) -> dict[str, Any]:
             values |= zip(shape.per_learner("reward"), rewards, strict=False)
         elif not values.pop("seeded"):
             values["seed"] = None
+    stored = {field.name: field.stored_name for field in topic.message.fields}
+    values = {stored.get(name, name): value for name, value in values.items()}
     return ({"phase": topic.phase} if topic.phase else {}) | values
 
 
@@ -63,7 +65,8 @@ def message_payload(topic: Topic, position: int, row: Mapping[str, Any], shape: 
         return encode_log(row["message"], position * STEP_NANOSECONDS / 1e9, row["level"], row["name"])
     if topic.message is schema.IMAGE:
         return encode_image(row["data"], row["format"], position, topic.phase)
-    fields = {field.name: row[field.name] for field in topic.message.fields if field.name in row}
+    stored = topic.message.fields
+    fields = {field.name: row[field.stored_name] for field in stored if field.stored_name in row}
     if topic.message in _OF_SPACES:
         names = {field.name for field in topic.message.fields} & shape.spaces.keys()
         fields |= {name: shape.spaces[name].value(row) for name in names}

@@ -21,13 +21,13 @@ MADE: Final = ("same_as", "path")
 PROGRAMS: Final = (
     *("run_id", "name", "config", "seed", "status", "tags", "note", "created"),
     *("episodes", "episodes_to_do", "train_steps", "eval_steps", "seconds"),
-    *("finish_percent", "mean_length", "mean_penalties", "mean_return", "logged"),
+    *("success_percent", "mean_length", "mean_penalties", "mean_return", "logged"),
     *("bytes", "content_digest", "same_as"),
     *("mode", "environment", "host", "git", "archive", "path"),
 )
 """What programs are told of a run, unless they ask for other columns."""
 HEADINGS: Final = {
-    "finish_percent": "success %",
+    "success_percent": "success %",
     "mean_return": "return",
     "bytes": "size",
     "tag": "tags",
@@ -46,7 +46,7 @@ def columns_of(text: str) -> list[str]:
     """
     names = [name.strip() for name in text.split(",") if name.strip()]
     if not names:
-        raise RunnerError("columns: found nothing, expected names such as id,name,finish_percent.")
+        raise RunnerError("columns: found nothing, expected names such as id,name,success_percent.")
     return [name if name in MADE or name.startswith(SETTING) else field_of(name).name for name in names]
 
 
@@ -134,7 +134,7 @@ def _logged_in_words(values: dict[str, float | None]) -> str:
 
 
 _IN_WORDS: Final[dict[str, Callable[[Any], str]]] = {
-    **dict.fromkeys(("finish_percent", "mean_length", "mean_penalties", "mean_return"), number),
+    **dict.fromkeys(("success_percent", "mean_length", "mean_penalties", "mean_return"), number),
     "logged": _logged_in_words,
     "age": age,
     "bytes": size,

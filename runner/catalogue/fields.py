@@ -54,7 +54,7 @@ _ALL: Final = (
     Field("steps", Kind.NUMBER, "steps of training and evaluation"),
     Field("train_steps", Kind.NUMBER, "steps of training"),
     Field("eval_steps", Kind.NUMBER, "steps of evaluation"),
-    Field("finish_percent", Kind.NUMBER, "percent of the last evaluation's trials that succeeded"),
+    Field("success_percent", Kind.NUMBER, "percent of the last evaluation's trials that succeeded"),
     Field("mean_length", Kind.NUMBER, "mean length of the last evaluation's trials"),
     Field("mean_penalties", Kind.NUMBER, "mean penalties of the last evaluation's trials"),
     Field(

@@ -40,7 +40,7 @@ class Removal:
     name: str
     seed: int | None
     status: str
-    finish_percent: float | None
+    success_percent: float | None
     created: datetime
     folder: Path
     is_archived: bool
@@ -91,7 +91,7 @@ def plan(run: Run, root: Path, force: bool = False) -> Removal:
         name=run.name,
         seed=run.seed,
         status=run.status,
-        finish_percent=last.finish_percent if last else None,
+        success_percent=last.success_percent if last else None,
         created=run.created,
         folder=run.folder,
         is_archived=bool(run.archive),

@@ -72,7 +72,7 @@ class Row(Model):
     steps = BigIntegerField(null=True)
     train_steps = BigIntegerField(null=True)
     eval_steps = BigIntegerField(null=True)
-    finish_percent = FloatField(null=True)
+    success_percent = FloatField(null=True)
     mean_length = FloatField(null=True)
     mean_penalties = FloatField(null=True)
     mean_return = FloatField(null=True)
@@ -136,7 +136,7 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         "steps": None if train is None or evaluation is None else train + evaluation,
         "train_steps": train,
         "eval_steps": evaluation,
-        "finish_percent": last.finish_percent,
+        "success_percent": last.success_percent,
         "mean_length": last.mean_length,
         "mean_penalties": last.mean_penalties,
         "mean_return": _mean_return(summary),

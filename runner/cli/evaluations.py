@@ -89,7 +89,7 @@ def _measures(records: Sequence[Mapping[str, Any]]) -> list[_Column]:
     if not all("training" in record for record in records):
         columns.append(_Column("trials", [f"{record['trials']:,}" for record in records]))
         columns.append(_Column("mean return", [_returns(record["mean_returns"]) for record in records]))
-    measures = (("success %", "finish_percent"), ("mean length", "mean_length"))
+    measures = (("success %", "success_percent"), ("mean length", "mean_length"))
     for heading, key in (*measures, ("mean penalties", "mean_penalties")):
         if "training" in records[0] or any(record[key] is not None for record in records):
             columns.append(_Column(heading, [number(record[key]) for record in records]))

@@ -13,7 +13,7 @@ from runner.catalogue.fields import FIELDS, Kind
 from runner.cli.output import console, draw, table
 
 USUAL: Final = (
-    *("id", "name", "config", "seed", "status", "tag", "episodes", "finish_percent", "mean_return"),
+    *("id", "name", "config", "seed", "status", "tag", "episodes", "success_percent", "mean_return"),
     *("logged", "bytes", "age", "same_as", "folder"),
 )
 """The columns that people want to see, where they tell something."""
@@ -71,7 +71,7 @@ def usual_columns(rows: Sequence[dict[str, Any]], folders: int) -> list[str]:
         "tag": any(row["tags"] for row in rows),
         "same_as": any(row["same_as"] for row in rows),
         "folder": folders > 1,
-        "finish_percent": any(row["finish_percent"] is not None for row in rows)
+        "success_percent": any(row["success_percent"] is not None for row in rows)
         or all(row["mean_return"] is None for row in rows),
         "mean_return": any(row["mean_return"] is not None for row in rows),
         "logged": any(row["logged"] != "{}" for row in rows),

@@ -144,5 +144,5 @@ def facts_in_words(progress: Progress, speed: float | None) -> str:
     if speed is not None:
         facts.append(f"{speed / 1e6:.1f}M steps/s" if speed >= 1e6 else f"{speed / 1e3:.0f}k steps/s")
     if progress.evaluations:
-        facts.append(f"success {number(progress.evaluations[-1]['finish_percent'], 0)} %")
+        facts.append(f"success {number(progress.evaluations[-1]['success_percent'], 0)} %")
     return "  ".join([*facts, size(progress.bytes_written)])

@@ -117,7 +117,7 @@ def _cells(removal: Removal) -> tuple[str, ...]:
         removal.name,
         str(removal.seed),
         removal.status,
-        UNKNOWN if removal.finish_percent is None else number(removal.finish_percent),
+        UNKNOWN if removal.success_percent is None else number(removal.success_percent),
         age((datetime.now(UTC) - removal.created).total_seconds()),
         size(removal.freed),
     )

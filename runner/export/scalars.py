@@ -1,7 +1,7 @@
 """A run's measures as named numbers over training steps: what metric stores and spreadsheets take.
 
     train/mean_length, train/percent_filled/taxi_1, train/reward_counts/-1, train/epsilon, ...
-    eval/finish_percent, eval/mean_return/taxi_1, eval/events/taxi_1.drop_off, eval/training/epsilon, ...
+    eval/success_percent, eval/mean_return/taxi_1, eval/events/taxi_1.drop_off, eval/training/epsilon, ...
     eval/exact/value/taxi_1, eval/exact/optimal_value, ... with `evaluation: {exact: true}`
     train/logged/loss, ... what somebody's own loop logged
     train/episode/length, train/episode/return/taxi_1, ... of each episode: in TensorBoard; of loops in MLflow
@@ -25,11 +25,11 @@ from runner.recording.schema import EVAL_EPISODE, SCALAR_TOPIC, STEP_NANOSECONDS
 
 _OF_TRAINING = ("mean_length", "zero_cells", "percent_filled", "epsilon", "step_size", "discount")
 _EXACT = {
-    **{name: name for name in ("finish_percent", "timeout_percent", "mean_length", "mean_penalties")},
+    **{name: name for name in ("success_percent", "timeout_percent", "mean_length", "mean_penalties")},
     **{"mean_returns": "mean_return", "values": "value", "best_responses": "best_response"},
-    **{f"optimal_{name}": f"optimal_{name}" for name in ("value", "finish_percent", "mean_length")},
+    **{f"optimal_{name}": f"optimal_{name}" for name in ("value", "success_percent", "mean_length")},
 }
-_OF_EVALUATION = ("trials", "successes", "finish_percent", "mean_penalties", "terminations")
+_OF_EVALUATION = ("trials", "successes", "success_percent", "mean_penalties", "terminations")
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ _remembered: OrderedDict[bytes, RandomBaseline] = OrderedDict()
 class RandomBaseline:
     """What the policy gets that takes every joint action with the same probability."""
 
-    finish_percent: float
+    success_percent: float
     """Episodes with a success; nan if the environment does not define success."""
     mean_length: float
     mean_return: float
@@ -41,13 +41,13 @@ class RandomBaseline:
         """The baseline as a sentence for people who read a success rate."""
         took = f"{self.mean_length:,.1f} steps on average"
         returned = f"{self.mean_return:,.1f}"
-        if math.isnan(self.finish_percent):
+        if math.isnan(self.success_percent):
             return (
                 f"A random policy's episodes take {took} and return {returned} "
                 f"(step limit {self.step_limit:,})."
             )
         return (
-            f"A random policy succeeds in {self.finish_percent:.1f} % of episodes within the limit of "
+            f"A random policy succeeds in {self.success_percent:.1f} % of episodes within the limit of "
             f"{self.step_limit:,} steps; its episodes take {took} and return {returned}."
         )
 
@@ -75,13 +75,13 @@ def _cached(path: Path, mdp: Mdp) -> RandomBaseline:
     with contextlib.suppress(OSError, ValueError):
         stored = read_object(path, _MAX_BYTES)
         length, returned, finish = (
-            stored.get(name) for name in ("mean_length", "mean_return", "finish_percent")
+            stored.get(name) for name in ("mean_length", "mean_return", "success_percent")
         )
         if isinstance(length, float) and isinstance(returned, float) and isinstance(finish, float | None):
             return RandomBaseline(math.nan if finish is None else finish, length, returned, mdp.step_limit)
     outcome = evaluate_stochastic_policy(mdp, random_policy(mdp), mdp.rewards.shape[-1], discount=1.0)
     baseline = RandomBaseline(
-        float(outcome.finish_percent),
+        float(outcome.success_percent),
         float(outcome.mean_length),
         float(sum(outcome.mean_returns)),
         mdp.step_limit,

@@ -34,7 +34,7 @@ class Outcome:
 
     starts: int
     """Number of start states."""
-    finish_percent: float
+    success_percent: float
     """Episodes with a success; nan if the environment does not know any."""
     timeout_percent: float
     """Episodes that the step limit cuts off."""
@@ -199,7 +199,7 @@ def _deterministic(
     timed_out = (paths.cycle[starts] >= 0) | (paths.length[starts] > limit)
     return Outcome(
         starts=len(starts),
-        finish_percent=_mean(100.0 * (counts[:, 0] > 0), weights) if known else float("nan"),
+        success_percent=_mean(100.0 * (counts[:, 0] > 0), weights) if known else float("nan"),
         timeout_percent=_mean(100.0 * timed_out, weights),
         mean_length=_mean(lengths, weights),
         mean_penalties=_mean(counts[:, 1], weights),
@@ -267,7 +267,7 @@ def _stochastic(
     length, penalties, *returns = _means(sums[starts], weights)
     return Outcome(
         starts=len(starts),
-        finish_percent=100 * finished if known else float("nan"),
+        success_percent=100 * finished if known else float("nan"),
         timeout_percent=100 * (1 - ended),
         mean_length=length,
         mean_penalties=penalties,

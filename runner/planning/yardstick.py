@@ -57,7 +57,7 @@ class Yardstick:
         optimal_value, optimum = (np.nan, None) if none else self._optimum(discount)
         return {
             "starts": outcome.starts,
-            "finish_percent": outcome.finish_percent,
+            "success_percent": outcome.success_percent,
             "timeout_percent": outcome.timeout_percent,
             "mean_length": outcome.mean_length,
             "mean_penalties": outcome.mean_penalties,
@@ -68,7 +68,7 @@ class Yardstick:
                 for learner in range(self._learners)
             ],
             "optimal_value": optimal_value,
-            "optimal_finish_percent": optimum.finish_percent if optimum else np.nan,
+            "optimal_success_percent": optimum.success_percent if optimum else np.nan,
             "optimal_mean_length": optimum.mean_length if optimum else np.nan,
             "cycle_states": [cycle.states[0] for cycle in outcome.cycles],
             "cycle_lengths": [len(cycle.states) for cycle in outcome.cycles],

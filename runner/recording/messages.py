@@ -34,6 +34,8 @@ class QTable:
 
 def encode(message: MessageType, values: Mapping[str, Any]) -> bytes:
     """Return the message with these field values; a field that is missing is protobuf's zero."""
+    stored = {field.name: field.stored_as for field in message.fields if field.stored_as}
+    values = {stored.get(name, name): value for name, value in values.items()}
     return bytes(message_class(message)(**values).SerializeToString(deterministic=True))
 
 
@@ -69,7 +71,7 @@ def decode(message: MessageType, payload: bytes) -> dict[str, Any]:
     return {
         field.name: list(value) if field.repeated else value
         for field in message.fields
-        for value in (getattr(parsed, field.name),)
+        for value in (getattr(parsed, field.stored_name),)
     }
 
 

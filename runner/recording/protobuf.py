@@ -35,7 +35,7 @@ def _files(message: MessageType) -> list[descriptor_pb2.FileDescriptorProto]:
     imports = []
     for field in message.fields:
         added = described.field.add(
-            name=field.name,
+            name=field.stored_name,
             number=field.number,
             type=field.kind,
             label=Pb.LABEL_REPEATED if field.repeated else Pb.LABEL_OPTIONAL,

@@ -24,6 +24,13 @@ class Field:
     name: str
     kind: int
     repeated: bool = False
+    stored_as: str = ""
+    """Its name in the file's schema and in archives, if that is another one."""
+
+    @property
+    def stored_name(self) -> str:
+        """Its name in the file's schema and in archives."""
+        return self.stored_as or self.name
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +113,7 @@ EVAL_METRICS = MessageType(
         Field(11, "evaluation", _SFIXED64),
         Field(12, "trials", _SFIXED64),
         Field(13, "successes", _SFIXED64),
-        Field(14, "finish_percent", _DOUBLE),
+        Field(14, "success_percent", _DOUBLE, stored_as="finish_percent"),
         Field(15, "eval_mean_length", _DOUBLE),
         Field(16, "mean_penalties", _DOUBLE),
         Field(17, "terminations", _SFIXED64),
@@ -121,7 +128,7 @@ OPTIMALITY = MessageType(
         Field(2, "episode", _SFIXED64),
         Field(3, "evaluation", _SFIXED64),
         Field(4, "starts", _SFIXED64),
-        Field(5, "finish_percent", _DOUBLE),
+        Field(5, "success_percent", _DOUBLE, stored_as="finish_percent"),
         Field(6, "timeout_percent", _DOUBLE),
         Field(7, "mean_length", _DOUBLE),
         Field(8, "mean_penalties", _DOUBLE),
@@ -129,7 +136,7 @@ OPTIMALITY = MessageType(
         Field(10, "values", _DOUBLE, repeated=True),
         Field(11, "best_responses", _DOUBLE, repeated=True),
         Field(12, "optimal_value", _DOUBLE),
-        Field(13, "optimal_finish_percent", _DOUBLE),
+        Field(13, "optimal_success_percent", _DOUBLE, stored_as="optimal_finish_percent"),
         Field(14, "optimal_mean_length", _DOUBLE),
         Field(15, "cycle_states", _SFIXED64, repeated=True),
         Field(16, "cycle_lengths", _SFIXED64, repeated=True),

@@ -94,10 +94,10 @@ class Objective(Section):
     """What a trial is judged by: the median over its seeds of a metric at a moment."""
 
     metric: str = Field(
-        default="finish_percent",
+        default="success_percent",
         min_length=1,
-        description="A recorded metric, such as finish_percent, mean_length, mean_return.taxi_1 or "
-        "exact.finish_percent.",
+        description="A recorded metric, such as success_percent, mean_length, mean_return.taxi_1 or "
+        "exact.success_percent.",
     )
     at: At = Field(
         default="last",
@@ -125,7 +125,7 @@ class Objective(Section):
 
     @property
     def described(self) -> str:
-        """The objective in words: `exact.finish_percent, last, maximize`."""
+        """The objective in words: `exact.success_percent, last, maximize`."""
         at = f"first at {self.level:g}" if self.at == "first_over" else self.at
         return f"{self.metric}, {at}, {self.direction}"
 

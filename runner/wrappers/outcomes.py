@@ -78,7 +78,7 @@ class Outcomes:
         return {
             "episode": self._evaluated_after,
             "trials": count,
-            "finish_percent": 100 * sums["success"] / count if self._has_success else None,
+            "success_percent": 100 * sums["success"] / count if self._has_success else None,
             "mean_length": sums["length"] / count,
             "mean_penalties": sums["penalties"] / count if self._has_penalties else None,
             "mean_return": sums["return"] / sums["usable"] if sums["usable"] else None,

@@ -166,7 +166,7 @@ def test_a_policy_that_draws_is_measured_exactly(algorithm, tmp_path):
     with open_recording(done.recording) as recording:
         exact = list(recording.optimality())[-1]
         sampled = list(recording.metrics("eval"))[-1]
-    assert exact["finish_percent"] == pytest.approx(sampled["finish_percent"], abs=7.5)
+    assert exact["success_percent"] == pytest.approx(sampled["success_percent"], abs=7.5)
     gains = [best - own for own, best in zip(exact["values"], exact["best_responses"], strict=True)]
     assert min(gains) > -1e-9
     assert verify(done.recording).sound

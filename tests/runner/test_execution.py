@@ -102,7 +102,7 @@ def test_one_run_is_what_the_twin_does_from_beginning_to_end(tmp_path):
                 "trials": 3,
                 "successes": sum(trial.success for trial in trials),
                 "terminations": sum(trial.terminated for trial in trials),
-                "finish_percent": 100 * sum(trial.success for trial in trials) / 3,
+                "success_percent": 100 * sum(trial.success for trial in trials) / 3,
                 "eval_mean_length": sum(trial.length for trial in trials) / 3,
                 "mean_penalties": sum(trial.penalties for trial in trials) / 3,
                 "mean_returns": [sum(trial.returns[i] for trial in trials) / 3 for i in range(2)],
@@ -142,7 +142,7 @@ def test_run_json_says_what_was_done(tmp_path):
     assert summary["episodes"] == last["episode"] == 60
     assert summary["last_evaluation"] == {
         "episode": 60,
-        "finish_percent": last["finish_percent"],
+        "success_percent": last["success_percent"],
         "mean_length": last["eval_mean_length"],
         "mean_penalties": last["mean_penalties"],
     }
@@ -163,11 +163,11 @@ def test_an_environment_that_names_no_success_reports_none(tmp_path):
     if "Pond-v0" not in gymnasium.registry:
         gymnasium.register("Pond-v0", Pond, max_episode_steps=20)
     run = make_run(tmp_path, LAKE, env={"id": "Pond-v0"})
-    assert run.summary["last_evaluation"]["finish_percent"] is None
+    assert run.summary["last_evaluation"]["success_percent"] is None
     with open_recording(run.recording) as recording:
         metrics = recording.metrics("eval")[-1]
     assert metrics["successes"] == -1
-    assert np.isnan(metrics["finish_percent"])
+    assert np.isnan(metrics["success_percent"])
 
 
 def test_the_same_job_twice_is_the_same_content_and_every_seed_another(tmp_path):
@@ -386,7 +386,7 @@ def test_exact_measures_are_those_of_a_trial_from_every_start(tmp_path, mode):
     assert [each["episode"] for each in exact] == [0, 100, 200]
     for trials, measures in zip(sampled, exact, strict=True):
         assert measures["starts"] == starts
-        assert measures["finish_percent"] == pytest.approx(trials["finish_percent"])
+        assert measures["success_percent"] == pytest.approx(trials["success_percent"])
         assert measures["timeout_percent"] == pytest.approx(100 * (1 - trials["terminations"] / starts))
         assert measures["mean_length"] == pytest.approx(trials["eval_mean_length"])
         assert measures["mean_penalties"] == pytest.approx(trials["mean_penalties"])

@@ -37,7 +37,7 @@ def corridor_run(tmp_path_factory):
 def test_evaluations(run):
     frame = frames.evaluations(run)
     assert frame["episode"].tolist() == [0, 10, 20, 30]
-    assert frame["finish_percent"].iloc[-1] == run.summary["last_evaluation"]["finish_percent"]
+    assert frame["success_percent"].iloc[-1] == run.summary["last_evaluation"]["success_percent"]
     assert frame["mean_length"].iloc[-1] == run.summary["last_evaluation"]["mean_length"]
     assert {"taxi_1.drop_off", "collision", "mean_return.taxi_2", "training.percent_filled.taxi_1"} <= set(
         frame
@@ -50,8 +50,8 @@ def test_evaluations_are_what_their_trials_say(run):
     grouped = trials.groupby(trials["episode"] // 50)
     assert grouped["length"].mean().tolist() == evaluations["mean_length"].tolist()
     assert grouped["collision"].sum().tolist() == evaluations["collision"].tolist()
-    assert (100 * grouped["success"].mean()).tolist() == evaluations["finish_percent"].tolist()
-    assert evaluations["finish_percent"].any()
+    assert (100 * grouped["success"].mean()).tolist() == evaluations["success_percent"].tolist()
+    assert evaluations["success_percent"].any()
     assert (
         evaluations["taxi_1.drop_off"].sum() + evaluations["taxi_2.drop_off"].sum() == trials["success"].sum()
     )
@@ -104,11 +104,11 @@ def test_a_run_may_be_a_path_or_open(run):
 
 
 def test_where_success_is_unknown(corridor_run):
-    assert frames.evaluations(corridor_run)["finish_percent"].isna().all()
+    assert frames.evaluations(corridor_run)["success_percent"].isna().all()
     assert {"return.agent"} <= set(frames.episodes(corridor_run))
     with runner.open_recording(corridor_run.recording) as recording:
         (first, *_) = frames.evaluation_records(recording)
-    assert (first["finish_percent"], first["successes"], first["events"]) == (None, None, {})
+    assert (first["success_percent"], first["successes"], first["events"]) == (None, None, {})
 
 
 def test_the_transition_table():

@@ -116,7 +116,7 @@ def test_one_field_of_one_record(run, tmp_path, topic, field, value):
     [
         (schema.TRAIN_METRICS_TOPIC, "mean_length", 12.5),
         (schema.TRAIN_METRICS_TOPIC, "epsilon", 0.25),
-        (schema.EVAL_METRICS_TOPIC, "finish_percent", 99.5),
+        (schema.EVAL_METRICS_TOPIC, "success_percent", 99.5),
         (schema.EVAL_METRICS_TOPIC, "successes", 1000),
         (schema.EVAL_METRICS_TOPIC, "reward_counts", [1, 2]),
     ],

@@ -1,7 +1,7 @@
 """Groups of runs against each other, a metric at a time: statistics over seeds.
 
     groups, notes = grouped([read_series(recording) for recording in recordings])
-    comparison = compare(groups, [("finish_percent", "")], Moment("last"), notes)
+    comparison = compare(groups, [("success_percent", "")], Moment("last"), notes)
 
 What a number means is said in `runner.analysis.compare.statistics`.
 """

@@ -11,7 +11,7 @@ from runner.analysis.series import SHARES, RunSeries
 from runner.errors import RunnerError, nearest
 
 _NOT_COMPARED = ("seeds", "recording", "name")
-_USUAL = ("finish_percent", "mean_length", "mean_penalties", "mean_return")
+_USUAL = ("success_percent", "mean_length", "mean_penalties", "mean_return")
 _USUAL_WITHOUT_GOAL = ("mean_return", "mean_length", "mean_penalties")
 _USUAL_OF_TRAINING = ("training.mean_return", "training.mean_reward", "training.mean_length")
 
@@ -85,7 +85,7 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
         raise RunnerError(
             "found neither an evaluation nor a report of training in any run, so there is nothing to compare."
         )
-    usual = _USUAL if "finish_percent" in known else _USUAL_WITHOUT_GOAL
+    usual = _USUAL if "success_percent" in known else _USUAL_WITHOUT_GOAL
     names = list(chosen)
     for some in (usual, _USUAL_OF_TRAINING):
         names = names or [name for name in some if name in known]

@@ -15,7 +15,7 @@ from runner.analysis.series import RunSeries, has_goal, points_of
 from runner.errors import RunnerError
 
 _HIGHER_IS_BETTER: Final = {
-    "finish_percent": True,
+    "success_percent": True,
     "mean_return": True,
     "training.mean_reward": True,
     "training.mean_return": True,
@@ -76,7 +76,7 @@ def moment_of(at: str, target: str | None, chosen: Sequence[str]) -> tuple[Momen
         try:
             return Moment("crossing", level=float(level)), (metric,)
         except ValueError:
-            message = f"target: found {target!r}, expected METRIC=LEVEL such as finish_percent=80."
+            message = f"target: found {target!r}, expected METRIC=LEVEL such as success_percent=80."
             raise RunnerError(message) from None
     if at.isascii() and at.isdecimal():
         return Moment("episode", number=int(at)), chosen

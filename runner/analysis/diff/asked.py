@@ -55,7 +55,7 @@ def as_json(difference: RunDiff) -> dict[str, Any]:
 
 
 def level_of(text: str) -> tuple[str, float]:
-    """Return metric and level of a target such as `finish_percent=80`.
+    """Return metric and level of a target such as `success_percent=80`.
 
     Raises:
         RunnerError: it is none.
@@ -65,5 +65,5 @@ def level_of(text: str) -> tuple[str, float]:
         return metric, float(level)
     except ValueError:
         raise RunnerError(
-            f"target: found {text!r}, expected METRIC=LEVEL such as finish_percent=80."
+            f"target: found {text!r}, expected METRIC=LEVEL such as success_percent=80."
         ) from None

@@ -13,7 +13,7 @@ from runner.frames import agents_of
 from runner.recording.reader import Recording
 
 SERIES = {
-    "finish_percent": "finish_percent",
+    "success_percent": "success_percent",
     "mean_length": "eval_mean_length",
     "mean_penalties": "mean_penalties",
     "training.mean_length": "mean_length",

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 @click.option(
     "--target",
     metavar="METRIC=LEVEL",
-    help="Instead: after how many episodes a level is first reached, such as finish_percent=80.",
+    help="Instead: after how many episodes a level is first reached, such as success_percent=80.",
 )
 @json_option
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for a note or an issue.")
@@ -74,7 +74,7 @@ def command(
     Examples:
       dualtaxi compare cooperative competitive
       dualtaxi compare first second third --metric mean_length --at 10000
-      dualtaxi compare sweep --by discount --target finish_percent=80
+      dualtaxi compare sweep --by discount --target success_percent=80
       dualtaxi compare cooperative competitive --html comparison.html
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.compare import compare

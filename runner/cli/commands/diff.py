@@ -62,7 +62,7 @@ def command(
     \b
     Examples:
       dualtaxi diff k3v9m2xq p7 --ignore 'package.*'
-      dualtaxi diff tutorial_cooperative cooperative --target finish_percent=80
+      dualtaxi diff tutorial_cooperative cooperative --target success_percent=80
       dualtaxi diff first second --html difference.html
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.diff import diff

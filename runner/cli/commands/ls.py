@@ -62,7 +62,7 @@ def command(
     any; FIELD:* is: known. The fields:
 
     \b
-      id name config seed status tag note created age episodes steps finish_percent
+      id name config seed status tag note created age episodes steps success_percent
       mean_length mean_penalties mean_return logged seconds bytes digest mode
       environment host git archive folder, and config.PATH for any value of the
       configuration
@@ -77,7 +77,7 @@ def command(
     Examples:
       dualtaxi ls
       dualtaxi ls tutorial NOT tag:keep
-      dualtaxi ls 'status:finished config.discount:>0.9' --sort -finish_percent --limit 5
+      dualtaxi ls 'status:finished config.discount:>0.9' --sort -success_percent --limit 5
       dualtaxi ls 'created:[2026-01-01 TO *] (seed:<3 OR age:<12h)' --columns id,seed,config,digest
       dualtaxi ls --quiet name:quick
     """  # noqa: D301 - Click wants the backspace itself

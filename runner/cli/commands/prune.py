@@ -57,7 +57,7 @@ def command(
     \b
     Examples:
       dualtaxi prune --older-than 30d --keep-last 5 --status interrupted --dry-run
-      dualtaxi prune 'config:quick finish_percent:<50' --yes
+      dualtaxi prune 'config:quick success_percent:<50' --yes
     """  # noqa: D301 - Click wants the backspace itself
     from runner.catalogue.filters import parse
     from runner.catalogue.removal import Wish

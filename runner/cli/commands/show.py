@@ -41,7 +41,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     """Tell all about a run: what it is, its evaluations, its tables, configuration and provenance.
 
     With --json also the whole series: under `eval` an object for each evaluation, with the training
-    episodes before it, finish_percent, mean_length, mean_penalties and the count of every event; under
+    episodes before it, success_percent, mean_length, mean_penalties and the count of every event; under
     `optimality` its exact measures, if the run takes them; under `train` one for each report of training;
     under `loop` the last results of a loop: its last evaluation, the means of its last 100 training episodes
     and the last values it logged.
@@ -130,8 +130,8 @@ def _exactly(run: Run, measures: dict[str, Any]) -> dict[str, str]:
         for agent, own, best in zip(agents, measures["values"], measures["best_responses"], strict=True)
     )
     told = {
-        "succeeds": f"{measures['finish_percent']:.1f} % of {measures['starts']:,} start states "
-        f"(the optimum {measures['optimal_finish_percent']:.1f} %)",
+        "succeeds": f"{measures['success_percent']:.1f} % of {measures['starts']:,} start states "
+        f"(the optimum {measures['optimal_success_percent']:.1f} %)",
         "length": f"{measures['mean_length']:.2f} steps (the optimum {measures['optimal_mean_length']:.2f})",
         "value": f"{sum(measures['values']):.3f} of {measures['optimal_value']:.3f} that are possible",
         "to gain": f"{gain}, by a best response",

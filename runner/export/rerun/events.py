@@ -81,7 +81,7 @@ def evaluation_texts(metrics: list[dict[str, Any]]) -> list[str]:
     """Return the result of each evaluation in words."""
     return [
         f"evaluation after {one['episode']:,} episodes: "
-        + (f"{one['finish_percent']:.1f} % success, " if one["successes"] >= 0 else "")
+        + (f"{one['success_percent']:.1f} % success, " if one["successes"] >= 0 else "")
         + f"{one['eval_mean_length']:.1f} steps and {one['mean_penalties']:.1f} penalties a trial"
         for one in metrics
     ]

@@ -17,7 +17,7 @@ from runner.words import spoken
 
 FRAMES_A_SECOND: Final = 10.0
 PLOTS: Final = (
-    ("Success (% of trials)", ("eval/metrics/finish_percent",)),
+    ("Success (% of trials)", ("eval/metrics/success_percent",)),
     ("Episode length (mean)", ("train/metrics/episode_length", "eval/metrics/episode_length")),
     ("Return of an episode (mean)", ("train/metrics/returns", "eval/metrics/returns")),
     ("Penalties an episode", ("train/metrics/penalties", "eval/metrics/penalties")),

@@ -79,7 +79,7 @@ class MetricWriter:
             return
         if any(row["successes"] >= 0 for row in rows):
             self._series(
-                "eval/metrics/finish_percent", rows, [[r["finish_percent"]] for r in rows], ["success"]
+                "eval/metrics/success_percent", rows, [[r["success_percent"]] for r in rows], ["success"]
             )
         self._series(
             "eval/metrics/episode_length", rows, [[r["eval_mean_length"]] for r in rows], ["evaluation"]

@@ -306,7 +306,7 @@ def _metric_paths(recording: Recording) -> Iterator[str]:
             f"train/metrics/{name}" for name in ("filled_percent", "epsilon", "step_size", "reward_percent")
         )
     if any(row["successes"] >= 0 for row in evaluations):
-        yield "eval/metrics/finish_percent"
+        yield "eval/metrics/success_percent"
     for name in (f"{event}s" for event in events if "." not in event):
         if reports:
             yield f"train/metrics/{name}"

@@ -183,7 +183,7 @@ def _results(found: list[Run]) -> list[tuple[str, list[str]]]:
     return [
         ("Status", [each.status for each in found]),
         *([("Mean return in the last evaluation", returns)] if any(map(is_loop, found)) else []),
-        ("Success in the last evaluation, %", [amounts.number(each.finish_percent) for each in last]),
+        ("Success in the last evaluation, %", [amounts.number(each.success_percent) for each in last]),
         ("Mean length of its trials", [amounts.number(each.mean_length) for each in last]),
         ("Penalties a trial", [amounts.number(each.mean_penalties) for each in last]),
         ("Training episodes", [amounts.number(each.summary.episodes, 0) for each in found]),

@@ -210,7 +210,7 @@ def _results(run: Run, last: Mapping[str, Any]) -> dict[str, str]:
     """Return the last results of a run by name: of a loop those that it has."""
     if not is_loop(run):
         return {
-            "Success in the last evaluation": _percent(last.get("finish_percent")),
+            "Success in the last evaluation": _percent(last.get("success_percent")),
             "Mean length of its trials": amounts.number(last.get("mean_length")),
             "Penalties a trial": amounts.number(last.get("mean_penalties")),
         }
@@ -218,7 +218,7 @@ def _results(run: Run, last: Mapping[str, Any]) -> dict[str, str]:
     evaluation, recent = results["last_evaluation"] or {}, results["recent_training"]
     episodes = f"the last {recent['episodes']:,} training episodes"
     measures = {
-        "Success in the last evaluation": _percent(evaluation.get("finish_percent")),
+        "Success in the last evaluation": _percent(evaluation.get("success_percent")),
         "Mean return in the last evaluation": amounts.number(evaluation.get("mean_return")),
         "Mean length of its trials": amounts.number(evaluation.get("mean_length")),
         "Penalties a trial": amounts.number(evaluation.get("mean_penalties")),

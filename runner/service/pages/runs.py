@@ -32,7 +32,7 @@ USUAL: Final = (
     "status",
     "tag",
     "episodes",
-    "finish_percent",
+    "success_percent",
     "mean_length",
     "bytes",
     "age",

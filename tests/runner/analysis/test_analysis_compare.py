@@ -20,10 +20,10 @@ from runner.analysis.series import RunSeries
 from runner.errors import RunnerError
 from runner.export.plots import panels_of
 
-FINISH = [("finish_percent", "")]
+FINISH = [("success_percent", "")]
 
 
-def run(seed, curve, *, name="a", finished=True, metric="finish_percent", line="", **config):
+def run(seed, curve, *, name="a", finished=True, metric="success_percent", line="", **config):
     """Return a run whose metric takes the values of a curve, every 100 episodes."""
     evaluation = [(100 * k, {metric: {line: float(value)}}) for k, value in enumerate(curve)]
     config = {"episodes": 100 * (len(curve) - 1), "name": name, "seeds": [seed]} | config
@@ -270,8 +270,8 @@ def test_groups_of_other_lengths_and_modes_are_compared_as_far_as_they_can_be():
 
 def test_an_unknown_metric_is_refused_with_those_there_are():
     groups, _ = grouped(two_groups([1], [2]))
-    with pytest.raises(RunnerError, match="Did you mean 'finish_percent'"):
-        metrics_of(groups, ["finish_percentage"])
+    with pytest.raises(RunnerError, match="Did you mean 'success_percent'"):
+        metrics_of(groups, ["success_percentage"])
 
 
 def text_of(comparison):
@@ -324,7 +324,7 @@ def test_the_command_prints_text_json_and_markdown(command):
         (["near"], "found 3 runs of one configuration"),
         (["near@latest"], "found one run"),
         (["near", "far", "--at", "middle"], "expected last, best, area"),
-        (["near", "far", "--target", "finish_percent"], "expected METRIC=LEVEL"),
+        (["near", "far", "--target", "success_percent"], "expected METRIC=LEVEL"),
         (["near", "far", "--target", "finish=80"], "expected one of"),
         (["near", "far", "--by", "tables"], "expected two values"),
         (["near", "nobody"], "nobody"),

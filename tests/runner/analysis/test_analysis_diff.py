@@ -69,7 +69,7 @@ def record(folder):
 def compare(record):
     def compared(*overrides: str) -> RunDiff:
         with open_recording(record()) as a, open_recording(record(*overrides)) as b:
-            return diff(a, b, {"finish_percent": 1.0})
+            return diff(a, b, {"success_percent": 1.0})
 
     return compared
 

@@ -248,7 +248,7 @@ def test_another_archive_of_the_same_id_is_left_alone(run, recordings, command):
 def test_a_target_that_cannot_be_written_leaves_nothing(run, recordings, command, tmp_path):
     (tmp_path / "file").write_text("")
     result = command("archive", run.run_id, "--to", tmp_path / "file", "--remove")
-    assert result.exit_code == 1
+    assert result.exit_code == 2
     assert "cannot be written" in result.output
     assert find_run(run.run_id, recordings).status == "finished"
     result = command("archive", run.run_id, "--to", "ftp://host/there")

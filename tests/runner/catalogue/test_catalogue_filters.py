@@ -33,7 +33,7 @@ RUNS = [
         },
         "summary": {}
         if i % 4 == 3
-        else {"episodes": 10 * i, "last_evaluation": {"finish_percent": 12.5 * (i % 9)}},
+        else {"episodes": 10 * i, "last_evaluation": {"success_percent": 12.5 * (i % 9)}},
         "labels": {"tags": [["keep"], ["keep", "fig-3"], []][i % 3], "note": ["", "Look\nhere"][i % 2]},
     }
     for i in range(24)
@@ -137,8 +137,8 @@ def range_leaf(low, high, with_low, with_high):
 leaves = st.one_of(
     number_leaf("seed", lambda run: run["seed"], st.sampled_from([0, 1, 5, 2**63, 2**64 - 1])),
     number_leaf(
-        "finish_percent",
-        lambda run: run["summary"].get("last_evaluation", {}).get("finish_percent"),
+        "success_percent",
+        lambda run: run["summary"].get("last_evaluation", {}).get("success_percent"),
         percents,
     ),
     number_leaf("config.discount", lambda run: run["config"]["discount"], st.sampled_from([0.9, 0.95, 1, 2])),
@@ -265,8 +265,8 @@ def test_a_pattern_of_many_stars_does_not_take_for_ever(folder):
 def test_sizes_and_negative_numbers(folder):
     assert [size_of(text) for text in ("3", "1.5 GB", "10mb", "2T")] == [3, 1.5e9, 1e7, 2e12]
     assert found(folder, 'config.evaluation.every:>"-1"') == {run["run_id"] for run in RUNS}
-    assert found(folder, "finish_percent:[-1 TO 1]") == {
+    assert found(folder, "success_percent:[-1 TO 1]") == {
         run["run_id"]
         for run in RUNS
-        if run["summary"].get("last_evaluation", {"finish_percent": math.nan})["finish_percent"] <= 1
+        if run["summary"].get("last_evaluation", {"success_percent": math.nan})["success_percent"] <= 1
     }

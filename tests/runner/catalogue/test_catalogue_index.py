@@ -75,7 +75,7 @@ def test_it_says_what_the_folder_says(folder, recorded):
     summary = run.summary
     assert (row["id"], row["name"], row["seed"], row["status"]) == (run.run_id, "tiny", 1, "finished")
     assert (row["digest"], row["episodes"]) == (summary["content_digest"], 4)
-    assert row["finish_percent"] == summary["last_evaluation"]["finish_percent"]
+    assert row["success_percent"] == summary["last_evaluation"]["success_percent"]
     assert row["steps"] == summary["train_steps"] + summary["eval_steps"]
     assert row["bytes"] == run.recording.stat().st_size
     assert (row["mode"], row["environment"]) == ("cooperative", "dualtaxi:DualTaxi-v1")
@@ -258,13 +258,13 @@ def test_odd_values_do_no_harm(folder):
         "summary": {
             "episodes": "many",
             "train_steps": True,
-            "last_evaluation": {"finish_percent": float("nan")},
+            "last_evaluation": {"success_percent": float("nan")},
         },
     }
     (folder / "odd").mkdir(parents=True)
     (folder / "odd" / RUN_FILE).write_text(json.dumps(odd))
     (row,) = rows(folder)[0]
-    assert (row["id"], row["seed"], row["episodes"], row["finish_percent"]) == ("odd", 2**64 - 1, None, None)
+    assert (row["id"], row["seed"], row["episodes"], row["success_percent"]) == ("odd", 2**64 - 1, None, None)
     assert len(row["name"]) <= 4000
     assert list_runs(folder)[0].recording.parent == folder / "odd"
     assert ids(folder, "seed:18446744073709551615") == ["odd"]

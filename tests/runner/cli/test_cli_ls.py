@@ -16,7 +16,7 @@ def test_json_lists_the_runs(recorded, recorded_run):
     assert (told["name"], told["config"], told["seed"]) == ("tiny", "tiny", 3)
     assert (told["status"], told["episodes"], told["episodes_to_do"]) == ("finished", 30, 30)
     assert told["bytes"] == recorded_run.recording.stat().st_size
-    assert told["finish_percent"] == recorded_run.summary["last_evaluation"]["finish_percent"]
+    assert told["success_percent"] == recorded_run.summary["last_evaluation"]["success_percent"]
 
 
 def test_text_lists_the_runs(recorded, recorded_run):

@@ -76,7 +76,7 @@ NAMES = [
 def _record(events, episode=50_000):
     return {
         "episode": episode,
-        "finish_percent": 98.5,
+        "success_percent": 98.5,
         "mean_length": 1500.0,
         "mean_penalties": 1499.9,
         "events": events,
@@ -111,7 +111,7 @@ def test_successes_are_told_apart_and_other_events_summed():
 
 
 def test_an_environment_without_events():
-    record = _record({}) | {"finish_percent": None, "training": {"percent_filled": {"agent": 12.34}}}
+    record = _record({}) | {"success_percent": None, "training": {"percent_filled": {"agent": 12.34}}}
     *_, line = _lines([record], [], 80)
     assert line.split() == ["50,000", "–", "1,500.0", "1,499.9", "12.3"]
 

@@ -32,7 +32,7 @@ def test_json_is_a_line_for_each_run(command, tiny):
         assert line.keys() == PROMISED | BESIDES
         assert line["last_evaluation"].keys() == {
             "episode",
-            "finish_percent",
+            "success_percent",
             "mean_length",
             "mean_penalties",
         }
@@ -165,7 +165,7 @@ def test_without_evaluation(command, tiny):
 def test_where_success_is_unknown_it_is_null(command, tiny):
     env = "env={id: tests.runner.corridor:Corridor-v0}"
     words = ("run", tiny, "--set", env, "--set", "mode=cooperative")
-    assert command.json(*words)["last_evaluation"]["finish_percent"] is None
+    assert command.json(*words)["last_evaluation"]["success_percent"] is None
     assert "–" in command(*words).stdout
 
 

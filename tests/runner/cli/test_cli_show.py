@@ -38,7 +38,7 @@ def test_json_has_the_whole_series(recorded):
     assert [evaluation["episode"] for evaluation in told["eval"]] == [0, 10, 20, 30]
     for evaluation in told["eval"]:
         assert evaluation["trials"] == 5
-        assert 0 <= evaluation["finish_percent"] <= 100
+        assert 0 <= evaluation["success_percent"] <= 100
         assert 1 <= evaluation["mean_length"] <= 40
         assert evaluation["mean_returns"].keys() == {"taxi_1", "taxi_2"}
         assert {

@@ -83,7 +83,7 @@ def test_loops_of_one_seed_are_all_drawn_unless_they_are_the_same():
 def test_every_metric_of_the_tutorial_and_every_event_has_a_panel(pictured):
     panels = panels_of(groups_of(series(pictured("taxis"))))
     metrics = {panel.metric for panel in panels}
-    assert {"finish_percent", "mean_length", "mean_penalties", "training.mean_length"} <= metrics
+    assert {"success_percent", "mean_length", "mean_penalties", "training.mean_length"} <= metrics
     assert {"training.percent_filled", "training.reward", "event.pickup", "event.collision"} <= metrics
     shares = next(panel for panel in panels if panel.metric == "training.reward")
     totals = sum(np.interp(shares.curves[0].episodes, c.episodes, c.median) for c in shares.curves)
@@ -169,7 +169,7 @@ def test_a_missing_package_is_named(pictured, tmp_path, monkeypatch):
 
 def test_where_success_is_unknown_there_is_no_panel_of_it(pictured):
     metrics = {panel.metric for panel in panels_of(groups_of(series(pictured("corridor"))))}
-    assert "finish_percent" not in metrics
+    assert "success_percent" not in metrics
     assert "mean_length" in metrics
 
 

@@ -197,8 +197,8 @@ def test_every_metric_is_there(exported):
         [row["eval_mean_length"]] for row in metrics
     ]
     if metrics[0]["successes"] >= 0:
-        finished = [[row["finish_percent"]] for row in metrics]
-        assert exported.table("/eval/metrics/finish_percent")["Scalars:scalars"] == finished
+        finished = [[row["success_percent"]] for row in metrics]
+        assert exported.table("/eval/metrics/success_percent")["Scalars:scalars"] == finished
     names = ["filled_percent", "epsilon", "step_size", "discount", "episode_length", "penalties", "returns"]
     for name in [*names, "reward_percent"]:
         assert exported.table(f"/train/metrics/{name}")["Scalars:scalars"]

@@ -114,7 +114,7 @@ def assert_measures(run, metrics):
     named = {
         name: value for phase, step, _, name, value in expected if (phase, step) == ("eval", last["step"])
     }
-    assert named["finish_percent"] == last["finish_percent"]
+    assert named["success_percent"] == last["success_percent"]
     assert named["mean_return/taxi_2"] == last["mean_returns"][1]
     assert named["training/percent_filled/taxi_1"] == last["percent_filled"][0]
     assert named["exact/value/taxi_1"] == exact["values"][0]
@@ -360,7 +360,7 @@ def test_the_layout_for_foxglove_names_what_a_recording_has(taxis):
                 name, _, field = path["value"].partition(".")
                 topic = topics[name]
                 field, _, index = field.partition("[")
-                (described,) = (one for one in topic.message.fields if one.name == field)
+                (described,) = (one for one in topic.message.fields if one.stored_name == field)
                 assert bool(index) == described.repeated, path
                 assert recording.count(topic)
             if "topicToRender" in panel:

@@ -101,7 +101,7 @@ def expected(mdp, policy, state, t=0, succeeded=False):
 def said(outcome):
     return np.array(
         [
-            outcome.finish_percent / 100,
+            outcome.success_percent / 100,
             outcome.timeout_percent / 100,
             *(outcome.mean_length, outcome.mean_penalties, *outcome.mean_returns),
         ]
@@ -250,7 +250,7 @@ def test_matching_pennies_the_even_policy_cannot_be_exploited_and_any_other_can(
 def test_random_taxis_deliver_in_five_of_six_episodes():
     mdp = load_mdp("dualtaxi:DualTaxi-v1", {}, None)
     outcome = evaluate_stochastic_policy(mdp, random_policy(mdp), 1, DISCOUNT)
-    assert outcome.finish_percent == pytest.approx(83.3386, abs=1e-4)
+    assert outcome.success_percent == pytest.approx(83.3386, abs=1e-4)
     assert outcome.mean_length == pytest.approx(687.396, abs=1e-3)
 
 
@@ -302,7 +302,7 @@ def test_the_best_two_taxis_deliver_every_passenger():
     mdp = load_mdp("dualtaxi:DualTaxi-v1", {}, None)
     values = optimal_values(mdp, DISCOUNT)
     outcome = evaluate_policy(mdp, greedy_policy(mdp, DISCOUNT, values), 1, DISCOUNT)
-    assert (outcome.starts, outcome.finish_percent, outcome.timeout_percent) == (2880, 100.0, 0.0)
+    assert (outcome.starts, outcome.success_percent, outcome.timeout_percent) == (2880, 100.0, 0.0)
     assert outcome.values[0] == pytest.approx(mdp.start @ values, abs=1e-9)
 
 
@@ -319,7 +319,7 @@ def test_the_random_baseline_is_computed_once_and_a_damaged_cache_is_not_believe
     monkeypatch.setattr(baseline, "_remembered", OrderedDict())
     computed = baseline.random_baseline(mdp)
     (file,) = tmp_path.rglob("*.json")
-    for damage in ("", "{}", '{"mean_length": "1", "mean_return": 1.0, "finish_percent": 1.0}'):
+    for damage in ("", "{}", '{"mean_length": "1", "mean_return": 1.0, "success_percent": 1.0}'):
         file.write_text(damage)
         baseline._remembered.clear()
         assert baseline.random_baseline(mdp) == computed

@@ -41,7 +41,7 @@ KEYS = (
 SUMMARY = ("train_steps", "eval_steps", "episodes", "seconds", "bytes", "content_digest", "topic_digests")
 SUMMARY += ("messages", "last_evaluation", "error", "steps_recorded", "recent_training", "logged")
 CONFIG = ("name", "episodes", "env", "evaluation", "tables", "rewards", "seeds")
-EVALUATION = ("finish_percent", "mean_length", "mean_penalties", "episode")
+EVALUATION = ("success_percent", "mean_length", "mean_penalties", "episode")
 
 
 def mutations(facts):

@@ -107,11 +107,11 @@ def test_a_range_beyond_the_end_is_empty_and_one_too_long_refused(client):
 
 def test_metrics_are_whole_or_say_that_they_are_thinned(client, recording):
     curves = client.get(f"{RUN}/metrics").json()["curves"]
-    finish = next(curve for curve in curves if curve["metric"] == "finish_percent")
-    recorded = [record["finish_percent"] for record in recording.metrics("eval")]
+    finish = next(curve for curve in curves if curve["metric"] == "success_percent")
+    recorded = [record["success_percent"] for record in recording.metrics("eval")]
     assert finish["values"] == recorded
     assert not finish["thinned"]
-    asked = {"points": 2, "metric": "finish_percent"}
+    asked = {"points": 2, "metric": "success_percent"}
     (thin,) = client.get(f"{RUN}/metrics", params=asked).json()["curves"]
     assert thin["thinned"]
     assert thin["of"] == len(recorded)
@@ -130,8 +130,8 @@ def test_plots_are_pictures(client):
 
 def test_diff_and_compare_are_those_of_the_commands(client, recordings):
     place = ("--json", "--recordings", str(recordings))
-    diff = client.get("/api/v1/diff", params={"a": "first", "b": "second", "target": "finish_percent=1"})
-    assert diff.json() == _printed("diff", "first", "second", "--target", "finish_percent=1", *place, code=1)
+    diff = client.get("/api/v1/diff", params={"a": "first", "b": "second", "target": "success_percent=1"})
+    assert diff.json() == _printed("diff", "first", "second", "--target", "success_percent=1", *place, code=1)
     asked = {"run": ["first", "second"], "by": "name"}
     compared = client.get("/api/v1/compare", params=asked).json()
     assert compared == _printed("compare", "first", "second", "--by", "name", *place)

@@ -78,7 +78,7 @@ def test_a_disk_that_is_too_small_is_told_before_anything_runs(type_in, file, mo
 
 
 def test_a_level_that_is_never_reached_is_never(type_in, file, tmp_path):
-    objective = {"metric": "finish_percent", "at": "first_over", "level": 101, "direction": "minimize"}
+    objective = {"metric": "success_percent", "at": "first_over", "level": 101, "direction": "minimize"}
     path = str(file(strategy="random", trials=1, seeds=[0], objective=objective))
     assert "never in trial 0" in type_in(path, "--workers", "1").stdout
     assert json.loads(type_in(path, "--resume", "--json").stdout)["best"]["value"] is None
@@ -86,7 +86,7 @@ def test_a_level_that_is_never_reached_is_never(type_in, file, tmp_path):
     type_in("show", "small", "--best", str(best))
     assert ": never, the median" in best.read_text()
     plotted = CliRunner().invoke(cli, ["plot", "small", "--recordings", str(tmp_path / "runs")])
-    assert "none of its 1 finished trials came to finish_percent, first at 101" in plotted.output
+    assert "none of its 1 finished trials came to success_percent, first at 101" in plotted.output
 
 
 def test_an_unknown_sweep_is_told_with_the_nearest(type_in, file):

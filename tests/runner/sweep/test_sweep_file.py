@@ -75,7 +75,7 @@ def test_an_unknown_parameter_is_told_with_its_place_and_the_nearest_name(file):
         ({"trials": None}, "tpe has no end"),
         ({"objectiv": {}}, "unknown key. Did you mean 'objective'?"),
         (
-            {"objective": {"metric": "finish_percent", "at": "first_over"}},
+            {"objective": {"metric": "success_percent", "at": "first_over"}},
             "expected a number: at is first_over",
         ),
         ({"base": BASE | {"episods": 5}}, "episods: unknown key"),
@@ -109,7 +109,7 @@ def test_what_is_shipped_is_found():
 
 def test_an_objective_that_is_never_recorded_is_refused_with_what_there_is():
     for metric, expected in (
-        ("finish_procent", "Did you mean 'finish_percent'?"),
+        ("finish_procent", "Did you mean 'success_percent'?"),
         ("exact.value", "evaluation: {exact: true}"),
     ):
         with pytest.raises(Exception, match="never recorded") as caught:

@@ -117,14 +117,14 @@ def test_exact_measures_belong_to_their_own_evaluation(done, monkeypatch):
     folder, *_ = done
     recording_path = next(folder.glob("*/recording.mcap"))
     measures = [
-        {"evaluation": number, "finish_percent": 10.0 * number, "optimal_finish_percent": 100.0}
+        {"evaluation": number, "success_percent": 10.0 * number, "optimal_success_percent": 100.0}
         | {"mean_length": 1.0, "optimal_mean_length": 1.0, "optimal_value": 1.0}
         | {"values": [0.5], "best_responses": [0.5]}
         for number in range(4)
     ]
     monkeypatch.setattr(Recording, "optimality", lambda _: iter(measures[1:]))
     with open_recording(recording_path) as recording:
-        assert curve_of(recording, "exact.finish_percent") == {20: 10.0, 40: 20.0, 60: 30.0}
+        assert curve_of(recording, "exact.success_percent") == {20: 10.0, 40: 20.0, 60: 30.0}
 
 
 def test_tpe_tries_no_values_twice_while_there_are_others():

@@ -75,7 +75,7 @@ def test_ls_and_show_have_the_returns_of_a_loop_and_what_it_logged(folder, name)
     assert row["mean_return"] == pytest.approx(trials["returns"].sum(axis=1).mean())
     assert row["mean_length"] == pytest.approx(trials["length"].mean())
     assert row["logged"].keys() == {"loss"}
-    assert (row["finish_percent"] is None) == (name != "lake")
+    assert (row["success_percent"] is None) == (name != "lake")
     listed = dualtaxi(folder, "ls", "--columns", "name,mean_return,logged", name).stdout
     assert f"{row['mean_return']:,.1f}" in listed
     assert f"loss {row['logged']['loss']:.4g}" in listed
