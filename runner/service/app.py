@@ -20,6 +20,7 @@ from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
 from runner.service.kept import Kept
 from runner.service.logs import LOG, AccessLog
+from runner.service.played import load_sweep_libraries
 from runner.service.problems import answer_errors, answers
 from runner.service.processes import ProcessPool
 from runner.service.receiving.model import Upload, UploadLimits
@@ -28,15 +29,13 @@ from runner.service.security import Tokens
 from runner.service.sessions import Sessions
 from runner.service.settings import Settings
 from runner.service.work import Jobs
+from runner.sweep.state import sweeps_in
 
 API: Final = "/api/v1"
 THREADS: Final = 8
 """Requests that are worked on at the same time; the others wait."""
 PROCESSES: Final = 2
 """Comparisons, pictures and exports that are made at the same time, each in a process of its own."""
-
-SWEEP_SECONDS: Final = 60.0
-"""How long a process for a sweep's page is kept: loading SciPy, scikit-learn and Matplotlib takes seconds."""
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -129,8 +128,10 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
             ProcessPool(PROCESSES, settings.limits.work_seconds, settings.limits.work_bytes)
         )
         app.state.sweep_processes = stack.enter_context(
-            ProcessPool(PROCESSES, settings.limits.work_seconds, settings.limits.work_bytes, SWEEP_SECONDS)
+            ProcessPool(1, settings.limits.work_seconds, settings.limits.work_bytes, keep_seconds=None)
         )
+        if any(sweeps_in(folder) for folder in settings.recordings):
+            app.state.sweep_processes.submit(load_sweep_libraries)
         LOG.info("started", extra=settings.told())
         yield {}
         app.state.stopping.set()

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import json
+import os
+import sys
+import threading
+from collections.abc import Sequence
 from dataclasses import asdict
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,6 +19,7 @@ from runner.runs import Run
 from runner.service.settings import without_folders
 
 if TYPE_CHECKING:
+    from runner.analysis.sections import Section
     from runner.sweep.results import Results
 
 BEHIND: Final = 1
@@ -119,32 +127,68 @@ def spot(run: Run, at: tuple[int, ...]) -> bytes:
     return str(with_spot(run, Request(), at or None).time).encode()
 
 
-def sweep_results(name: str, recordings: Path) -> bytes:
-    """Return what came of a sweep, as JSON: sections as `dualtaxi sweep show` prints them, and the runs."""
-    from runner.sweep.results import results_of, sections
+def load_sweep_libraries() -> None:
+    """Import what the pages of sweeps need, in a thread that gives way to all others where that is possible.
+
+    SciPy, scikit-learn and Optuna take seconds to load, which nobody should have to wait for.
+    """
+
+    def load() -> None:
+        if sys.platform == "linux":  # elsewhere a priority is that of a whole process
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+        for module in ("scipy.stats", "sklearn.tree", "optuna.samplers", "runner.sweep.results"):
+            with contextlib.suppress(ImportError):  # whoever needs it says what to install
+                importlib.import_module(module)
+
+    thread = threading.Thread(target=load)
+    thread.start()
+    thread.join()
+
+
+@lru_cache(maxsize=1)
+def _results(name: str, recordings: Path, digest: str) -> Results:  # noqa: ARG001
+    """Return what came of a sweep; the digest tells its states apart."""
+    from runner.sweep.results import results_of
     from runner.sweep.state import read_sweep
 
-    results = results_of(read_sweep(name, recordings), recordings)
+    return results_of(read_sweep(name, recordings), recordings)
+
+
+def sweep_results(name: str, recordings: Path, digest: str) -> bytes:
+    """Return the ranking of a sweep, as JSON: sections as `dualtaxi sweep show` prints them, and the runs."""
+    from runner.sweep.results import ranking_sections
+
+    results = _results(name, recordings, digest)
     told = {
-        "sections": [
-            asdict(section) | {"sentences": [without_folders(text, recordings) for text in section.sentences]}
-            for section in sections(results, None)
-        ],
+        "sections": _told_sections(ranking_sections(results, None), recordings),
         "runs": {entry.number: entry.runs for entry in results.ranking},
         "best": results.best_yaml,
     }
     return json.dumps(told, default=str).encode()
 
 
-def sweep_pictures(name: str, recordings: Path) -> bytes:
+def sweep_importance(name: str, recordings: Path, digest: str) -> bytes:
+    """Return what mattered in a sweep, as JSON: the section that `dualtaxi sweep show` prints, if any."""
+    from runner.sweep.results import effects_sections
+
+    sections = effects_sections(_results(name, recordings, digest))
+    return json.dumps({"sections": _told_sections(sections, recordings)}, default=str).encode()
+
+
+def _told_sections(sections: Sequence[Section], recordings: Path) -> list[dict[str, Any]]:
+    return [
+        asdict(section) | {"sentences": [without_folders(text, recordings) for text in section.sentences]}
+        for section in sections
+    ]
+
+
+def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
     """Return the pictures of a sweep, as JSON: its parameters, and how some of its trials learned."""
     from runner.errors import RunnerError
     from runner.sweep.figure import parallel_svg, parameter_svgs
     from runner.sweep.plots import picture_of
-    from runner.sweep.results import results_of
-    from runner.sweep.state import read_sweep
 
-    results = results_of(read_sweep(name, recordings), recordings)
+    results = _results(name, recordings, digest)
     pictures, note = [], ""
     try:
         picture = picture_of(results)

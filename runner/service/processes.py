@@ -62,10 +62,13 @@ class ProcessPool:
         processes: how many run at the same time.
         seconds: a call that takes longer is killed.
         memory_bytes: how much a call may allocate; not limited on Windows.
-        keep_seconds: how long an idle process is kept for the next call; 0: a process serves one call.
+        keep_seconds: how long an idle process is kept for the next call; 0: a process serves one call; None:
+            it is kept until the pool is closed.
     """
 
-    def __init__(self, processes: int, seconds: float, memory_bytes: int, keep_seconds: float = 0.0) -> None:
+    def __init__(
+        self, processes: int, seconds: float, memory_bytes: int, keep_seconds: float | None = 0.0
+    ) -> None:
         self.seconds = seconds
         self._memory_bytes, self._keep_seconds = memory_bytes, keep_seconds
         self._context = _context()
@@ -140,7 +143,7 @@ class ProcessPool:
         is_reusable = False
         try:
             kind, result = child.call((function, args, keywords), self.seconds)
-            is_reusable = kind != "memory" and self._keep_seconds > 0
+            is_reusable = kind != "memory" and self._keep_seconds != 0
         finally:
             if is_reusable:
                 self._keep(child)
@@ -185,6 +188,8 @@ class ProcessPool:
             self._idle.append(child)
             child.uses += 1
             uses = child.uses
+        if self._keep_seconds is None:
+            return
         timer = threading.Timer(self._keep_seconds, self._end_idle, (child, uses))
         timer.daemon = True
         timer.start()

@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -56,9 +57,28 @@ class Results:
     """How many there are to be."""
     ranking: list[Ranked]
     """The finished ones from the best on, then those given up, unfinished, failed and excluded."""
-    effects: list[Effect]
-    """How much each parameter, and each two together, explain of the completed trials; the largest first."""
+    found: list[Trial]
+    """All trials so far, in the order they were suggested."""
     best: Trial | None
+
+    @cached_property
+    def effects(self) -> list[Effect]:
+        """Shares of the variance explained by each parameter and each pair, the largest first.
+
+        Computed when first read: it takes longer than everything else here.
+
+        Raises:
+            MissingExtra: scikit-learn is not installed.
+        """
+        parameters = self.sweep.file.parameters
+        if _is_whole_grid(self.sweep, self.found):
+            return effects_of_grid(parameters, [list(trial.seed_values.values()) for trial in self.found])
+        completed = [
+            (trial.values, trial.value)
+            for trial in self.found
+            if trial.state == "finished" and trial.value is not None and abs(trial.value) < statistics.NEVER
+        ]
+        return effects_of(parameters, [values for values, _ in completed], [value for _, value in completed])
 
     @property
     def best_yaml(self) -> str | None:
@@ -76,19 +96,7 @@ def results_of(sweep: Sweep, recordings: Path) -> Results:
     statistics.require_scipy()
     trials = Trials(sweep)
     found = list(recorded(trials, recordings))
-    completed = [
-        (trial.values, trial.value)
-        for trial in found
-        if trial.state == "finished" and trial.value is not None and abs(trial.value) < statistics.NEVER
-    ]
-    if _is_whole_grid(sweep, found):
-        seed_values = [list(trial.seed_values.values()) for trial in found]
-        effects = effects_of_grid(sweep.file.parameters, seed_values)
-    else:
-        effects = effects_of(
-            sweep.file.parameters, [values for values, _ in completed], [value for _, value in completed]
-        )
-    return Results(sweep, trials.search.trials, ranking(sweep, found), effects, best_of(found, sweep))
+    return Results(sweep, trials.search.trials, ranking(sweep, found), found, best_of(found, sweep))
 
 
 def _is_whole_grid(sweep: Sweep, trials: Sequence[Trial]) -> bool:
@@ -153,20 +161,34 @@ def sections(results: Results, shown: int | None = SHOWN) -> list[Section]:
     Args:
         results: of a sweep.
         shown: how many trials; None for all.
+
+    Raises:
+        MissingExtra: scikit-learn is not installed.
     """
+    return [*ranking_sections(results, shown), *effects_sections(results)]
+
+
+def ranking_sections(results: Results, shown: int | None = SHOWN) -> list[Section]:
+    """Return the ranking and the trials without a value as sections of text; arguments as for `sections`."""
     ranked = results.ranking[:shown]
     grid = _ranking_grid(results.sweep, ranked)
     found = [Section(f"Sweep {results.sweep.name}", _heading(results, len(ranked)), [grid])]
     for state, title in (("failed", "Failed"), ("excluded", "Left out: these values do not go together")):
         told = _errors([entry for entry in results.ranking if entry.state == state])
         found += [Section(title, told)] if told else []
-    if results.effects:
-        found.append(_effects(results))
     return found
 
 
-def _effects(results: Results) -> Section:
-    """Return main effects and interactions as a table; small interactions are left out."""
+def effects_sections(results: Results) -> list[Section]:
+    """Return main effects and interactions as a table; none if too little is known.
+
+    Small interactions are left out.
+
+    Raises:
+        MissingExtra: scikit-learn is not installed.
+    """
+    if not results.effects:
+        return []
     shown = [
         effect for effect in results.effects if len(effect.parameters) == 1 or effect.share >= SMALLEST_SHOWN
     ]
@@ -199,7 +221,7 @@ def _effects(results: Results) -> Section:
     ]
     left_out = len(results.effects) - len(shown)
     said += [f"{left_out} pairs of less than {100 * SMALLEST_SHOWN:.0f} % are left out."] if left_out else []
-    return Section("What mattered", said, [Grid(("parameter", "", "share", "95 %"), rows)])
+    return [Section("What mattered", said, [Grid(("parameter", "", "share", "95 %"), rows)])]
 
 
 def _errors(entries: Sequence[Ranked]) -> list[str]:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 from runner.archive.places import at_hand
 from runner.config import from_mapping
 from runner.environments import load_mdp
-from runner.errors import RunnerError
+from runner.errors import RecordingError, RunnerError
 from runner.execution import Progress, run_job
 from runner.finding import find_run
 from runner.job import Job
@@ -130,17 +130,27 @@ def result_of(run: Run, objective: Objective) -> Result:
     Raises:
         RunnerError: its recording cannot be read, or the objective was never recorded.
     """
-    with open_recording(at_hand(run).recording) as recording:
-        curve = curve_of(recording, objective.metric)
-        size = recording.size
+    path = at_hand(run).recording
+    try:
+        facts = path.stat()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+    curve = dict(_curve_of(path, facts.st_size, facts.st_mtime_ns, objective.metric))
     return Result(
         "pruned" if PRUNED in run.tags else "finished",
         run.run_id,
         curve,
         run.summary.content_digest or "",
-        size,
+        facts.st_size,
         run.summary.seconds or 0.0,
     )
+
+
+@lru_cache(maxsize=4096)
+def _curve_of(path: Path, size: int, modified: int, metric: str) -> Curve:  # noqa: ARG001
+    """Return the readings of a recording; size and time tell its states apart."""
+    with open_recording(path) as recording:
+        return curve_of(recording, metric)
 
 
 def _run(task: Task, stop: Callable[[], bool]) -> Run:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
@@ -30,6 +29,8 @@ from runner.sweep.state import folder_of, read_sweep, sweeps_in, tag_of
 router = APIRouter(prefix="/sweeps", include_in_schema=False)
 
 Name = Annotated[str, InPath(max_length=100)]
+Part = Literal["results", "importance", "pictures"]
+"""Parts of a page in the order in which they are computed, the fastest first."""
 
 
 @router.get("")
@@ -69,14 +70,10 @@ async def sweep(
 ) -> Response:
     """Show what came of a sweep: at once, with what is not ready yet announced in its place."""
     seen = await run_in_threadpool(_look, name, settings.recordings, catalogue)
-    results: bytes | None
-    pictures: bytes | None
-    if whole:
-        results, pictures = await asyncio.gather(
-            _made(seen, "results", kept, apart), _made(seen, "pictures", kept, apart)
-        )
-    else:
-        results, pictures = (kept.found((part, seen)) for part in ("sweep results", "sweep pictures"))
+    parts: dict[str, str | None] = {}
+    for part, render in _RENDERERS.items():
+        body = await _made(seen, part, kept, apart) if whole else kept.found((f"sweep {part}", seen))
+        parts[part] = await run_in_threadpool(render, body) if body else None
 
     def shown() -> Response:
         made_by = [job for job in jobs.queue.jobs() if job.kind == "sweep" and job.name == name]
@@ -88,31 +85,20 @@ async def sweep(
             runs=seen.runs,
             parameters=list(read_sweep(name, seen.folder).file.parameters),
             job=shown_job(made_by[-1], jobs) if made_by else None,
-            results=_results_html(results) if results else "",
-            pictures=_pictures_html(pictures) if pictures else "",
+            parts=parts,
         )
 
     return await run_in_threadpool(shown)
 
 
-@router.get("/{name}/results")
-async def results(
-    name: Name, settings: SettingsOf, catalogue: CatalogueOf, kept: KeptOf, apart: SweepProcesses
+@router.get("/{name}/{part}")
+async def sweep_part(
+    name: Name, part: Part, settings: SettingsOf, catalogue: CatalogueOf, kept: KeptOf, apart: SweepProcesses
 ) -> Response:
-    """Return the comparison of a sweep's trials, as a part of its page."""
+    """Return a part of a sweep's page: the ranking, what mattered, or the pictures."""
     seen = await run_in_threadpool(_look, name, settings.recordings, catalogue)
-    body = await _made(seen, "results", kept, apart)
-    return HTMLResponse(await run_in_threadpool(_results_html, body))
-
-
-@router.get("/{name}/pictures")
-async def pictures(
-    name: Name, settings: SettingsOf, catalogue: CatalogueOf, kept: KeptOf, apart: SweepProcesses
-) -> Response:
-    """Return the pictures of a sweep, as a part of its page."""
-    seen = await run_in_threadpool(_look, name, settings.recordings, catalogue)
-    body = await _made(seen, "pictures", kept, apart)
-    return HTMLResponse(await run_in_threadpool(_pictures_html, body))
+    body = await _made(seen, part, kept, apart)
+    return HTMLResponse(await run_in_threadpool(_RENDERERS[part], body))
 
 
 # --- inside -------------------------------------------------------------------------------------------
@@ -150,12 +136,18 @@ def _look(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _Seen:
 
 async def _made(seen: _Seen, part: str, kept: Kept, apart: ProcessPool) -> bytes:
     """Return a part of a sweep's page as data, made by a child process unless it is kept."""
-    make = played.sweep_results if part == "results" else played.sweep_pictures
-    return await kept.awaited((f"sweep {part}", seen), lambda: apart(make, seen.name, seen.folder), ALWAYS)
+    make = _MAKERS[part]
+    return await kept.awaited(
+        (f"sweep {part}", seen), lambda: apart(make, seen.name, seen.folder, seen.digest), ALWAYS
+    )
 
 
 def _results_html(body: bytes) -> str:
     return templates().get_template("sweep_results.html").render(told=json.loads(body))
+
+
+def _importance_html(body: bytes) -> str:
+    return templates().get_template("sweep_importance.html").render(told=json.loads(body))
 
 
 def _pictures_html(body: bytes) -> str:
@@ -164,6 +156,14 @@ def _pictures_html(body: bytes) -> str:
         panel["address"] = picture_address(panel["svg"])
     pictures = [picture_address(picture) for picture in told["pictures"]]
     return templates().get_template("sweep_pictures.html").render(told=told, pictures=pictures)
+
+
+_MAKERS: Final = {
+    "results": played.sweep_results,
+    "importance": played.sweep_importance,
+    "pictures": played.sweep_pictures,
+}
+_RENDERERS: Final = {"results": _results_html, "importance": _importance_html, "pictures": _pictures_html}
 
 
 def _runs_tagged(catalogue: Catalogue, name: str) -> int:
