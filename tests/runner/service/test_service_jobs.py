@@ -162,7 +162,10 @@ def test_a_sweep_is_done_and_may_use_the_workers_that_nobody_waits_for(client, s
     table = client.get("/sweeps/small/results").text
     assert all(f'href="/runs/{run.run_id}"' in table for run in runs)
     # The index notices a little later that the last runs are over, and then the page is made once more.
-    until(lambda: client.get("/sweeps/small?whole=true").text == client.get("/sweeps/small").text)
+    until(
+        lambda same: same,
+        lambda: client.get("/sweeps/small?whole=true").text == client.get("/sweeps/small").text,
+    )
     page = client.get("/sweeps/small").text
     assert 'alt="Length of evaluation trials over training episodes"' in page
     assert table in page
