@@ -150,6 +150,10 @@ class Recorder:
         already = self._past.remaining(topic)
         return free[:already] if already else free
 
+    def capacity(self, topic: Topic) -> int:
+        """Return how many records a whole block of a fixed-width topic has."""
+        return self._lanes[topic].capacity
+
     def commit(self, phase: str, steps: int, episodes: int) -> None:
         """Say how many records of the phase's blocks were filled; closes what is full or old.
 

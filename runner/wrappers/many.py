@@ -7,6 +7,7 @@ import os
 import random
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from numbers import Integral
 from typing import Any
 
@@ -20,7 +21,8 @@ from runner.wrappers.described import Described, describe, kind_of
 from runner.wrappers.loop import Loop
 from runner.wrappers.plan import plan_of
 from runner.wrappers.single import Recorded, given
-from runner.wrappers.staged import AgentRows, VectorRows
+from runner.wrappers.staged import AgentRows
+from runner.wrappers.vector import VectorRows
 
 
 class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any]):
@@ -30,23 +32,25 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
 
     def __init__(self, env: VectorEnv[Any, Any, Any], loop: Loop[VectorRows], mode: AutoresetMode) -> None:
         VectorWrapper.__init__(self, env)
-        self._mode = mode
-        self._over = np.zeros(env.num_envs, np.bool_)
+        self._has_finals = mode == AutoresetMode.SAME_STEP
         self._own(loop)
-        self._enter("train")
+        self._phase, self._rows = "train", loop.rows("train")
+
+    def _enter(self, phase: str) -> None:
+        with self._loop.lock:
+            over = self._rows.over
+            super()._enter(phase)
+            self._rows.over = over  # the environments are the same ones
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Take a step in every environment, and record it."""
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
-        ended, cut = np.array(terminated, np.bool_), np.array(truncated, np.bool_)
-        next_step = self._mode == AutoresetMode.NEXT_STEP
-        only_reset = self._over if next_step else np.zeros_like(self._over)
-        final = _final_observations(infos) if self._mode == AutoresetMode.SAME_STEP else None
+        final = _final_observations(infos) if self._has_finals else None
         with self._loop.lock:
-            self._loop.activate(self._rows)
-            self._rows.take(actions, observations, rewards, ended, cut, only_reset, final)
-        self._over = ended | cut
+            if self._loop.active is not self._rows:
+                self._loop.activate(self._rows)
+            self._rows.take(actions, observations, rewards, terminated, truncated, final)
         if self._loop.plan.info:
             self._loop.info(self._phase, _by_environment(infos))
         return result
@@ -63,7 +67,6 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
         with self._loop.lock:
             self._loop.activate(self._rows)
             self._rows.reset(result[0], seeds, which)
-        self._over = self._over & ~which
         self._loop.reset_info(self._phase, _by_environment(result[1]), asked, None)
         return result
 
@@ -111,7 +114,8 @@ def record_vector(
     described = _described_vector(envs)
     _require_fixed(described)
     plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
-    return RecordedVector(envs, Loop(described, plan, VectorRows), mode)
+    rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
+    return RecordedVector(envs, Loop(described, plan, rows), mode)
 
 
 def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str | None) -> AutoresetMode:

@@ -1,7 +1,8 @@
-"""Steps of several environments at once, or of several agents: put down whole, as they come.
+"""What vector environments and games of several agents have in common: records of episodes and resets.
 
 Where a vector environment steps N environments at once, N records follow one another: number n of a
-phase is of environment n modulo N.
+phase is of environment n modulo N. `AgentRows` records the steps of games, `vector.VectorRows` those of
+vector environments.
 """
 
 from __future__ import annotations
@@ -18,18 +19,17 @@ from runner.recording import schema
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
 from runner.wrappers.described import Described, parts_of
-from runner.wrappers.values import Leaf, leaves, put_batch, put_chosen
+from runner.wrappers.values import Leaf, leaves, put_batch
 
 Flags = NDArray[np.bool_]
 
 
 class StagedRows:
-    """How the episodes of one phase stand, in each environment; nothing waits to be committed.
+    """The state of one phase's episodes in each environment, and their records.
 
-    Not thread-safe: whoever calls holds the loop's lock.
+    Not thread-safe: the caller holds the loop's lock.
     """
 
-    filled = 0
     off_table = 0
 
     def __init__(
@@ -45,7 +45,6 @@ class StagedRows:
         self._resets = topics[f"/{phase}/reset"]
         n = described.environments
         self._n = n
-        self._stage = recorder.blank(self._steps, n)
         self._episode = np.zeros(n, np.int64)
         """The number of the episode under way, or to come, in each environment."""
         self._length = np.zeros(n, np.int64)
@@ -54,20 +53,11 @@ class StagedRows:
         self._were_reset = 0
         self._set_leaves(described)
 
-    @property
-    def place(self) -> tuple[int, int]:
-        """The steps of the phase so far, and how many episodes have ended."""
-        return self._recorder.steps[self._phase], self._ended
-
     def open(self) -> None:
-        """Do nothing: no rows wait."""
-
-    def commit(self) -> None:
-        """Do nothing: no rows wait."""
+        """Do nothing: blocks are taken from the recorder when records are complete."""
 
     def reshape(self, described: Described) -> None:
-        """Make room for actions of another dtype; no step was put down yet."""
-        self._stage = self._recorder.blank(self._steps, self._n)
+        """Prepare for actions of another dtype; no step was recorded yet."""
         self._set_leaves(described)
 
     def _set_leaves(self, described: Described) -> None:
@@ -79,37 +69,29 @@ class StagedRows:
             self._is_settled = True
             self._first_action(action)
 
-    def _put_steps(
-        self, rewards: NDArray[Any], only_reset: Flags, terminated: Flags, truncated: Flags
+    def _put_ends(
+        self,
+        last: NDArray[Any],
+        length: NDArray[Any],
+        returns: NDArray[Any],
+        terminated: NDArray[Any],
+        truncated: NDArray[Any],
     ) -> None:
-        """Complete the staged records and hand them on; `only_reset` are those that took no step."""
-        stage, before = self._stage, sum(self._recorder.steps.values())
-        first = self._recorder.steps[self._phase]
-        stage["rewards"] = rewards
-        stage["step"] = first + np.arange(self._n)
-        stage["episode"] = self._episode
-        stage["t"] = np.where(only_reset, schema.NEVER, self._length)
-        stage["terminated"], stage["truncated"] = terminated, truncated
-        self._put(self._steps, stage, np.arange(before + 1, before + self._n + 1))
-        self._recorder.steps[self._phase] += self._n
-        self._length += ~only_reset
-        self._return = np.where(only_reset[:, np.newaxis], 0.0, self._return + rewards)
-        over = terminated | truncated
-        if over.any():
-            self._end(np.flatnonzero(over), terminated, truncated)
+        """Record the ends of episodes, in the order in which they ended; `last` are their last steps."""
+        block = self._recorder.blank(self._episodes, len(last))
+        block["episode"] = self._ended + np.arange(len(last))
+        block["last_step"] = last
+        block["length"] = length
+        block["returns"] = returns
+        block["terminated"], block["truncated"] = terminated, truncated
+        other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
+        self._put(self._episodes, block, last + 1 + other)
+        self._ended += len(last)
 
     def _end(self, which: NDArray[np.intp], terminated: Flags, truncated: Flags) -> None:
         """Record the ends of the episodes under way in these environments; their last steps just came."""
-        block = self._recorder.blank(self._episodes, len(which))
         last = self._recorder.steps[self._phase] - self._n + which
-        block["episode"] = self._ended + np.arange(len(which))
-        block["last_step"] = last
-        block["length"] = self._length[which]
-        block["returns"] = self._return[which]
-        block["terminated"], block["truncated"] = terminated[which], truncated[which]
-        other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
-        self._put(self._episodes, block, last + 1 + other)
-        self._ended += len(which)
+        self._put_ends(last, self._length[which], self._return[which], terminated[which], truncated[which])
         self._episode[which] += 1
         self._length[which] = 0
         self._return[which] = 0.0
@@ -123,17 +105,29 @@ class StagedRows:
 
     def _begin(self, which: NDArray[np.intp], observation: NDArray[Any], seeds: Sequence[int | None]) -> None:
         """Record resets of these environments, with a row of observations and a seed for each."""
+        steps = np.full(len(which), self._recorder.steps[self._phase])
+        self._put_resets(which, observation, seeds, self._episode[which], steps)
+
+    def _put_resets(
+        self,
+        which: NDArray[np.intp],
+        observation: NDArray[Any],
+        seeds: Sequence[int | None],
+        episode: NDArray[Any],
+        steps: NDArray[Any],
+    ) -> None:
+        """Record resets in the order in which they were; `steps` are the steps of the phase before each."""
         block = self._recorder.blank(self._resets, len(which))
-        own = [seeds[i] if len(seeds) else None for i in which.tolist()]
+        kept = [seed if seed is not None and 0 <= seed < 2**64 else None for seed in seeds]
         block["observation"] = observation
         block["reset"] = self._were_reset + np.arange(len(which))
-        block["episode"] = self._episode[which]
-        block["step"] = self._recorder.steps[self._phase]
+        block["episode"] = episode
+        block["step"] = steps
         block["environment"] = which
-        block["seed"] = [seed or 0 for seed in own]
-        block["seeded"] = [seed is not None for seed in own]
-        now = sum(self._recorder.steps.values())
-        self._put(self._resets, block, np.full(len(which), now))
+        block["seed"] = [seed or 0 for seed in kept]
+        block["seeded"] = [seed is not None for seed in kept]
+        other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
+        self._put(self._resets, block, steps + other)
         self._were_reset += len(which)
 
     def _put(self, topic: Topic, records: NDArray[Any], positions: NDArray[Any]) -> None:
@@ -148,91 +142,30 @@ class StagedRows:
             done += n
 
 
-class VectorRows(StagedRows):
-    """The steps of the environments of a vector environment."""
-
-    def __init__(
-        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
-    ) -> None:
-        super().__init__(recorder, described, phase, first_action)
-        self._discrete = described.kind == "step"
-        self._observation, self._action = described.observation, described.action
-        dtype = recorder.blank(self._resets, 1).dtype["observation"]
-        self._seen = np.zeros(self._n, np.dtype([("value", dtype)]))["value"]
-        """What was last observed in each environment."""
-
-    def _set_leaves(self, described: Described) -> None:
-        self._observation_leaves = leaves(
-            parts_of(described.observation, "the observation space"), "observation"
-        )
-        self._action_leaves = leaves(parts_of(described.recorded_action, "the action space"), "action")
-
-    def take(
-        self,
-        action: Any,
-        observation: Any,
-        rewards: Any,
-        terminated: Flags,
-        truncated: Flags,
-        only_reset: Flags,
-        final: Any,
-    ) -> None:
-        """Put down a step of all environments.
-
-        Args:
-            action: batched, as the vector environment takes it.
-            observation: batched, as it gives it.
-            rewards: [N].
-            terminated: [N].
-            truncated: [N].
-            only_reset: [N], environments that ignored their action and were reset instead.
-            final: what was observed last of episodes that ended, where `observation` is already of the
-                next; None where it is not.
-        """
-        self._settle(action)
-        stage, over = self._stage, terminated | truncated
-        now = np.zeros_like(self._seen)
-        put_batch(self._observation_leaves, observation, now, (self._n,))
-        last = now
-        if final is not None and over.any():
-            last = now.copy()
-            put_chosen(self._observation_leaves, final, last, np.flatnonzero(over))
-        if self._discrete:
-            actions = np.asarray(action).astype(np.int64)
-            stage["state"] = self._seen - _start(self._observation)
-            stage["action"] = actions - _start(self._action)
-            stage["next_state"] = last - _start(self._observation)
-        else:
-            put_batch(self._action_leaves, action, stage["action"], (self._n,))
-            stage["next_observation"] = last
-            stage["acted"] = 1
-            stage["agents_terminated"], stage["agents_truncated"] = terminated, truncated
-        if only_reset.any():
-            self._begin(np.flatnonzero(only_reset), now[only_reset], ())
-        paid = np.asarray(rewards, np.float64).reshape(self._n, 1)
-        self._put_steps(paid, only_reset, terminated, truncated)
-        if final is not None and over.any():
-            self._begin(np.flatnonzero(over), now[over], ())
-        self._seen[...] = now
-
-    def reset(self, observation: Any, seeds: Sequence[int | None], which: Flags) -> None:
-        """Put down a reset of some environments; episodes under way in them end by it."""
-        chosen = np.flatnonzero(which)
-        self._abandon(chosen)
-        now = np.zeros_like(self._seen)
-        put_batch(self._observation_leaves, observation, now, (self._n,))
-        self._seen[which] = now[which]
-        self._begin(chosen, now[which], seeds)
-
-
 class AgentRows(StagedRows):
-    """The steps of all agents of a PettingZoo parallel environment."""
+    """Records the steps of all agents of a PettingZoo parallel environment, each as it comes."""
+
+    filled = 0
 
     def __init__(
         self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
     ) -> None:
         super().__init__(recorder, described, phase, first_action)
         self._agents = described.agents
+        self._stage = recorder.blank(self._steps, 1)
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """The steps of the phase so far, and how many episodes have ended."""
+        return self._recorder.steps[self._phase], self._ended
+
+    def commit(self) -> None:
+        """Do nothing: every step was handed to the recorder as it came."""
+
+    def reshape(self, described: Described) -> None:
+        """Prepare for actions of another dtype; no step was recorded yet."""
+        super().reshape(described)
+        self._stage = self._recorder.blank(self._steps, 1)
 
     def _set_leaves(self, described: Described) -> None:
         self._observation_leaves = _by_agent(described.observation, "observation")
@@ -258,11 +191,17 @@ class AgentRows(StagedRows):
         stage["agents_terminated"] = self._mask(terminated)
         stage["agents_truncated"] = self._mask(truncated)
         paid = np.array([[float(rewards.get(agent, 0.0)) for agent in self._agents]])
-        nothing = np.zeros(1, np.bool_)
+        stage["rewards"] = paid
+        stage["step"] = self._recorder.steps[self._phase]
+        stage["episode"], stage["t"] = self._episode, self._length
         ends = [np.array([over and any(flags.values())]) for flags in (terminated, truncated)]
-        self._put_steps(paid, nothing, ends[0], ends[1])
-        if over and not (ends[0] | ends[1]).any():
-            self._abandon(np.zeros(1, np.intp))
+        stage["terminated"], stage["truncated"] = ends
+        self._put(self._steps, stage, np.array([sum(self._recorder.steps.values()) + 1]))
+        self._recorder.steps[self._phase] += 1
+        self._length += 1
+        self._return += paid
+        if over:
+            self._end(np.zeros(1, np.intp), *ends)
 
     def reset(self, observations: Mapping[str, Any], seed: int | None) -> None:
         """Put down a reset; an episode under way ends by it."""
@@ -290,7 +229,3 @@ def _by_agent(space: spaces.Space[Any], what: str) -> dict[str, list[Leaf]]:
     assert isinstance(space, spaces.Dict)
     own = leaves(parts_of(space, "the agents' spaces"), what)
     return {agent: [leaf for leaf in own if leaf.keys[0] == agent] for agent in space.spaces}
-
-
-def _start(space: Any) -> int:
-    return int(space.start)

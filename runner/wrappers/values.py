@@ -97,15 +97,22 @@ def leaves(parts: Sequence[Part], what: str) -> list[Leaf]:
     return [Leaf(part, what) for part in parts]
 
 
-def filler(own: Sequence[Leaf], column: NDArray[Any]) -> Callable[[int, Any], None]:
+def filler(
+    own: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] = ()
+) -> Callable[[int, Any], None]:
     """Return a function that puts a value of a space into a row of a column.
+
+    Args:
+        own: the leaves of the space.
+        column: [rows, *batch] values of the space.
+        batch: the shape of the batch that each value is, if it is one.
 
     Raises:
         RecordingError: (from the returned function) a value is not of its space.
     """
     if len(own) == 1 and not own[0].keys:
-        return _single_filler(own[0], column)
-    fillers = [(leaf, _single_filler(leaf, _within(column, leaf.part))) for leaf in own]
+        return _single_filler(own[0], column, batch)
+    fillers = [(leaf, _single_filler(leaf, _within(column, leaf.part), batch)) for leaf in own]
 
     def put(row: int, value: Any) -> None:
         for leaf, put_leaf in fillers:
@@ -120,17 +127,18 @@ def filler(own: Sequence[Leaf], column: NDArray[Any]) -> Callable[[int, Any], No
     return put
 
 
-def _single_filler(leaf: Leaf, column: NDArray[Any]) -> Callable[[int, Any], None]:
-    base, shape, scalars, array = leaf.base, leaf.shape, leaf.exact_scalars, np.ndarray
+def _single_filler(leaf: Leaf, column: NDArray[Any], batch: tuple[int, ...]) -> Callable[[int, Any], None]:
+    base, shape, array = leaf.base, batch + leaf.shape, np.ndarray
+    scalars = frozenset() if batch else leaf.exact_scalars
 
     def put(row: int, value: Any) -> None:
         kind = value.__class__
         try:
             if kind is array:  # the usual case costs two comparisons
                 if value.dtype is not base or value.shape != shape:
-                    value = leaf.fit(value)
+                    value = leaf.fit(value, batch)
             elif kind not in scalars:
-                value = leaf.fit(value)
+                value = leaf.fit(value, batch)
             column[row] = value
         except (TypeError, ValueError, OverflowError) as error:
             raise leaf.refused(error) from error

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
@@ -214,3 +216,90 @@ def test_an_export_to_rerun_says_that_texts_are_not_drawn(tmp_path):
         list(play(rec, 5))
     with open_recording(rec.run.recording) as recording:
         assert "they are not drawn" in select(recording, Request()).warnings[0]
+
+
+class Tide(gymnasium.Env[Any, Any]):
+    """Episodes, rewards and observations that follow from the seed of the first reset by whole numbers."""
+
+    def __init__(self, is_discrete: bool) -> None:
+        self.observation_space: Any = spaces.Box(-9, 9, (2,), np.float32)
+        self.action_space: Any = spaces.Box(-9, 9, (1,), np.float32)
+        if is_discrete:
+            self.observation_space, self.action_space = (
+                spaces.Discrete(9, start=2),
+                spaces.Discrete(3, start=1),
+            )
+        self._is_discrete = is_discrete
+        self._k = 0
+
+    def _observation(self) -> Any:
+        self._k = (self._k * 75 + 74) % 65537
+        return 2 + self._k % 9 if self._is_discrete else np.array([self._k % 9, -(self._k % 7)], np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self._k += 0 if seed is None else seed
+        return self._observation(), {}
+
+    def step(self, action: Any) -> Any:
+        observation = self._observation()
+        return observation, self._k / 10 - 3000, self._k % 11 == 0, self._k % 13 == 0, {}
+
+
+def tide(folder: Any, is_discrete: bool, mode: AutoresetMode) -> Any:
+    """Return the run of a loop with two phases, resets of some environments, resets of all, logged values."""
+    envs = SyncVectorEnv([lambda: Tide(is_discrete)] * N, autoreset_mode=mode)
+    action = np.array([1, 2, 3]) if is_discrete else np.array([[0.5], [-1], [2]], np.float32)
+    with runner.record_vector(envs, folder, chunk_steps=256) as rec:
+
+        def step(k: int) -> None:
+            _, _, terminated, truncated, _ = rec.step(action)
+            over = terminated | truncated
+            if mode == AutoresetMode.DISABLED and over.any():
+                rec.reset(options={"reset_mask": over if k % 3 else np.ones(N, np.bool_)})
+
+        rec.reset(seed=7)
+        for k in range(400):
+            step(k)
+            if k % 5 == 0:
+                rec.log("k", k)
+            if k % 100 == 50:
+                with rec.phase("eval"):
+                    rec.reset(seed=k)
+                    for i in range(30):
+                        step(i)
+                rec.reset()
+    return rec.run
+
+
+TIDES = {
+    (True, AutoresetMode.NEXT_STEP): "7d1212c6b4beb05409c57d86fc187cb74c08a52ae97aad3486699367c518a535",
+    (True, AutoresetMode.SAME_STEP): "bd62f823f5c74c8a25f457876209f32e5177d1afc086662585805549eebf7b5e",
+    (True, AutoresetMode.DISABLED): "32bcc1d51885b8e685e430665920c6c9eabbffa6f4c7cc24e1b081e6d17c3898",
+    (False, AutoresetMode.NEXT_STEP): "76a3990be866c24b7082ba31f151868c2aff7d45cc46be6fe3bb6bd665a28641",
+    (False, AutoresetMode.SAME_STEP): "3f0fc9f5ea657a96a7502bb9e238cc9826734cffa16289009f7a3f190b1a4cf8",
+    (False, AutoresetMode.DISABLED): "14ddde05557dd75f9bd67ab2d0960a51e84bb87d354e4b4f147821f7d5a4c852",
+}
+"""Content digests by whether spaces are discrete, and how environments reset themselves."""
+
+
+@pytest.mark.parametrize(("is_discrete", "mode"), TIDES)
+def test_a_vector_loop_has_the_content_that_it_always_had(tmp_path, is_discrete, mode):
+    run = tide(tmp_path, is_discrete, mode)
+    assert run.summary["content_digest"] == TIDES[is_discrete, mode]
+    check_integrity(run.recording)
+
+
+def test_values_logged_between_steps_are_placed_among_them(tmp_path):
+    envs = SyncVectorEnv([lambda: Tide(True)] * N)
+    ended, expected = 0, []
+    with runner.record_vector(envs, tmp_path) as rec:
+        rec.reset(seed=3)
+        for k in range(50):
+            _, _, terminated, truncated, _ = rec.step(np.ones(N, np.int64))
+            ended += int((terminated | truncated).sum())
+            rec.log("k", float(k))
+            expected.append(((k + 1) * N, ended))
+    with open_recording(rec.run.recording) as recording:
+        logged = list(recording.decoded(schema.SCALAR_TOPIC))
+    assert ended > 5
+    assert [(one["step"], one["episode"]) for one in logged] == expected
