@@ -42,18 +42,26 @@ def encode(message: MessageType, values: Mapping[str, Any]) -> bytes:
 def scalar_encoder(name: str, phase: str) -> Callable[[float, int, int], bytes]:
     """Return a function that encodes `dualtaxi.Scalar` messages, from value, step and episode.
 
-    It gives the bytes that `encode` gives, in a tenth of the time, because only three numbers change.
+    It returns the bytes that `encode` returns, in a tenth of the time, because only three numbers change.
+    Neither name nor phase may be empty.
     """
     named, phased = name.encode(), phase.encode()
-    before_value = b"\n" + varint(len(named)) + named + b"\x11"
-    before_step = b"\x1a" + varint(len(phased)) + phased + b"!"
+    head = b"\n" + varint(len(named)) + named
+    middle = b"\x1a" + varint(len(phased)) + phased
+    before_value, before_step = head + b"\x11", middle + b"!"
     pack = struct.Struct(f"<{len(before_value)}sd{len(before_step)}sqcq").pack
+    pack_value, pack_number = struct.Struct("<cd").pack, struct.Struct("<cq").pack
 
     def encode_scalar(value: float, step: int, episode: int) -> bytes:
         if value and step and episode:
             return pack(before_value, value, before_step, step, b")", episode)
-        fields = {"name": name, "value": value, "phase": phase, "step": step, "episode": episode}
-        return encode(schema.SCALAR, fields)  # protobuf leaves zeros out
+        # Protobuf leaves zeros out, but not a negative one.
+        is_zero = not value and math.copysign(1.0, value) > 0
+        return (
+            (head if is_zero else head + pack_value(b"\x11", value))
+            + (middle + pack_number(b"!", step) if step else middle)
+            + (pack_number(b")", episode) if episode else b"")
+        )
 
     return encode_scalar
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.recording.blocks import message_record
+from runner.recording.blocks import HEADER_BYTES, MESSAGE_HEAD, RECORD_HEAD, message_record
 from runner.recording.schema import Topic
 
 MOST_BYTES: Final = 1 << 18
@@ -21,9 +21,11 @@ Send = Callable[[Topic, memoryview, NDArray[np.uint64], NDArray[np.uint64]], Non
 
 @dataclass
 class _Pile:
-    records: bytearray = field(default_factory=bytearray)
+    topic: Topic
+    records: list[bytes] = field(default_factory=list)
     times: list[int] = field(default_factory=list)
-    offsets: list[int] = field(default_factory=list)
+    size: int = 0
+    """Bytes of the records."""
 
 
 class Piles:
@@ -35,28 +37,43 @@ class Piles:
 
     def __init__(self, send: Send) -> None:
         self._send = send
-        self._piles: dict[Topic, _Pile] = {}
+        self._piles: dict[int, _Pile] = {}
+        """By channel."""
 
     def add(self, topic: Topic, log_time: int, payload: bytes) -> None:
         """Put a message on its topic's pile."""
-        pile = self._piles.get(topic)
-        if pile is None:
-            pile = self._piles[topic] = _Pile()
-        elif pile.records and len(pile.records) + len(payload) > MOST_BYTES:
-            self._close(topic)
-            pile = self._piles[topic] = _Pile()
-        pile.offsets.append(len(pile.records))
-        pile.times.append(log_time)
-        pile.records += message_record(topic, log_time, payload)
-        if len(pile.times) == MOST_MESSAGES:
-            self._close(topic)
+        self._put(topic, [log_time], [message_record(topic, log_time, payload)])
+
+    def extend(self, topic: Topic, log_times: Sequence[int], payloads: Sequence[bytes]) -> None:
+        """Put messages on their topic's pile."""
+        pack, channel, head = MESSAGE_HEAD.pack, topic.channel, HEADER_BYTES - RECORD_HEAD.size
+        records = [
+            pack(5, head + len(payload), channel, 0, time, time) + payload
+            for time, payload in zip(log_times, payloads, strict=True)
+        ]
+        self._put(topic, log_times, records)
 
     def flush(self) -> None:
         """Send every pile."""
-        for topic in list(self._piles):
-            self._close(topic)
+        for pile in list(self._piles.values()):
+            self._close(pile)
 
-    def _close(self, topic: Topic) -> None:
-        pile = self._piles.pop(topic)
-        times, offsets = (np.array(numbers, np.uint64) for numbers in (pile.times, pile.offsets))
-        self._send(topic, memoryview(pile.records), times, offsets)
+    def _put(self, topic: Topic, times: Sequence[int], records: Sequence[bytes]) -> None:
+        size = sum(map(len, records))
+        pile = self._piles.get(topic.channel)
+        if pile is not None and (
+            pile.size + size > MOST_BYTES or len(pile.times) + len(records) > MOST_MESSAGES
+        ):
+            self._close(pile)
+            pile = None
+        if pile is None:
+            pile = self._piles[topic.channel] = _Pile(topic)
+        pile.records += records
+        pile.times += times
+        pile.size += size
+
+    def _close(self, pile: _Pile) -> None:
+        del self._piles[pile.topic.channel]
+        sizes = np.array([len(record) for record in pile.records], np.uint64)
+        times = np.array(pile.times, np.uint64)
+        self._send(pile.topic, memoryview(b"".join(pile.records)), times, np.cumsum(sizes) - sizes)

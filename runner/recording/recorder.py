@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final
@@ -203,6 +203,16 @@ class Recorder:
         self._pipeline.raise_failure()
         self._piles.add(topic, position * STEP_NANOSECONDS, payload)
         self.counts[topic.name] += 1
+
+    def extend(self, topic: Topic, payloads: Sequence[bytes], positions: Sequence[int]) -> None:
+        """Record messages of a topic of variable size, as `append` does one.
+
+        Raises:
+            StorageError: the disk is full or failing; everything before is kept.
+        """
+        self._pipeline.raise_failure()
+        self._piles.extend(topic, [position * STEP_NANOSECONDS for position in positions], payloads)
+        self.counts[topic.name] += len(payloads)
 
     def submit(self, topic: Topic, make: Callable[[], bytes], position: int) -> None:
         """Record one message that is yet to be made, by a thread of the recorder's own.

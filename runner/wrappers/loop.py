@@ -8,7 +8,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -43,6 +43,10 @@ from runner.wrappers.values import lone_number, warn_user
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
 MAX_INFO_BYTES: Final = 1 << 20
 """Bytes of JSON that the info of one step may take."""
+_MOST_NUMBERS: Final = 1024
+"""Logged numbers that wait for the recorder; they are handed over twice a second at the latest."""
+_LONG_NAME: Final = 200
+"""Numbers under longer names do not wait, because together they would be large."""
 _UNDECIDED_SECONDS: Final = 5.0
 """The dtype of actions is left open so long while no step is taken; then it is that of their space."""
 
@@ -70,6 +74,16 @@ class Putting(Protocol):
 
     def reshape(self, described: Described) -> None:
         """Prepare for actions of another dtype; no step was put down yet."""
+
+
+@dataclass(frozen=True)
+class _Series:
+    """The numbers that are logged under one name in one phase."""
+
+    name: str
+    rows: Putting
+    encode: Callable[[float, int, int], bytes]
+    """Returns the message for a value, step and episode."""
 
 
 class Ignored:
@@ -131,7 +145,9 @@ class Loop(Generic[R]):
         self._is_described = False
         self._is_settled = not can_widen(described.action)
         self._has_logged = False
-        self._scalars: dict[tuple[str, str], Callable[[float, int, int], bytes]] = {}
+        self._series: dict[tuple[str, str], _Series] = {}
+        self._numbers: list[tuple[_Series, float, int, int, int]] = []
+        """Logged numbers that the recorder has not taken yet: series, value, position, step, episode."""
         self._topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
         made_by = provenance()
         known = {key: made_by[key] for key in runs.MADE_BY if key in made_by}
@@ -245,25 +261,36 @@ class Loop(Generic[R]):
         Raises:
             ConfigError: it is neither, or the name is none.
         """
-        if isinstance(value, str):
-            self._log_text(name, value)
-            return
-        number = value if value.__class__ is float else _number(name, value)
-        encoder = self._scalars.get((phase, name)) or self._scalar_encoder(phase, name, value)
+        series = self._series.get((phase, name))
+        if value.__class__ is not float or series is None:
+            if isinstance(value, str):
+                self._log_text(name, value)
+                return
+            value = _number(name, value)
+            series = series or self._new_series(phase, name, value)
         with self.lock:
             if self.is_foreign:
                 self._warn_of_fork()
                 return
             position = self._moment()
-            step, episode = self.rows(phase).place
-            self._recorder.append(schema.SCALAR_TOPIC, encoder(number, step, episode), position)
-            self._outcomes.take_logged(name, number)
-            self._has_logged = True
+            step, episode = series.rows.place
+            self._numbers.append((series, value, position, step, episode))
+            if len(self._numbers) == _MOST_NUMBERS or len(name) > _LONG_NAME:
+                self._commit_numbers()
 
-    def _scalar_encoder(self, phase: str, name: str, value: Any) -> Callable[[float, int, int], bytes]:
+    def _new_series(self, phase: str, name: str, value: Any) -> _Series:
         _check_name(name, value)
-        encoder = self._scalars[phase, name] = scalar_encoder(name, phase)
-        return encoder
+        self._has_logged = True
+        series = self._series[phase, name] = _Series(name, self.rows(phase), scalar_encoder(name, phase))
+        return series
+
+    def _commit_numbers(self) -> None:
+        """Hand the logged numbers to the recorder."""
+        numbers, self._numbers = self._numbers, []
+        payloads = [series.encode(value, step, episode) for series, value, _, step, episode in numbers]
+        self._recorder.extend(schema.SCALAR_TOPIC, payloads, [position for _, _, position, _, _ in numbers])
+        for series, value, _, _, _ in numbers:
+            self._outcomes.take_logged(series.name, value)
 
     def _log_text(self, name: str, text: str) -> None:
         _check_name(name, text)
@@ -441,8 +468,7 @@ class Loop(Generic[R]):
         return {"rewards_off_table": sum(rows.off_table for rows in self._rows.values())}
 
     def _finish(self, status: str, error: str) -> dict[str, Any]:
-        for rows in self._rows.values():
-            rows.commit()
+        self._commit()
         topics = self._recorder.drain()
         result = (
             self._recorder.totals(topics)
@@ -457,6 +483,13 @@ class Loop(Generic[R]):
         write_result(self._file, status, result)
         seconds = round(time.monotonic() - self._started, 3)
         return result | {"seconds": seconds, "bytes": self._file.size}
+
+    def _commit(self) -> None:
+        """Hand everything to the recorder."""
+        for rows in self._rows.values():
+            rows.commit()
+        if self._numbers:
+            self._commit_numbers()
 
     def flush(self) -> bool:
         """Write what is half a second old, also while the loop does something else; called by a thread.
@@ -473,8 +506,7 @@ class Loop(Generic[R]):
             if self._is_undecided():
                 self.run.beat()
                 return True
-            for rows in self._rows.values():
-                rows.commit()
+            self._commit()
             self._recorder.flush()
             self._recorder.release()
             for rows in self._rows.values():

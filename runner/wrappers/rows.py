@@ -86,7 +86,7 @@ class Rows:
     def place(self) -> tuple[int, int]:
         """The steps of the phase so far, and the number of the episode that began last; 0 before any."""
         began = self._episode + len(self._begins)
-        return self._recorder.steps[self._phase] + self.filled, max(began, 0)
+        return self._recorder.steps[self._phase] + self.filled, began if began > 0 else 0
 
     @property
     def _coming(self) -> int:
