@@ -159,16 +159,14 @@ def test_a_sweep_is_done_and_may_use_the_workers_that_nobody_waits_for(client, s
     first = client.get("/sweeps/small").text
     assert "Comparing the trials of 6 runs …" in first
     assert 'data-later="/sweeps/small/pictures"' in first
-    table = client.get("/sweeps/small/results").text
+
+    def texts():
+        """The index notices late that the last runs are over, and then the page is made once more."""
+        return [client.get(f"/sweeps/small{rest}").text for rest in ("?whole=true", "", "/results")]
+
+    page, _, table = until(lambda seen: seen[0] == seen[1] and seen[2] in seen[0], texts)
     assert all(f'href="/runs/{run.run_id}"' in table for run in runs)
-    # The index notices a little later that the last runs are over, and then the page is made once more.
-    until(
-        lambda same: same,
-        lambda: client.get("/sweeps/small?whole=true").text == client.get("/sweeps/small").text,
-    )
-    page = client.get("/sweeps/small").text
     assert 'alt="Length of evaluation trials over training episodes"' in page
-    assert table in page
 
 
 def test_a_job_whose_worker_dies_is_tried_again_and_then_fails(client, submit):
