@@ -1,4 +1,4 @@
-"""Panels drawn with Matplotlib: one figure for print, or a small SVG a panel for a page.
+"""Panels drawn with Matplotlib as one figure for print; `svg_charts` draws those of pages.
 
 Groups of runs differ in colour and marker, agents in the kind of line, so that nothing is told by colour
 alone; the colours are those of Okabe and Ito. Percent goes from 0 to 100, and what cannot be negative
@@ -144,25 +144,6 @@ def draw_figure(groups: Sequence[Group], panels: Sequence[Panel]) -> Figure:
 def is_wide(panel: Panel) -> bool:
     """Return whether a panel takes all the room beside it: it has a legend of many lines."""
     return panel.metric == SHARES
-
-
-def panel_svg(panel: Panel, groups: int) -> str:
-    """Return one panel as an SVG element for a page: its ink is the page's text colour."""
-    mpl = matplotlib_of("a report")
-    width = 8.0 if is_wide(panel) else 4.0
-    with mpl.rc_context(STYLE):
-        figure = mpl.figure.Figure(figsize=(width, 2.5))
-        right = 0.8 if is_wide(panel) else 0.97
-        axes = figure.add_axes((0.68 / width, 0.19, right - 0.68 / width, 0.63))
-        draw_panel(axes, panel, groups)
-        return svg_for_page(figure, panel.metric, f"{panel.title} over training episodes")
-
-
-def panel_svgs(panels: Sequence[Panel], groups: int) -> list[dict[str, Any]]:
-    """Return panels as pages take them: title, SVG, and whether it is wide."""
-    return [
-        {"title": panel.title, "svg": panel_svg(panel, groups), "wide": is_wide(panel)} for panel in panels
-    ]
 
 
 def draw_panel(axes: Axes, panel: Panel, groups: int) -> None:

@@ -21,7 +21,7 @@ from runner.errors import RecordingError, RunnerError
 from runner.export import svg, svg_maps
 from runner.export.contents import flat_text, has_steps, shortcomings, why_no_steps
 from runner.export.plots import panels_of
-from runner.export.plots_figure import footnote, matplotlib_of, panel_svgs
+from runner.export.plots_figure import COLOURS, footnote
 from runner.export.report_maps import MapRow, maps_of, stages_of
 from runner.export.report_replay import (
     Episode,
@@ -31,6 +31,7 @@ from runner.export.report_replay import (
     training_episode,
     trial,
 )
+from runner.export.svg_charts import panel_svgs
 from runner.extras import require
 from runner.frames import agents_of, evaluation_records
 from runner.recording import schema
@@ -64,7 +65,7 @@ def write_report(
         progress: called with what is done next.
 
     Raises:
-        MissingExtra: Jinja2 or Matplotlib is not installed.
+        MissingExtra: Jinja2 is not installed.
         RecordingError: a recording cannot be read, or has no such episode.
         OSError: the page cannot be written.
     """
@@ -79,7 +80,6 @@ def require_packages() -> None:
     Raises:
         MissingExtra: it is.
     """
-    matplotlib_of("a report")
     templates()
 
 
@@ -295,8 +295,6 @@ def _title(runs: Sequence[dict[str, Any]]) -> str:
 
 def _plots(series: Sequence[RunSeries]) -> dict[str, Any]:
     """Return the panels as SVG, what their colours mean, and what lines and bands are."""
-    from runner.export.plots_figure import COLOURS
-
     groups = groups_of(series)
     panels = curves(groups)
     if not panels:

@@ -185,7 +185,7 @@ def _told_sections(sections: Sequence[Section], recordings: Path) -> list[dict[s
 def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
     """Return the pictures of a sweep, as JSON: its parameters, and how some of its trials learned."""
     from runner.errors import RunnerError
-    from runner.sweep.figure import parallel_svg, parameter_svgs
+    from runner.sweep.charts import parallel_svg, parameter_svgs
     from runner.sweep.plots import picture_of
 
     results = _results(name, recordings, digest)
@@ -207,7 +207,8 @@ def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
 def _learning(results: Results, recordings: Path) -> dict[str, Any]:
     """Return how the best and the median trial of a sweep learned, or why that cannot be shown."""
     from runner.errors import RunnerError
-    from runner.export.plots_figure import COLOURS, footnote, panel_svgs
+    from runner.export.plots_figure import COLOURS, footnote
+    from runner.export.svg_charts import panel_svgs
     from runner.sweep.plots import learning
 
     try:

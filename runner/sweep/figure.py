@@ -1,11 +1,11 @@
-"""The plots of a sweep drawn with Matplotlib: one figure for print, or small SVGs for a page."""
+"""The plots of a sweep as one figure for print, drawn with Matplotlib."""
 
 from __future__ import annotations
 
 import math
 import re
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,7 +21,6 @@ from runner.export.plots_figure import (
     draw_panel,
     matplotlib_of,
     number_on_axis,
-    svg_for_page,
 )
 from runner.sweep.plots import Axis, Picture
 
@@ -75,25 +74,6 @@ def save_figure(path: Path, title: str, picture: Picture, groups: Sequence[Group
             figure.text(0.01, y, line, color=colour, fontsize=7.5, va="top")
         stamp = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower(), {})
         figure.savefig(path, metadata=stamp)
-
-
-def parameter_svgs(picture: Picture) -> list[str]:
-    """Return a plot for each parameter."""
-    return [
-        _svg(
-            lambda axes, axis=axis: draw_parameter(axes, picture, axis),  # type: ignore[misc]
-            axis.path,
-            f"{picture.objective} against {axis.path}",
-        )
-        for axis in picture.axes
-    ]
-
-
-def parallel_svg(picture: Picture) -> str:
-    """Return the parallel coordinates."""
-    return _svg(
-        lambda axes: draw_parallel(axes, picture), "parallel", "The trials in parallel coordinates", 8.2, 3.0
-    )
 
 
 def draw_parameter(axes: Axes, picture: Picture, axis: Axis) -> None:
@@ -200,12 +180,3 @@ def _objective_axis(axes: Axes, picture: Picture) -> None:
     axes.yaxis.set_major_formatter(number_on_axis)
     better = "lower" if picture.lower_is_better else "higher"
     axes.set_ylabel("\n".join([*textwrap.wrap(picture.objective, 30), f"({better} is better)"]))
-
-
-def _svg(draw: Callable[[Axes], None], name: str, told: str, width: float = 4.0, height: float = 2.6) -> str:
-    mpl = matplotlib_of("a report")
-    with mpl.rc_context(STYLE):
-        figure = mpl.figure.Figure(figsize=(width, height), layout="constrained")
-        draw(figure.add_subplot())
-        page = svg_for_page(figure, f"sweep-{name}", told)
-    return page.replace("#ffffff", "var(--paper, #ffffff)")

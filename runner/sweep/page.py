@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from runner.analysis.groups import Group
-from runner.export.plots_figure import COLOURS, footnote, panel_svgs
+from runner.export.plots_figure import COLOURS, footnote
 from runner.export.report import TEMPLATES, require_packages, templates
-from runner.sweep.figure import parallel_svg, parameter_svgs
+from runner.export.svg_charts import panel_svgs
+from runner.sweep.charts import parallel_svg, parameter_svgs
 from runner.sweep.plots import learning, picture_of
 from runner.sweep.results import Results, sections
 
@@ -23,7 +24,7 @@ def render_sweep(results: Results, recordings: Path) -> str:
         recordings: the folder of its runs.
 
     Raises:
-        MissingExtra: Jinja2 or Matplotlib is not installed.
+        MissingExtra: Jinja2 is not installed.
         RunnerError: no trial is finished yet, or a run cannot be read.
     """
     require_packages()
