@@ -8,9 +8,12 @@ import os
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from runner.files import open_regular
+
+_BINARY: Final = getattr(os, "O_BINARY", 0)
+"""What Windows needs to leave line ends as they are."""
 
 
 def finite(value: Any) -> Any:
@@ -86,8 +89,8 @@ def write_whole(path: Path, value: dict[str, Any], mode: int = 0o666) -> None:
     data = (json.dumps(value, indent=1, ensure_ascii=False) + "\n").encode()
     fresh = path.with_suffix(f".{secrets.token_hex(4)}.tmp")
     try:
-        fresh.touch(mode, exist_ok=False)
-        fresh.write_bytes(data)
+        with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, mode), "wb") as stream:
+            stream.write(data)
         fresh.replace(path)
     except BaseException:
         fresh.unlink(missing_ok=True)

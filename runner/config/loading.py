@@ -101,6 +101,8 @@ def packing_from(values: Mapping[str, Any]) -> Recording:
     Raises:
         ConfigError: there is no such option, or a value is out of its bounds.
     """
+    if not values:
+        return Recording()
     try:
         return from_mapping({"episodes": 1, "recording": dict(values)}).recording
     except ConfigError as error:

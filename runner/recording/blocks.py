@@ -98,6 +98,11 @@ def varint(number: int) -> bytes:
 
 def blank_records(topic: Topic, sizes: Sizes, n: int) -> NDArray[np.void]:
     """Return n message records of the topic with every constant byte set and every value 0."""
+    return np.full(n, _blank_record(topic, sizes))
+
+
+@lru_cache(64)
+def _blank_record(topic: Topic, sizes: Sizes) -> NDArray[np.void]:
     dtype = record_dtype(topic.message, sizes)
     one = np.zeros((), dtype=dtype)
     one["opcode"] = 5
@@ -105,7 +110,7 @@ def blank_records(topic: Topic, sizes: Sizes, n: int) -> NDArray[np.void]:
     one["channel_id"] = topic.channel
     for field, value in zip(topic.message.fields, _values(topic.message, sizes), strict=True):
         one[f"tag_{field.name}"] = list(_tag(field, value))
-    return np.full(n, one)
+    return one
 
 
 def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:

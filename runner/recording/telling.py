@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 from numpy.typing import NDArray
@@ -46,11 +47,17 @@ def run_facts(
 
 def environment_attachments(said: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Attachments:
     """Return the attachments that tell of an environment: what is said of it, and the arrays it has."""
-    text = json.dumps({**said, "arrays": sorted(arrays)}, indent=1, sort_keys=True)
+    text = _indented(json.dumps({**said, "arrays": sorted(arrays)}, sort_keys=True))
     return {"environment.json": ("application/json", text.encode())} | {
         f"environment/{name}.npy.zst": ("application/zstd", pack_array(arrays[name]))
         for name in sorted(arrays)
     }
+
+
+@lru_cache(32)
+def _indented(text: str) -> str:
+    """Return JSON with one value a line; cached, because a process often records one environment again."""
+    return json.dumps(json.loads(text), indent=1, sort_keys=True)
 
 
 def write_description(

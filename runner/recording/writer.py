@@ -77,7 +77,7 @@ class RecordingFile:
         self._counts = {topic.channel: 0 for topic in ALL_TOPICS}
         self._start_time: int | None = None
         self._end_time = 0
-        self._schemas, self._channels = schemas_and_channels(topics)
+        self._topics = tuple(topics)
 
     @classmethod
     def reopen(cls, path: Path, contents: Contents) -> RecordingFile:
@@ -223,17 +223,17 @@ class RecordingFile:
 
     def _summary(self, start: int) -> tuple[bytes, bytes]:
         """Return the summary section and the summary offset section, to stand at `start`."""
-        groups: list[tuple[Opcode, list[McapRecord]]] = [
-            (Opcode.SCHEMA, list(self._schemas)),
-            (Opcode.CHANNEL, list(self._channels)),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, list(self._chunks)),
-            (Opcode.ATTACHMENT_INDEX, list(self._attachments)),
-            (Opcode.METADATA_INDEX, list(self._metadata)),
+        schemas, channels = _schema_and_channel_bytes(self._topics)
+        groups = [
+            (Opcode.SCHEMA, schemas),
+            (Opcode.CHANNEL, channels),
+            (Opcode.STATISTICS, _bytes_of(self._statistics())),
+            (Opcode.CHUNK_INDEX, _bytes_of(*self._chunks)),
+            (Opcode.ATTACHMENT_INDEX, _bytes_of(*self._attachments)),
+            (Opcode.METADATA_INDEX, _bytes_of(*self._metadata)),
         ]
         body, offsets = bytearray(), []
-        for opcode, records in groups:
-            data = _bytes_of(*records)
+        for opcode, data in groups:
             if data:
                 offsets.append(
                     SummaryOffset(group_opcode=opcode, group_start=start + len(body), group_length=len(data))
@@ -244,14 +244,14 @@ class RecordingFile:
     def _statistics(self) -> Statistics:
         return Statistics(
             attachment_count=len(self._attachments),
-            channel_count=len(self._channels),
+            channel_count=len(self._topics),
             channel_message_counts={channel: n for channel, n in self._counts.items() if n},
             chunk_count=len(self._chunks),
             message_count=sum(self._counts.values()),
             metadata_count=len(self._metadata),
             message_start_time=self._start_time or 0,
             message_end_time=self._end_time,
-            schema_count=len(self._schemas),
+            schema_count=len({topic.message for topic in self._topics}),
         )
 
 
@@ -300,14 +300,14 @@ def storage_error(file: RecordingFile, error: OSError) -> StorageError:
 
 
 @cache
-def _schema_and_channel_bytes(topics: tuple[Topic, ...]) -> bytes:
+def _schema_and_channel_bytes(topics: tuple[Topic, ...]) -> tuple[bytes, bytes]:
     schemas, channels = schemas_and_channels(topics)
-    return _bytes_of(*schemas, *channels)
+    return _bytes_of(*schemas), _bytes_of(*channels)
 
 
 def schema_and_channel_bytes(topics: Sequence[Topic]) -> bytes:
     """Return the records that stand behind the header of a recording with these topics."""
-    return _schema_and_channel_bytes(tuple(topics))
+    return b"".join(_schema_and_channel_bytes(tuple(topics)))
 
 
 def _bytes_of(*records: McapRecord) -> bytes:

@@ -156,7 +156,8 @@ class Loop(Generic[R]):
         path = self.run.folder / RECORDING_FILE
         with unless_empty(self.run):
             self._file = create_recording(path, schema.KINDS[described.kind])
-        facts = self._facts()
+        self._said = facts = self._facts()
+        """What the recording says of the run."""
         self._outcomes = Outcomes(described.mdp)
         self._recorder = Recorder(
             self._file,
@@ -204,7 +205,7 @@ class Loop(Generic[R]):
         if not self._is_described:
             self._is_described = self._is_settled = True
             write_description(
-                self._file, self._facts(), self._config, self._made_by, _environment(self.described)
+                self._file, self._said, self._config, self._made_by, _environment(self.described)
             )
 
     def _first_action(self, action: Any) -> None:
@@ -216,7 +217,8 @@ class Loop(Generic[R]):
         if wide is self.described.action:
             return
         self.described = replace(self.described, wide_action=wide)
-        self._recorder.resize(sizes_of(self._facts(), str(self.run.recording)))
+        self._said = self._facts()
+        self._recorder.resize(sizes_of(self._said, str(self.run.recording)))
         for rows in self._rows.values():
             rows.reshape(self.described)
 
