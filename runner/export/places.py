@@ -25,6 +25,11 @@ def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
     fresh = path.with_name(f".{secrets.token_hex(4)}.{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise StorageError(f"{path}: {path.parent} is a file, expected a folder.") from error
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
+    try:
         write(fresh)
         fresh.replace(path)
     except OSError as error:

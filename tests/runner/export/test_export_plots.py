@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from statistics import median
 
 import numpy as np
@@ -14,6 +15,7 @@ from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries
 from runner.cli import cli
 from runner.errors import RunnerError
+from runner.export import plots_figure
 from runner.export.plots import panels_of
 from runner.export.plots_figure import draw_figure, draw_panel
 from runner.finding import find_run
@@ -140,10 +142,28 @@ def test_a_file_is_replaced_only_when_asked(pictured, tmp_path):
     assert path.read_text() != "mine"
 
 
-def test_a_file_that_cannot_be_written_is_said_as_a_full_disk_is(pictured, tmp_path):
-    result = plot(pictured("corridor", log=None).recording, "-o", tmp_path / "nowhere" / "plot.svg")
+def test_a_missing_folder_is_created(pictured, tmp_path):
+    path = tmp_path / "new" / "folder" / "plot.svg"
+    assert plot(pictured("corridor", log=None).recording, "-o", path).exit_code == 0
+    assert path.stat().st_size > 10_000
+
+
+def test_a_place_that_cannot_be_written_is_wrong_input(pictured, tmp_path):
+    (tmp_path / "file").touch()
+    result = plot(pictured("corridor", log=None).recording, "-o", tmp_path / "file" / "plot.svg")
+    assert result.exit_code == 2
+    assert f"{tmp_path / 'file'} is a file, expected a folder" in result.stderr
+
+
+def test_a_full_disk_is_no_fault_of_the_input(pictured, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(plots_figure, "save_figure", full)
+    result = plot(pictured("corridor", log=None).recording, "-o", tmp_path / "plot.svg")
     assert result.exit_code == 1
-    assert "cannot be written (No such file or directory)" in result.stderr
+    assert "cannot be written (No space left on device)" in result.stderr
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_name_stands_for_all_its_runs(pictured, tmp_path):

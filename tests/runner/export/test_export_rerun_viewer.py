@@ -104,8 +104,10 @@ def test_a_screenshot_is_kept_whole_or_its_place_is_told(monkeypatch, tmp_path):
     picture = tmp_path / "step.png"
     viewer.screenshot(tmp_path / "a.rrd", 0, picture)
     assert picture.read_bytes() == b"drawn"
-    with pytest.raises(StorageError, match="cannot be written"):
-        viewer.screenshot(tmp_path / "a.rrd", 0, tmp_path / "missing" / "step.png")
+    viewer.screenshot(tmp_path / "a.rrd", 0, tmp_path / "new" / "step.png")
+    assert (tmp_path / "new" / "step.png").read_bytes() == b"drawn"
+    with pytest.raises(StorageError, match="is a file, expected a folder"):
+        viewer.screenshot(tmp_path / "a.rrd", 0, picture / "step.png")
 
 
 @pytest.mark.parametrize("size", ["foo", "1600", "1600x", "0x900", "1600x99999", "-5x900", "1600x900x2"])
