@@ -51,6 +51,7 @@ STYLE: Final = {
     "axes.titlesize": 9.5,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
+    "axes.titley": 1.0,  # else every title is placed by measuring all that is drawn
     "axes.labelsize": 8.5,
     "axes.spines.top": False,
     "axes.spines.right": False,

@@ -29,7 +29,7 @@ from runner.service.security import Tokens
 from runner.service.sessions import Sessions
 from runner.service.settings import Settings
 from runner.service.work import Jobs
-from runner.sweep.state import sweeps_in
+from runner.sweep.names import sweeps_in
 
 API: Final = "/api/v1"
 THREADS: Final = 8

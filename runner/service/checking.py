@@ -95,6 +95,7 @@ def _told_at(key: tuple[str, ...], document: Document) -> Iterator[None]:
 def _sweep(text: str, source: str, document: Document, recordings: Path) -> Checked:
     from runner.sweep import state
     from runner.sweep.loading import from_text as sweep_in
+    from runner.sweep.names import sweeps_in
     from runner.sweep.search import Search, require_optuna
 
     require_optuna()
@@ -106,7 +107,7 @@ def _sweep(text: str, source: str, document: Document, recordings: Path) -> Chec
             told |= {("parameters", path, i): choice for i, choice in enumerate(choices)}
     _refuse_paths(told, document)
     values, runs = sweep.to_mapping(), Search(sweep.file).trials * len(sweep.seeds)
-    if sweep.name in state.sweeps_in(recordings):
+    if sweep.name in sweeps_in(recordings):
         before = state.read_sweep(sweep.name, recordings).to_mapping()
         if differing := ", ".join(key for key, _, _ in state.differences(before, values)):
             message = (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import secrets
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,9 +21,8 @@ from runner.locking import acquired
 from runner.runs import Run, list_runs
 from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep
+from runner.sweep.names import FILE, folder_of, sweeps_in, tag_of
 
-FOLDER: Final = ".sweeps"
-FILE: Final = "sweep.yaml"
 FAILED: Final = "failed.json"
 MAX_FAILED_BYTES: Final = 8 << 20
 LOCK: Final = "owner.lock"
@@ -38,26 +37,6 @@ PRUNED: Final = "pruned"
 
 class SweepBusy(RunnerError):
     """Another process is doing the sweep."""
-
-
-def tag_of(name: str) -> str:
-    """Return the tag of a sweep's runs."""
-    return f"sweep={name}"
-
-
-def folder_of(name: str, recordings: Path) -> Path:
-    """Return the folder of a sweep; it need not exist."""
-    return recordings / FOLDER / name
-
-
-def sweeps_in(recordings: Path) -> list[str]:
-    """Return the names of the sweeps of a recordings folder."""
-    return sorted(file.parent.name for file in (recordings / FOLDER).glob(f"*/{FILE}"))
-
-
-def is_sweep(names: Sequence[str], recordings: Path) -> bool:
-    """Return whether names are the one of a sweep, rather than of runs."""
-    return len(names) == 1 and names[0] in sweeps_in(recordings)
 
 
 def read_sweep(name: str, recordings: Path) -> Sweep:

@@ -19,6 +19,7 @@ from runner.runs import Run
 from runner.sweep import state
 from runner.sweep.local import Workers
 from runner.sweep.model import Sweep
+from runner.sweep.names import tag_of
 from runner.sweep.readings import Curve, value_of
 from runner.sweep.search import Search, bounds
 from runner.sweep.state import is_over
@@ -328,7 +329,7 @@ class _Batch:
             seed=seed,
             config=trial.config,
             name=self._sweep.name,
-            tags=(state.tag_of(self._sweep.name), f"trial={trial.number}"),
+            tags=(tag_of(self._sweep.name), f"trial={trial.number}"),
             recordings=str(self._recordings),
             objective=self._sweep.objective,
             bounds=bounds,

@@ -50,7 +50,7 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     from runner.export.plots_figure import check_suffix, matplotlib_of, save_figure
     from runner.recording.reader import open_recording
     from runner.runs import recordings_folder
-    from runner.sweep.state import is_sweep
+    from runner.sweep.names import is_sweep
 
     check_suffix(output)
     matplotlib_of("a plot")

@@ -69,7 +69,7 @@ def command(
     from runner.export.places import write_new
     from runner.export.report import require_packages, write_report
     from runner.runs import recordings_folder
-    from runner.sweep.state import is_sweep
+    from runner.sweep.names import is_sweep
 
     require_packages()
     folder = recordings_folder(recordings)

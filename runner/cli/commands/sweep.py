@@ -239,7 +239,7 @@ def ls(recordings: Path | None, as_json: bool) -> None:
       dualtaxi sweep ls
     """  # noqa: D301 - Click wants the backspace itself
     from runner.runs import recordings_folder
-    from runner.sweep.state import sweeps_in
+    from runner.sweep.names import sweeps_in
 
     names = sweeps_in(recordings_folder(recordings))
     if as_json:

@@ -32,12 +32,13 @@ def do_sweep(order: Order, line: Line) -> Outcome:
     """
     from runner.sweep import state
     from runner.sweep.loading import from_values
+    from runner.sweep.names import sweeps_in
     from runner.sweep.plan import plan_of, require_disk, room
     from runner.sweep.trials import INTERRUPTED, run_sweep
 
     sweep = from_values(described(order))
     with _held(order, line.stop):
-        there = order.name in state.sweeps_in(order.recordings)
+        there = order.name in sweeps_in(order.recordings)
         state.begin(sweep, order.recordings, resume=there, accept_changes=order.accept_changes)
         if order.retry:
             state.forget_failures(order.name, order.recordings)

@@ -24,7 +24,8 @@ from runner.service.pages.jobs import shown_job
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page, picture_address, templates
 from runner.service.processes import ProcessPool
-from runner.sweep.state import folder_of, read_sweep, sweeps_in, tag_of
+from runner.sweep.names import folder_of, sweeps_in, tag_of
+from runner.sweep.state import read_sweep
 
 router = APIRouter(prefix="/sweeps", include_in_schema=False)
 

@@ -9,7 +9,7 @@ import pytest
 from sweeping import described
 
 from runner.recording.reader import Recording, open_recording
-from runner.sweep import state
+from runner.sweep import names, state
 from runner.sweep.loading import from_values
 from runner.sweep.model import Objective, SweepFile
 from runner.sweep.readings import curve_of, hopeless, value_of
@@ -146,7 +146,7 @@ def test_tpe_tries_no_values_twice_while_there_are_others():
 def test_a_sweep_that_was_begun_before_goes_on_as_it_began(tmp_path):
     sweep = from_values(described())
     state.begin(sweep, tmp_path, resume=False, accept_changes=False)
-    stored = state.folder_of(sweep.name, tmp_path) / state.FILE
+    stored = names.folder_of(sweep.name, tmp_path) / names.FILE
     stored.write_text(stored.read_text().replace("repeats: false\n", ""))
     assert not sweep.file.repeats
     assert state.read_sweep(sweep.name, tmp_path).file.repeats
