@@ -43,6 +43,20 @@ def describe(run: Run, recording: Recording) -> dict[str, Any]:
     }
 
 
+def random_policy_sentence(recording: Recording) -> str:
+    """Return what a random policy achieves in a recording's environment; empty where that says nothing.
+
+    It says nothing of a loop, whose environment is not known as a table, and of a run that acts at random
+    itself. It takes about a second unless it was computed for this environment before.
+    """
+    from runner.planning import random_baseline
+
+    if recording.kind != "job" or recording.config["algorithm"] == "random":
+        return ""
+    baseline = random_baseline(recording.mdp)
+    return baseline.sentence if baseline else ""
+
+
 def _config(run: Run, recording: Recording) -> dict[str, Any]:
     """Return the recording's configuration, in the order of keys in which people read it."""
     readable = dict(run.file.config)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 from runner.analysis.groups import Group, groups_of
 from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries, values_left_out
+from runner.description import random_policy_sentence
 from runner.errors import RecordingError, RunnerError
 from runner.export import svg, svg_maps
 from runner.export.contents import flat_text, has_steps, shortcomings, why_no_steps
@@ -137,7 +138,7 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
         "made_by": recording.config.get("made_by", ""),
         "last": evaluations[-1] if evaluations else None,
         "last_return": _return_of(evaluations[-1]) if evaluations else None,
-        "random": _random_policy(recording),
+        "random": random_policy_sentence(recording),
         "steps": has_steps(recording),
         "evaluations": evaluations,
         "event_names": [_heading(name) for name in environment["event_names"]],
@@ -176,14 +177,6 @@ def _return_of(evaluation: Mapping[str, Any]) -> float | None:
     """Return the mean return of an evaluation, summed over agents; None if one is not finite."""
     returns = list(evaluation["mean_returns"].values())
     return None if None in returns else sum(returns)
-
-
-def _random_policy(recording: Recording) -> str:
-    """Return what a random policy gets in the recording's environment, as a sentence; empty if unknown."""
-    from runner.planning import random_baseline
-
-    baseline = random_baseline(recording.mdp) if recording.kind == "job" else None
-    return baseline.sentence if baseline else ""
 
 
 def _facts(recording: Recording) -> dict[str, str]:

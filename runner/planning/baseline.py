@@ -20,7 +20,7 @@ MAX_WORK: Final = 1_000_000_000
 """Outcomes of joint actions times the step limit; DualTaxi has a third of it, and takes about a second."""
 _MAX_REMEMBERED: Final = 32
 _MAX_BYTES: Final = 4096
-_VERSION: Final = 1
+_VERSION: Final = 2
 """Of the computation; results of another version are not read from the cache."""
 _remembered: OrderedDict[bytes, RandomBaseline] = OrderedDict()
 

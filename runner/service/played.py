@@ -65,12 +65,11 @@ def part(path: Path, which: tuple[int, ...], start: int, steps: int) -> bytes:
 
 
 def random_policy(path: Path) -> bytes:
-    """Return what a random policy gets in a recording's environment, as a sentence; empty if unknown."""
-    from runner.planning import random_baseline
+    """Return what a random policy achieves in a recording's environment, as a sentence or nothing."""
+    from runner.description import random_policy_sentence
 
     with open_recording(path) as recording:
-        baseline = random_baseline(recording.mdp) if recording.kind == "job" else None
-    return baseline.sentence.encode() if baseline else b""
+        return random_policy_sentence(recording).encode()
 
 
 def typical(path: Path) -> bytes:

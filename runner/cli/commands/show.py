@@ -23,6 +23,7 @@ from runner.cli.output import (
     size,
     title,
 )
+from runner.cli.progress import stage_line
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -67,6 +68,8 @@ def _draw(run: Run, told: dict[str, Any]) -> None:
     parts: list[RenderableType] = [facts(_head(run, told))]
     if told["eval"]:
         parts += [title("Evaluations"), evaluation_table(told["eval"], told["success_events"], console())]
+        random = _random_policy(run)
+        parts += [random] if random else []
     if told["loop"]:
         parts += [title("Last results"), facts(_loop_results(told["loop"]))]
     if told["optimality"]:
@@ -100,6 +103,15 @@ def _head(run: Run, told: dict[str, Any]) -> dict[str, str]:
         "digest": told["content_digest"] or f"{UNKNOWN} (told when a run ends properly)",
         "file": f"{run.recording}  {size(told['bytes'])}" if told["bytes"] else "no recording",
     }
+
+
+def _random_policy(run: Run) -> str:
+    """Return what a random policy achieves, as a sentence or nothing: what an evaluation compares with."""
+    from runner.description import random_policy_sentence
+    from runner.recording.reader import open_recording
+
+    with stage_line("computing what a random policy achieves"), open_recording(run.recording) as recording:
+        return random_policy_sentence(recording)
 
 
 def _loop_results(loop: dict[str, Any]) -> dict[str, str]:

@@ -55,6 +55,10 @@ def test_json_has_the_whole_series(recorded):
     assert told["train"][0]["percent_filled"].keys() == {"taxi_1", "taxi_2"}
 
 
+def test_the_text_says_what_a_random_policy_achieves(recorded):
+    assert "A random policy succeeds in " in recorded("show", "tiny").stdout
+
+
 def test_text_tells_the_same(recorded, recorded_run):
     result = recorded("show", recorded_run.run_id)
     assert result.exit_code == 0
