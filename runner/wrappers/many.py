@@ -22,7 +22,7 @@ from runner.wrappers.loop import Loop
 from runner.wrappers.plan import plan_of
 from runner.wrappers.single import Recorded, given
 from runner.wrappers.staged import AgentRows
-from runner.wrappers.vector import VectorRows
+from runner.wrappers.vector_buffer import VectorRows
 
 
 class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any]):
