@@ -8,9 +8,9 @@ from pathlib import Path
 
 import runner
 from benchmarks.figures import Figure, figure
-from runner.export import svg
+from runner.drawing import svg
 from runner.export.gif import Film, render_svg
-from runner.export.report_replay import training_episode
+from runner.export.reports.episode import training_episode
 from runner.recording.reader import open_recording
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.learners import train, tutorial_learner
-from runner.mdp import Mdp
+from runner.environments.mdp import Mdp
 from runner.planning.evaluation import evaluate_policy
 from runner.planning.optimum import greedy_policy, optimal_values
 

@@ -23,10 +23,10 @@ from blake3 import blake3
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
 from benchmarks.serving import Service, serving
-from runner.finding import find_run
-from runner.service.client import Client
-from runner.service.parcel import Parcel
-from runner.verify import verify
+from runner.client.http import Client
+from runner.client.upload_source import Parcel
+from runner.execution.verify import verify
+from runner.runs.resolve import find_run
 
 LOOP = """
 import sys, gymnasium, runner

@@ -10,14 +10,14 @@ from pathlib import Path
 from benchmarks.bench_reader import tutorial
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
+from runner.execution.verify import verify
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.replay.tables import tables_at
-from runner.verify import verify
 
 READ = "import sys; from pathlib import Path; from benchmarks.bench_reader import read_all, read_episode; \
 path = Path(sys.argv[1]); read_all(path); read_episode(path)"
-VERIFY = "import sys; from pathlib import Path; from runner.verify import verify; \
+VERIFY = "import sys; from pathlib import Path; from runner.execution.verify import verify; \
 assert verify(Path(sys.argv[1])).sound"
 
 

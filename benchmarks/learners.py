@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from benchmarks.processes import ROOT
 from runner.config import load
-from runner.environments import load_mdp
+from runner.environments.loading import load_mdp
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts

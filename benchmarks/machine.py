@@ -9,7 +9,7 @@ from typing import Self
 
 import psutil
 
-from runner.provenance import provenance
+from runner.runs.provenance import provenance
 
 
 def machine() -> dict[str, str]:

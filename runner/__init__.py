@@ -16,15 +16,15 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import runner.frames as frames  # noqa: PLR0402
+    import runner.analysis.frames as frames  # noqa: PLR0402
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
     from runner.errors import RunnerError
-    from runner.finding import find_run
+    from runner.loops.env import record
+    from runner.loops.vector import record_parallel, record_vector
     from runner.recording.reader import Recording, open_recording
-    from runner.runs import Run, list_runs
-    from runner.wrappers.many import record_parallel, record_vector
-    from runner.wrappers.single import record
+    from runner.runs.resolve import find_run
+    from runner.runs.run import Run, list_runs
 
 __version__ = "0.1.0"
 
@@ -47,14 +47,14 @@ __all__ = [
 _HOME = {
     "ExperimentConfig": "runner.config",
     "Recording": "runner.recording.reader",
-    "Run": "runner.runs",
+    "Run": "runner.runs.run",
     "RunnerError": "runner.errors",
-    "find_run": "runner.finding",
-    "list_runs": "runner.runs",
+    "find_run": "runner.runs.resolve",
+    "list_runs": "runner.runs.run",
     "open_recording": "runner.recording.reader",
-    "record": "runner.wrappers.single",
-    "record_parallel": "runner.wrappers.many",
-    "record_vector": "runner.wrappers.many",
+    "record": "runner.loops.env",
+    "record_parallel": "runner.loops.vector",
+    "record_vector": "runner.loops.vector",
     "run": "runner.api",
     "run_all": "runner.api",
 }
@@ -63,7 +63,7 @@ _HOME = {
 
 def __getattr__(name: str) -> Any:
     if name == "frames":
-        return importlib.import_module("runner.frames")
+        return importlib.import_module("runner.analysis.frames")
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.config import ConfigError, ExperimentConfig, RunTable, from_mapping, load
-from runner.job import Job, jobs_of
-from runner.runs import Run, create_run, recordings_folder, unless_empty
+from runner.config.job import Job, jobs_of
+from runner.runs.run import Run, create_run, recordings_folder, unless_empty
 
 if TYPE_CHECKING:  # both are imported late: a run is to stand on disk before NumPy and Numba are loaded
-    from runner.execution import Progress
+    from runner.execution.session import Progress
 
 Config = str | os.PathLike[str] | Mapping[str, Any] | ExperimentConfig
 Handler = Callable[[int, Any], Any] | int | signal.Handlers | None
@@ -114,7 +114,7 @@ def jobs_in(config: ExperimentConfig, recordings: Path) -> Iterator[Job]:
         RunnerError: it begins with the table of a run that is not there.
     """
     if isinstance(config.initial_q, RunTable):
-        from runner.origin import settled
+        from runner.execution.initial_tables import settled
 
         config = settled(config, recordings)
     return jobs_of(config)
@@ -144,7 +144,7 @@ def abreast(
     def do(job: Job) -> Run | None:
         if stopped():
             return None
-        from runner.execution import run_job
+        from runner.execution.session import run_job
 
         run = create_run(folder, job.config, job.seed, name)
         with unless_empty(run):
@@ -185,7 +185,7 @@ def checked_run_name(name: str | None) -> str | None:
     """
     import re
 
-    from runner.labels import RUN_NAME_EXPECTED, RUN_NAME_PATTERN
+    from runner.runs.labels import RUN_NAME_EXPECTED, RUN_NAME_PATTERN
 
     if name is not None and not re.fullmatch(RUN_NAME_PATTERN, name):
         raise ConfigError(f"name: found {name!r}, expected {RUN_NAME_EXPECTED}")
@@ -269,7 +269,7 @@ def _run_job(job: Job, folder: Path, name: str | None, report: Callable[[Progres
     with interruptible() as interrupt:
         run = create_run(folder, job.config, job.seed, name)
         with unless_empty(run):
-            from runner.execution import run_job
+            from runner.execution.session import run_job
 
             run = run_job(job, run, report, interrupt)
     if interrupt.came:

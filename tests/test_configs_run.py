@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from runner.config import load
-from runner.execution import run_job
-from runner.job import jobs_of
+from runner.config.job import jobs_of
+from runner.execution.session import run_job
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
-from runner.runs import create_run
+from runner.runs.run import create_run
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 SHORT = ["episodes=30", "evaluation.every=15", "evaluation.trials=3", "log.every_steps=1000"]

@@ -14,7 +14,7 @@ from nbclient import NotebookClient
 
 import runner
 from runner.errors import MissingExtra
-from runner.notebook import facts_html, plot, report, rerun_view
+from runner.export.notebook import facts_html, plot, report, rerun_view
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))
 

@@ -99,7 +99,7 @@ def test_the_first_ten_minutes_need_no_clone(python: Path, folder: Path) -> None
 
 
 def test_a_missing_extra_is_installed_from_the_same_wheel(python: Path, wheel: Path, folder: Path) -> None:
-    code = "from runner.extras import install_command; print(install_command('plots'))"
+    code = "from runner.util.extras import install_command; print(install_command('plots'))"
     advice = subprocess.run(
         [python, "-c", code], cwd=folder, capture_output=True, text=True, check=True
     ).stdout

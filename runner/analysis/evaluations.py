@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from runner.analysis.frames import trained_before
 from runner.errors import RecordingError
-from runner.frames import trained_before
 from runner.recording.reader import Recording
 from runner.recording.schema import TRAIN_EPISODE
 

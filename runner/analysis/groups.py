@@ -7,8 +7,8 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from runner.amounts import listed
 from runner.analysis.series import RunSeries, is_loop
+from runner.util.humanize import listed
 
 
 @dataclass(frozen=True)

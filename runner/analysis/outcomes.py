@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.mdp import Mdp
+from runner.environments.mdp import Mdp
 
 _COMPARED: Final = 1 << 20
 """Outcomes that are compared at a time, so that memory grows with neither steps nor outcomes."""

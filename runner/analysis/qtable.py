@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.naming import action_names, actions_in_words, states_in_words
 from runner.errors import RunnerError
 from runner.recording.reader import Recording
 from runner.replay.history import history_of
 from runner.replay.tables import TableReplay, last_step, step_of_episode
-from runner.words import action_names, actions_in_words, states_in_words
 
 
 def at_moment(recording: Recording, step: int | None = None, episode: int | None = None) -> TableReplay:

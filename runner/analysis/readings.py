@@ -9,12 +9,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.frames import LARGEST, agents_of, evaluation_records, is_usable, training_records
 from runner.analysis.series import LOGGED, SHARES, Readings, RunSeries
+from runner.environments.naming import spoken
 from runner.errors import RecordingError
-from runner.frames import LARGEST, agents_of, evaluation_records, is_usable, training_records
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.words import spoken
 
 _POINTS: Final = 200
 _MOST_NAMES: Final = 64

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from runner.frames import LARGEST
-from runner.words import event_in_words
+from runner.analysis.frames import LARGEST
+from runner.environments.naming import event_in_words
 
 Readings = dict[str, dict[str, float]]
 """Metric -> line (an agent, a reward, or "") -> value."""

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from runner.archive.layout import PHASES, Shape
 from runner.archive.values import SpaceColumns
+from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
-from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.blocks import Sizes, blank_records, record_dtype
-from runner.recording.facts import kind_of, sizes_of, spaces_of
+from runner.recording.metadata import kind_of, sizes_of, spaces_of
 from runner.recording.reader import Recording
 from runner.recording.recorder import BLOCK_BYTES
 from runner.recording.schema import STEP_NANOSECONDS, Topic

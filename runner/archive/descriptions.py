@@ -11,10 +11,10 @@ import pyarrow as pa
 
 from runner.archive import layout
 from runner.archive.layout import Shape
+from runner.environments.mdp import Mdp
+from runner.environments.naming import actions_in_words, states_in_words
 from runner.errors import RecordingError
-from runner.mdp import Mdp
 from runner.recording.reader import Recording
-from runner.words import actions_in_words, states_in_words
 
 
 def run_table(recording: Recording) -> pa.Table:

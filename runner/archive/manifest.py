@@ -11,11 +11,11 @@ from typing import Any, Final
 from blake3 import blake3
 
 from runner.archive.layout import FORMAT, MANIFEST, VERSION
+from runner.environments.scene import is_whole
 from runner.errors import RecordingError
-from runner.hashing import hash_of
 from runner.recording import schema
 from runner.recording.digest import combine
-from runner.scene import is_whole
+from runner.util.hashing import hash_of
 
 MAX_MANIFEST_BYTES: Final = 1 << 20
 _MOST: Final = 2**53

@@ -12,9 +12,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from runner.cache import CACHE_VARIABLE, RESTORED, cache_folder
 from runner.errors import RecordingError, StorageError
-from runner.runs import RUN_FILE, Run
+from runner.runs.run import RUN_FILE, Run
+from runner.util.cache import CACHE_VARIABLE, RESTORED, cache_folder
 
 ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
 KEPT: Final = 8

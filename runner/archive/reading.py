@@ -19,12 +19,12 @@ from runner.archive.columns import shape_of
 from runner.archive.layout import Shape
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
 from runner.archive.pages import largest_page
+from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
-from runner.files import open_regular
-from runner.mdp import Mdp
-from runner.recording.facts import check_run, environment_of, environment_said, json_object, kind_of
 from runner.recording.index import UNPACKED_A_BYTE
+from runner.recording.metadata import check_run, environment_of, environment_said, json_object, kind_of
 from runner.recording.schema import Topic
+from runner.util.opening import open_regular
 
 MAX_DESCRIPTION_BYTES: Final = 64 << 20
 MAX_ROWS_A_GROUP: Final = 1 << 21

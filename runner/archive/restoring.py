@@ -24,11 +24,11 @@ from runner.config.loading import packing_from
 from runner.config.sections import Recording as Plan
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
+from runner.recording.batching import Piles
 from runner.recording.blocks import HEADER_BYTES, message_record
 from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
-from runner.recording.facts import json_object
 from runner.recording.messages import QTable, encode_q_table
-from runner.recording.piles import Piles
+from runner.recording.metadata import json_object
 from runner.recording.pipeline import Pipeline
 from runner.recording.reader import open_recording
 from runner.recording.recorder import BLOCK_BYTES, capacity_of

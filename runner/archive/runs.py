@@ -19,11 +19,11 @@ from runner.archive.restoring import check
 from runner.archive.targets import Target, no_archive, split_place, target_of, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.locking import locked
 from runner.recording.integrity import checked_survey, may_be_cut
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
-from runner.runs import RECORDING_FILE, RUN_FILE, Run, run_of_id
+from runner.runs.locking import locked
+from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, run_of_id
 
 Report = Callable[[int], None]
 

@@ -16,10 +16,10 @@ from typing import Final, Protocol
 
 from runner.archive import layout
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Manifest, read_manifest
-from runner.documents import sync
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.extras import require
-from runner.files import open_regular
+from runner.util.extras import require
+from runner.util.files import sync
+from runner.util.opening import open_regular
 
 ASIDE: Final = ".partial"
 """The folder of archives that are being written; one level down, where `*/steps.parquet` does not reach."""

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from runner.analysis.frames import agents_of
 from runner.analysis.outcomes import events_of
-from runner.cli.drawing import Drawing
 from runner.cli.output import number
-from runner.frames import agents_of
-from runner.words import actions_in_words, event_in_words, states_in_words
+from runner.drawing.text import Drawing
+from runner.environments.naming import actions_in_words, event_in_words, states_in_words
 
 if TYPE_CHECKING:
     from rich.text import Text

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.cli.output import UNBOUNDED, number, table
-from runner.words import spoken
+from runner.environments.naming import spoken
 
 if TYPE_CHECKING:
     from rich.console import Console

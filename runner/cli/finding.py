@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 from runner.errors import RunnerError
 
 if TYPE_CHECKING:
-    from runner.runs import Run
+    from runner.runs.run import Run
 
 
 def find(name: str, recordings: Path | None) -> Run:
     """Return the run of a name, or of a path, in the chosen folder."""
-    from runner.catalogue.finding import find_run
     from runner.cli.output import say
-    from runner.runs import recordings_folder
+    from runner.runs.catalogue.lookup import find_run
+    from runner.runs.run import recordings_folder
 
     return find_run(name, recordings_folder(recordings), say)
 
@@ -33,9 +33,9 @@ def find_all_recorded(names: Iterable[str], recordings: Path | None) -> list[Run
 
     A name stands for all runs of that name.
     """
-    from runner.catalogue.finding import find_all
     from runner.cli.output import say
-    from runner.runs import recordings_folder
+    from runner.runs.catalogue.lookup import find_all
+    from runner.runs.run import recordings_folder
 
     found: dict[Path, Run] = {}
     for name in names:
@@ -82,7 +82,7 @@ def restored(run: Run) -> Run:
 
 def suggested(run: Run, verb: str, *options: str) -> str:
     """Return what to type for a command on a run; its folder is named if it is not the usual one."""
-    from runner.runs import recordings_folder
+    from runner.runs.run import recordings_folder
 
     words, root = ["dualtaxi", verb, run.run_id, *options], run.folder.parent
     if root.absolute() != recordings_folder().absolute():

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import click
 
-from runner.catalogue.columns import HEADINGS, as_json, in_words
-from runner.catalogue.fields import FIELDS, Kind
 from runner.cli.output import console, draw, table
+from runner.runs.catalogue.columns import HEADINGS, as_json, in_words
+from runner.runs.catalogue.fields import FIELDS, Kind
 
 USUAL: Final = (
     *("id", "name", "config", "seed", "status", "tag", "episodes", "success_percent", "mean_return"),

@@ -31,7 +31,7 @@ def _folders(
     param: click.Parameter,  # noqa: ARG001
     value: tuple[Path, ...],
 ) -> tuple[Path, ...]:
-    from runner.runs import recordings_folder
+    from runner.runs.run import recordings_folder
 
     return value or (recordings_folder(),)
 

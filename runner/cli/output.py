@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.amounts import UNKNOWN, age, amount, duration, number, size
-from runner.documents import finite
+from runner.util.files import finite
+from runner.util.humanize import UNKNOWN, age, amount, duration, number, size
 
 if TYPE_CHECKING:  # imported when something is drawn
     from rich.console import Console, RenderableType

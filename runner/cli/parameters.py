@@ -23,8 +23,8 @@ class RunName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # gener
         incomplete: str,
     ) -> list[CompletionItem]:
         """Return ids and names that begin so, the newest first; paths, once there is a slash."""
-        from runner.catalogue.finding import completions
-        from runner.runs import recordings_folder
+        from runner.runs.catalogue.lookup import completions
+        from runner.runs.run import recordings_folder
 
         if "/" in incomplete or "\\" in incomplete:
             return [CompletionItem(incomplete, type="file")]
@@ -68,7 +68,7 @@ class FilterWord(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # ge
         incomplete: str,
     ) -> list[CompletionItem]:
         """Return the fields that begin so, each with its colon; after `status:` the statuses."""
-        from runner.catalogue.fields import FIELDS, SETTING, STATUSES
+        from runner.runs.catalogue.fields import FIELDS, SETTING, STATUSES
 
         words = {f"{name}:": field.meaning for name, field in FIELDS.items()}
         words[SETTING] = "a value of the configuration, such as config.discount"

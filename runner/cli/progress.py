@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from runner.cli.output import number, size
 
 if TYPE_CHECKING:
-    from runner.execution import Progress
+    from runner.execution.session import Progress
 
 REDRAWS_A_SECOND: Final = 5
 BAR_WIDTH: Final = 12

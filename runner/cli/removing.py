@@ -12,8 +12,8 @@ from runner.cli.output import UNKNOWN, age, console, draw, number, print_json, s
 from runner.errors import RunnerError
 
 if TYPE_CHECKING:
-    from runner.catalogue.removal import Removal
-    from runner.runs import Run
+    from runner.runs.catalogue.removal import Removal
+    from runner.runs.run import Run
 
 _MOST_DRAWN: Final = 1000
 """Rows that are fitted to a terminal; more are printed as in a file, which is far quicker."""
@@ -43,7 +43,7 @@ def carry_out(
     Raises:
         RunnerError: there is nobody to ask.
     """
-    from runner.catalogue.removal import clean, remove, total
+    from runner.runs.catalogue.removal import clean, remove, total
 
     if removals and not as_json:
         _draw(removals)
@@ -63,7 +63,7 @@ def carry_out(
 
 
 def _ask(removals: Sequence[Removal], yes: bool) -> None:
-    from runner.catalogue.removal import total
+    from runner.runs.catalogue.removal import total
 
     if yes:
         return
@@ -74,7 +74,7 @@ def _ask(removals: Sequence[Removal], yes: bool) -> None:
 
 
 def _as_json(removals: Sequence[Removal], kept: dict[str, str], dry_run: bool) -> dict[str, Any]:
-    from runner.catalogue.removal import total
+    from runner.runs.catalogue.removal import total
 
     runs = [
         {

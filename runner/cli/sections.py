@@ -34,7 +34,7 @@ def require_one_form(as_json: bool, as_markdown: bool) -> None:
 def require_page(path: Path, force: bool) -> None:
     """Refuse to begin where the page could not be made in the end."""
     from runner.export.places import require_new
-    from runner.export.report import require_packages
+    from runner.export.reports.report import require_packages
 
     require_packages()
     require_new(path, force)

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from runner.cli.finding import find_recorded, suggested
 from runner.cli.output import UNKNOWN, draw, duration, facts, print_json, say, size
 from runner.errors import RecordingError, RunnerError, RunNotFound
-from runner.runs import RECORDING_FILE, RUN_FILE, recordings_folder
+from runner.runs.run import RECORDING_FILE, RUN_FILE, recordings_folder
 
 if TYPE_CHECKING:
     from runner.api import Interrupt
-    from runner.execution import Report
-    from runner.runs import Run
+    from runner.execution.session import Report
+    from runner.runs.run import Run
 
 
 def recording_of(name: str, recordings: Path | None) -> tuple[Path, Run | None]:

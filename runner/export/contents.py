@@ -6,10 +6,10 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from runner.environments.scene import is_whole
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.scene import is_whole
 
 
 def shortcomings(recording: Recording) -> list[str]:

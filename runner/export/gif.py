@@ -17,14 +17,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from runner.analysis.frames import agents_of
+from runner.drawing import svg
+from runner.environments.mdp import Mdp
+from runner.environments.naming import events_in_words, exploration_in_words, spoken, states_in_words
 from runner.errors import RecordingError
-from runner.export import svg
-from runner.export.report_replay import Episode, deeds_in_words
-from runner.extras import missing, require
-from runner.frames import agents_of
-from runner.mdp import Mdp
+from runner.export.reports.episode import Episode, deeds_in_words
 from runner.recording.reader import Recording
-from runner.words import events_in_words, exploration_in_words, spoken, states_in_words
+from runner.util.extras import missing, require
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

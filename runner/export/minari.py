@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.export.contents import whole_ranges
 from runner.export.minari_loops import Episode, loop_episodes, space_of
-from runner.extras import require
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.util.extras import require
 
 if TYPE_CHECKING:
     import gymnasium

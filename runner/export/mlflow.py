@@ -18,8 +18,8 @@ from typing import Any, Final
 from runner.errors import RunnerError
 from runner.export.contents import flat_text
 from runner.export.scalars import Measures, created, episodes, measures, seconds_of
-from runner.extras import require
 from runner.recording.reader import Recording
+from runner.util.extras import require
 
 RUN_TAG: Final = "dualtaxi.run_id"
 DIGEST_TAG: Final = "dualtaxi.content_digest"

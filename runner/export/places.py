@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from runner.errors import RunnerError, StorageError
-from runner.extras import require
+from runner.util.extras import require
 
 
 def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:

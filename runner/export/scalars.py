@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+from runner.analysis.frames import agents_of, event_names_of
 from runner.errors import RecordingError
-from runner.frames import agents_of, event_names_of
 from runner.recording.reader import Recording
 from runner.recording.schema import EVAL_EPISODE, SCALAR_TOPIC, STEP_NANOSECONDS, TRAIN_EPISODE
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Final
 
 from runner.export.scalars import created, episodes, measures, seconds_of
-from runner.extras import require
 from runner.recording.reader import Recording
+from runner.util.extras import require
 
 OURS: Final = ("events.out.tfevents.*",)
 

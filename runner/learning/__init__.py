@@ -1,5 +1,5 @@
 """Learning: a compiled kernel over transition arrays; it knows no files, no clock, no command line."""
 
-from runner.compiled import watch
+from runner.learning.numba_cache import watch
 
 watch(__file__)

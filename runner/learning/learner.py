@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig
 from runner.config.sections import RandomTable
+from runner.environments.mdp import Mdp
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.learning import algorithms, kernel
 from runner.learning.algorithms import Rules, Tables
 from runner.learning.kernel import Tally
 from runner.learning.model import Model, build_model
 from runner.learning.schedules import compile_schedule, schedule_value
-from runner.mdp import Mdp
 
 Held = Mapping[str, NDArray[np.float64]]
 """What one learner holds: its Q-table as `q` and, by name, whatever else its algorithm keeps (`KEPT`)."""

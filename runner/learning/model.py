@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.mdp import Mdp
+from runner.environments.mdp import Mdp
 
 PENALTY_BIT = np.uint32(1 << 31)
 """Bit of an event class that marks a penalty; events themselves use the bits below it."""

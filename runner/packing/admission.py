@@ -8,17 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from runner.documents import sync, write_whole
 from runner.errors import RecordingError
-from runner.labels import LABELS_FILE, RUN_NAME_EXPECTED, RUN_NAME_PATTERN, Labels, as_json
 from runner.packing.packing import facts_bytes, run_facts
 from runner.packing.present import Occupied, known, link, met, settled
 from runner.packing.unpacking import workplace
 from runner.recording.integrity import is_merely_cut_off
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
-from runner.run_file import parse_run_file
-from runner.runs import MADE_BY, RECORDING_FILE, RUN_FILE, Run, run_at
+from runner.recording.run_file import parse_run_file
+from runner.runs.labels import LABELS_FILE, RUN_NAME_EXPECTED, RUN_NAME_PATTERN, Labels, as_json
+from runner.runs.run import MADE_BY, RECORDING_FILE, RUN_FILE, Run, run_at
+from runner.util.files import sync, write_whole
 
 
 @dataclass(frozen=True)

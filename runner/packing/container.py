@@ -23,10 +23,10 @@ from blake3 import blake3
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from runner.errors import RunnerError
-from runner.files import open_regular
-from runner.hashing import hash_of
-from runner.labels import LABELS_FILE, MAX_LABELS_BYTES
-from runner.runs import RECORDING_FILE, RUN_FILE
+from runner.runs.labels import LABELS_FILE, MAX_LABELS_BYTES
+from runner.runs.run import RECORDING_FILE, RUN_FILE
+from runner.util.hashing import hash_of
+from runner.util.opening import open_regular
 
 VERSION: Final = 0
 MANIFEST_FILE: Final = "manifest.json"

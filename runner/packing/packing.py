@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import RunnerError, StorageError
-from runner.labels import LABELS_FILE
 from runner.packing.container import (
     MEMBERS,
     VERSION,
@@ -25,7 +24,8 @@ from runner.packing.container import (
 )
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of, rewrite
-from runner.runs import RECORDING_FILE, RUN_FILE, Run
+from runner.runs.labels import LABELS_FILE
+from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
 
 SUFFIX: Final = ".dualtaxi"
 PRIVATE: Final = ("host", "user", "command", "directory")

@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from runner.catalogue.finding import with_id
-from runner.documents import sync, write_whole
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.labels import MAX_TAGS, Labels, change_labels
-from runner.locking import locked
 from runner.recording.rewriting import content_of, continues
-from runner.runs import RECORDING_FILE, RUN_FILE, Run, run_at, runs_in
+from runner.runs.catalogue.lookup import with_id
+from runner.runs.labels import MAX_TAGS, Labels, change_labels
+from runner.runs.locking import locked
+from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, run_at, runs_in
+from runner.util.files import sync, write_whole
 
 UNFINISHED: Final = ("interrupted", "failed")
 """What the status of a run is that can be gone on with."""

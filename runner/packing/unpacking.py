@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.labels import LABELS_FILE, read_labels
 from runner.packing.container import Manifest, Pack, PackError, opened
 from runner.packing.packing import facts_bytes, run_facts
 from runner.packing.present import Occupied, known, met, settled
-from runner.recording.facts import json_object
+from runner.recording.metadata import json_object
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of, rewrite
-from runner.run_file import parse_run_file
-from runner.runs import RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at
+from runner.recording.run_file import parse_run_file
+from runner.runs.labels import LABELS_FILE, read_labels
+from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at
 
 
 @dataclass(frozen=True)

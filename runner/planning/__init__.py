@@ -13,13 +13,13 @@ from runner.planning.evaluation import (
     evaluate_stochastic_policy,
     random_policy,
 )
+from runner.planning.optimality import Yardstick
 from runner.planning.optimum import (
     best_response,
     best_response_to_stochastic,
     greedy_policy,
     optimal_values,
 )
-from runner.planning.yardstick import Yardstick
 
 __all__ = [
     "Cycle",

@@ -11,10 +11,10 @@ from typing import Final
 
 from blake3 import blake3
 
-from runner.cache import cache_folder
-from runner.documents import finite, read_object, write_whole
-from runner.mdp import Mdp
+from runner.environments.mdp import Mdp
 from runner.planning.evaluation import evaluate_stochastic_policy, random_policy
+from runner.util.cache import cache_folder
+from runner.util.files import finite, read_object, write_whole
 
 MAX_WORK: Final = 1_000_000_000
 """Outcomes of joint actions times the step limit; DualTaxi has a third of it, and takes about a second."""

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
-from runner.mdp import Mdp
 from runner.planning import kernel
 from runner.planning.kernel import Chain, Paths
 from runner.planning.optimum import sweep_tolerance

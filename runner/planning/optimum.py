@@ -8,8 +8,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
-from runner.mdp import Mdp
 from runner.planning import kernel
 
 TOLERANCE: Final = 1e-10

@@ -11,8 +11,8 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from runner.environments.mdp import MAX_ARRAYS_BYTES
 from runner.errors import RecordingError
-from runner.mdp import MAX_ARRAYS_BYTES
 
 _MAX_WINDOW: Final = 1 << 27
 _HEAD_BYTES: Final = 1024

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.mdp import step_counts
+from runner.environments.mdp import step_counts
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.schema import NEVER

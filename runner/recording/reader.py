@@ -23,15 +23,15 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from runner.environments.mdp import Mdp
 from runner.errors import RecordingError, RunnerError
-from runner.labels import read_labels
-from runner.mdp import Mdp
-from runner.owner import is_owned
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
+from runner.recording.chunk_cache import RecordStore
 from runner.recording.chunks import MAX_CHUNK_BYTES
-from runner.recording.contents import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
-from runner.recording.facts import (
+from runner.recording.index import read_index
+from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
+from runner.recording.metadata import (
     check_facts,
     environment_of,
     environment_said,
@@ -41,13 +41,13 @@ from runner.recording.facts import (
     sizes_of,
     spaces_of,
 )
-from runner.recording.index import read_index
-from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
+from runner.recording.run_file import Summary, parse_summary
+from runner.recording.scan import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
 from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
-from runner.recording.store import RecordStore
 from runner.recording.topic_chunks import TopicChunks, chunks_by_topic
-from runner.run_file import Summary, parse_summary
+from runner.runs.labels import read_labels
+from runner.runs.liveness import is_owned
 
 MAX_EPISODE_BYTES: Final = 128 << 20
 """The most that `episode_steps` gives as one array: some 1.5 million steps."""

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
+from runner.recording.batching import Piles
 from runner.recording.blocks import Sizes, blank_records, block_counts, message_record, record_dtype
 from runner.recording.chunks import Packing
 from runner.recording.digest import combine
-from runner.recording.past import Past
-from runner.recording.piles import Piles
 from runner.recording.pipeline import Pipeline
+from runner.recording.reference import Past
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 

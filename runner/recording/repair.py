@@ -18,19 +18,19 @@ from typing import Final
 import numpy as np
 from mcap.opcode import Opcode
 
+from runner.environments.scene import is_whole
 from runner.errors import RecordingError, StorageError
-from runner.files import open_regular
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
-from runner.recording.contents import Report, asks_for_indexes, attachment_of, metadata_of, read_chunk
-from runner.recording.facts import NEEDED, check_run, json_object, kind_of, sizes_of
 from runner.recording.integrity import check_integrity, places
+from runner.recording.metadata import NEEDED, check_run, json_object, kind_of, sizes_of
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import copied_chunk
 from runner.recording.salvage import DamagedFile
+from runner.recording.scan import Report, asks_for_indexes, attachment_of, metadata_of, read_chunk
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
-from runner.scene import is_whole
+from runner.util.opening import open_regular
 
 _CHUNK_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
 _MOST_MESSAGES: Final = 2**62

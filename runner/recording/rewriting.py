@@ -13,10 +13,13 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.files import open_regular
 from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import Chunk, message_index
-from runner.recording.contents import (
+from runner.recording.digest import ContentHash, combine
+from runner.recording.integrity import check_integrity, places
+from runner.recording.reader import open_recording
+from runner.recording.run_file import Summary
+from runner.recording.scan import (
     UNREADABLE,
     Part,
     asks_for_indexes,
@@ -25,12 +28,9 @@ from runner.recording.contents import (
     read_chunk,
     walk,
 )
-from runner.recording.digest import ContentHash, combine
-from runner.recording.integrity import check_integrity, places
-from runner.recording.reader import open_recording
 from runner.recording.schema import KINDS, STEP, TOPIC_OF, TOPICS, Topic
 from runner.recording.writer import RecordingFile
-from runner.run_file import Summary
+from runner.util.opening import open_regular
 
 Times = NDArray[np.uint64]
 Change = Callable[[str, dict[str, str]], dict[str, str]]

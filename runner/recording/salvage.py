@@ -17,8 +17,8 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import RecordingError
 from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head
-from runner.recording.contents import UNREADABLE, Report, attachment_of, metadata_of, read_chunk
 from runner.recording.index import IN_DATA
+from runner.recording.scan import UNREADABLE, Report, attachment_of, metadata_of, read_chunk
 
 _LIKE_A_CHUNK: Final = re.compile(
     rb"\x06(?=.{3}[\0-\x04]\0{4}"  # its length

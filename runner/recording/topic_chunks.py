@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import HEADER_BYTES, MESSAGE_HEAD
+from runner.recording.chunk_cache import RecordStore
 from runner.recording.index import ChunkEntry, ChunkTable, Index
 from runner.recording.schema import ALL_TOPICS, Topic
-from runner.recording.store import RecordStore
 
 _MESSAGE: Final = int(Opcode.MESSAGE)
 

@@ -23,8 +23,8 @@ from blake3 import blake3
 from numpy.typing import NDArray
 
 import runner.learning
-from runner.cache import TABLES, cache_folder
 from runner.recording.reader import Recording
+from runner.util.cache import TABLES, cache_folder
 
 CHECKPOINT_STEPS: Final = 1 << 20
 """Training steps between checkpoints: replayed in well under half a second."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
-from runner.mdp import Mdp
 
 
 def check_steps(block: NDArray[np.void], mdp: Mdp, where: str, phase: str = "training") -> None:

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.config import from_mapping
+from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.learning import kernel
 from runner.learning.learner import Held, Learner, held_of, kinds_of
-from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording

@@ -18,17 +18,17 @@ from runner.service import health, login, pages
 from runner.service.api import comparing, files, jobs, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
-from runner.service.kept import Kept
+from runner.service.jobs.scheduler import Jobs
 from runner.service.logs import LOG, AccessLog
 from runner.service.played import load_sweep_libraries
 from runner.service.problems import answer_errors, answers
 from runner.service.processes import ProcessPool
 from runner.service.receiving.model import Upload, UploadLimits
 from runner.service.receiving.uploads import Uploads
+from runner.service.response_cache import Kept
 from runner.service.security import Tokens
 from runner.service.sessions import Sessions
 from runner.service.settings import Settings
-from runner.service.work import Jobs
 from runner.sweep.names import sweeps_in
 
 API: Final = "/api/v1"

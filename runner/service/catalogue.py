@@ -10,16 +10,16 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from runner.catalogue.database import Version, version
-from runner.catalogue.finding import Candidate, all_of_name, answering, run_of
-from runner.catalogue.folders import Depth
-from runner.catalogue.index import look
 from runner.errors import RunnerError, RunNotFound
-from runner.finding import the_one
-from runner.runs import Run, run_of_id
+from runner.runs.catalogue.database import Version, version
+from runner.runs.catalogue.folders import Depth
+from runner.runs.catalogue.index import look
+from runner.runs.catalogue.lookup import Candidate, all_of_name, answering, run_of
+from runner.runs.resolve import the_one
+from runner.runs.run import Run, run_of_id
 
 if TYPE_CHECKING:
-    from runner.catalogue.index import Index
+    from runner.runs.catalogue.index import Index
 
 Found = TypeVar("Found")
 

@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.documents import finite
+from runner.analysis.frames import Phase, episode_columns, evaluation_records, step_columns, training_records
 from runner.errors import RunnerError
-from runner.frames import Phase, episode_columns, evaluation_records, step_columns, training_records
 from runner.recording.reader import open_recording
-from runner.service.refused import Refused
+from runner.service.errors import Refused
+from runner.util.files import finite
 
 if TYPE_CHECKING:
     from runner.analysis.series import RunSeries
     from runner.export.rerun.selection import Request
-    from runner.runs import Run
+    from runner.runs.run import Run
 
 Which = Literal["evaluations", "training", "optimality"]
 
@@ -174,8 +174,8 @@ def plot(paths: Sequence[Path], form: str) -> bytes:
     import tempfile
 
     from runner.analysis.groups import groups_of
-    from runner.export.plots import panels_of
-    from runner.export.plots_figure import matplotlib_of, save_figure
+    from runner.export.plots.figure import matplotlib_of, save_figure
+    from runner.export.plots.metrics import panels_of
 
     matplotlib_of("a plot")
     groups = groups_of(_series(paths))

@@ -9,12 +9,12 @@ from fastapi import Depends, Path, Request
 
 from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
-from runner.runs import Run
+from runner.runs.run import Run
 from runner.service.catalogue import Catalogue
-from runner.service.kept import Kept
+from runner.service.jobs.scheduler import Jobs
 from runner.service.processes import ProcessPool
+from runner.service.response_cache import Kept
 from runner.service.settings import Settings
-from runner.service.work import Jobs
 
 
 def settings_of(request: Request) -> Settings:

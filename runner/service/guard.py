@@ -16,8 +16,8 @@ from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
 from runner.errors import RunnerError
+from runner.service.errors import Refused
 from runner.service.problems import status_of
-from runner.service.refused import Refused
 from runner.service.security import (
     SAFE_METHODS,
     Token,

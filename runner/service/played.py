@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.recording.reader import Recording, open_recording
-from runner.runs import Run
+from runner.runs.run import Run
 from runner.service.settings import without_folders
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ def part(path: Path, which: tuple[int, ...], start: int, steps: int) -> bytes:
     Raises:
         RecordingError: there is no such episode or step, or no steps were recorded.
     """
-    from runner.export import svg
-    from runner.export.report_replay import payload, training_episode, trial
+    from runner.drawing import svg
+    from runner.export.reports.episode import payload, training_episode, trial
 
     with open_recording(path) as recording:
         recording.require_job("a replay in the page", "The Rerun viewer shows what it recorded.")
@@ -66,7 +66,7 @@ def part(path: Path, which: tuple[int, ...], start: int, steps: int) -> bytes:
 
 def random_policy(path: Path) -> bytes:
     """Return what a random policy achieves in a recording's environment, as a sentence or nothing."""
-    from runner.description import random_policy_sentence
+    from runner.analysis.summary import random_policy_sentence
 
     with open_recording(path) as recording:
         return random_policy_sentence(recording).encode()
@@ -74,7 +74,7 @@ def random_policy(path: Path) -> bytes:
 
 def typical(path: Path) -> bytes:
     """Return the address of the episode that is most worth looking at: `eval/3000/17`, or `train/0`."""
-    from runner.export.report_replay import last_episode, last_whole_evaluation, typical_trial
+    from runner.export.reports.episode import last_episode, last_whole_evaluation, typical_trial
 
     with open_recording(path) as recording:
         if last_whole_evaluation(recording) is None:
@@ -85,8 +85,8 @@ def typical(path: Path) -> bytes:
 
 def learned(path: Path) -> bytes:
     """Return policy and values of a run at stages of learning, as JSON: a row of maps for each."""
-    from runner.export.report_maps import maps_of, stages_of
-    from runner.frames import agents_of
+    from runner.analysis.frames import agents_of
+    from runner.export.reports.maps import maps_of, stages_of
 
     with open_recording(path) as recording:
         if recording.kind != "job":
@@ -101,7 +101,7 @@ def difference(a: Run, b: Run) -> bytes:
     """Return in what two runs differ, as JSON: what the page of `dualtaxi diff` tells and shows."""
     from runner.analysis.diff import diff
     from runner.analysis.diff.asked import with_seconds, without
-    from runner.export.diff_page import told_of
+    from runner.export.reports.diff import told_of
 
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
         told = told_of(without(with_seconds(diff(ours, theirs), a, b), ()), ours, theirs)
@@ -110,7 +110,7 @@ def difference(a: Run, b: Run) -> bytes:
 
 def _typical_start(recording: Recording) -> int:
     from runner.errors import RecordingError
-    from runner.export.report_replay import trial, typical_trial
+    from runner.export.reports.episode import trial, typical_trial
 
     try:
         return int(trial(recording, *typical_trial(recording)).states[0])
@@ -120,8 +120,8 @@ def _typical_start(recording: Recording) -> int:
 
 def spot(run: Run, at: tuple[int, ...]) -> bytes:
     """Return the step of the viewer's timeline at (episode, t) or (training episodes before, trial, t)."""
+    from runner.export.rerun.positions import with_spot
     from runner.export.rerun.selection import Request
-    from runner.export.rerun.spots import with_spot
 
     return str(with_spot(run, Request(), at or None).time).encode()
 
@@ -206,8 +206,8 @@ def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
 def _learning(results: Results, recordings: Path) -> dict[str, Any]:
     """Return how the best and the median trial of a sweep learned, or why that cannot be shown."""
     from runner.errors import RunnerError
-    from runner.export.plots_figure import COLOURS, footnote
-    from runner.export.svg_charts import panel_svgs
+    from runner.export.plots.figure import COLOURS, footnote
+    from runner.export.plots.svg import panel_svgs
     from runner.sweep.plots import learning
 
     try:

@@ -24,10 +24,10 @@ from runner.errors import (
     RunNotFound,
     StorageError,
 )
+from runner.service.errors import Refused
+from runner.service.jobs.queue import NoSuchJob, NotPossibleNow, QueueFull
 from runner.service.logs import LOG
-from runner.service.queue import NoSuchJob, NotPossibleNow, QueueFull
 from runner.service.receiving.model import Conflict, TooLarge, TooMany
-from runner.service.refused import Refused
 from runner.service.settings import Settings
 
 _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {

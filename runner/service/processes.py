@@ -22,14 +22,14 @@ from pathlib import Path
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
-from runner.service.refused import Refused
+from runner.service.errors import Refused
 
 Args = ParamSpec("Args")
 Answer = TypeVar("Answer")
 
 MAX_WAITING: Final = 32
 """Calls that may wait for a process; more are refused."""
-_PRELOADED: Final = ["runner.service.preloaded"]
+_PRELOADED: Final = ["runner.service.jobs.preload"]
 
 
 class WorkFailed(Refused):

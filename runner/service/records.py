@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
-from runner.documents import read_object, write_whole
 from runner.errors import StorageError
+from runner.util.files import read_object, write_whole
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

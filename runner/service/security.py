@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import RunnerError
+from runner.service.errors import Refused
 from runner.service.records import RecordsFile
-from runner.service.refused import Refused
 
 READ: Final = "read"
 WRITE: Final = "write"

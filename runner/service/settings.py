@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from runner.cache import cache_folder
 from runner.errors import RunnerError
+from runner.util.cache import cache_folder
 
 CONFIG_VARIABLE: Final = "XDG_CONFIG_HOME"
 MB: Final = 1_000_000

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.export.svg_charts import SMALL, Chart, Scale, colour_of_line, labelled
-from runner.export.svg_maps import LEVELS, colour_of
+from runner.drawing.svg_maps import LEVELS, colour_of
+from runner.export.plots.svg import SMALL, Chart, Scale, colour_of_line, labelled
 from runner.sweep.plots import Axis, Picture
 
 Values = NDArray[np.float64]

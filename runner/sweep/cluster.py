@@ -13,8 +13,8 @@ from dataclasses import replace
 from typing import Any, Final, Self
 
 from runner.errors import RunnerError
-from runner.extras import require
 from runner.sweep.task import Result, Task, do
+from runner.util.extras import require
 
 _GOODBYE_SECONDS: Final = 30.0
 _KNOCK_SECONDS: Final = 5.0

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.groups import Group
-from runner.export.plots import Panel
-from runner.export.plots_figure import (
+from runner.export.plots.figure import (
     COLOURS,
     INK,
     STYLE,
@@ -22,6 +21,7 @@ from runner.export.plots_figure import (
     matplotlib_of,
     number_on_axis,
 )
+from runner.export.plots.metrics import Panel
 from runner.sweep.plots import Axis, Picture
 
 if TYPE_CHECKING:

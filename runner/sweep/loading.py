@@ -224,7 +224,7 @@ def _placed(sweep: Sweep, values: Mapping[str, Any], document: Document) -> Expe
 
 
 def _check_environment(experiment: ExperimentConfig, path: str, document: Document) -> None:
-    from runner.environments import load_mdp
+    from runner.environments.loading import load_mdp
 
     try:
         load_mdp(experiment.env.id, experiment.env.kwargs, experiment.rewards)

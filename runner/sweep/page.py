@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from runner.analysis.groups import Group
-from runner.export.plots_figure import COLOURS, footnote
-from runner.export.report import TEMPLATES, require_packages, templates
-from runner.export.svg_charts import panel_svgs
+from runner.export.plots.figure import COLOURS, footnote
+from runner.export.plots.svg import panel_svgs
+from runner.export.reports.report import TEMPLATES, require_packages, templates
 from runner.sweep.charts import parallel_svg, parameter_svgs
 from runner.sweep.plots import learning, picture_of
 from runner.sweep.results import Results, sections

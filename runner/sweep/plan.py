@@ -7,21 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from runner.amounts import size
 from runner.config import ConfigError, ExperimentConfig, from_mapping
-from runner.environments import load_mdp
+from runner.config.job import Job
+from runner.environments.loading import load_mdp
+from runner.environments.mdp import Mdp
 from runner.errors import StorageError
-from runner.estimate import estimate, free_bytes
-from runner.execution import run_job
-from runner.job import Job
-from runner.mdp import Mdp
+from runner.execution.estimate import estimate, free_bytes
+from runner.execution.session import run_job
 from runner.recording.reader import open_recording
-from runner.runs import create_run
+from runner.runs.run import create_run
 from runner.sweep.model import Limits, Sweep
 from runner.sweep.readings import curve_of
 from runner.sweep.search import Search
 from runner.sweep.task import Task
 from runner.sweep.trials import Room, Standing
+from runner.util.humanize import size
 
 BYTES_AN_EPISODE: Final = 40
 BYTES_AN_EVALUATION: Final = 1500

@@ -14,9 +14,9 @@ from runner.analysis.groups import Group
 from runner.analysis.readings import read_series
 from runner.archive.places import at_hand
 from runner.errors import RunnerError
-from runner.export.plots import Panel, panels_of
-from runner.finding import find_run
+from runner.export.plots.metrics import Panel, panels_of
 from runner.recording.reader import open_recording
+from runner.runs.resolve import find_run
 from runner.sweep.model import Range
 from runner.sweep.results import Ranked, Results, spoken
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from runner.analysis.compare.moments import first_crossing
 from runner.analysis.compare.statistics import NEVER
+from runner.analysis.frames import agents_of, evaluation_record, event_names_of
 from runner.analysis.readings import evaluation_readings, exact_readings, training_readings
 from runner.errors import RunnerError, nearest
-from runner.frames import agents_of, evaluation_record, event_names_of
 from runner.recording.reader import Recording
 from runner.sweep.model import Objective
 

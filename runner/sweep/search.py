@@ -13,8 +13,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from runner.extras import require
 from runner.sweep.model import Objective, Range, SweepFile
+from runner.util.extras import require
 
 
 def require_optuna() -> Any:

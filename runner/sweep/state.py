@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.config.document import read_yaml, write_yaml
+from runner.config.job import identity_of
 from runner.config.loading import read_text
-from runner.documents import read_object, write_whole
 from runner.errors import ConfigError, RunnerError, StorageError, nearest
-from runner.job import identity_of
-from runner.locking import acquired
-from runner.runs import Run, list_runs
+from runner.runs.locking import acquired
+from runner.runs.run import Run, list_runs
 from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep
 from runner.sweep.names import FILE, folder_of, sweeps_in, tag_of
+from runner.util.files import read_object, write_whole
 
 FAILED: Final = "failed.json"
 MAX_FAILED_BYTES: Final = 8 << 20
@@ -102,7 +102,7 @@ def require_startable(sweep: Sweep, recordings: Path, resume: bool, accept_chang
 
 def _require_same_makers(name: str, recordings: Path) -> None:
     """Refuse runs that cannot be gone on with as they are: without them a search would go elsewhere."""
-    from runner.resume import require_same_makers
+    from runner.execution.resume import require_same_makers
 
     failed = failures_of(name, recordings)
     for identity, run in runs_of(name, recordings).items():

@@ -14,16 +14,16 @@ from typing import Any, Literal
 
 from runner.archive.places import at_hand
 from runner.config import from_mapping
-from runner.environments import load_mdp
+from runner.config.job import Job
+from runner.environments.loading import load_mdp
+from runner.environments.mdp import Mdp
 from runner.errors import RecordingError, RunnerError
-from runner.execution import Progress, run_job
-from runner.finding import find_run
-from runner.job import Job
-from runner.labels import Labels, change_labels
-from runner.mdp import Mdp
+from runner.execution.resume import resume
+from runner.execution.session import Progress, run_job
 from runner.recording.reader import open_recording
-from runner.resume import resume
-from runner.runs import Run, create_run, list_runs, unless_empty
+from runner.runs.labels import Labels, change_labels
+from runner.runs.resolve import find_run
+from runner.runs.run import Run, create_run, list_runs, unless_empty
 from runner.sweep.model import Objective
 from runner.sweep.readings import Curve, curve_of, hopeless, readings
 from runner.sweep.state import PRUNED, is_over

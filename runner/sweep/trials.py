@@ -14,8 +14,8 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from runner.config import ConfigError
-from runner.job import identity_of
-from runner.runs import Run
+from runner.config.job import identity_of
+from runner.runs.run import Run
 from runner.sweep import state
 from runner.sweep.local import Workers
 from runner.sweep.model import Sweep

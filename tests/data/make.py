@@ -17,15 +17,15 @@ from blake3 import blake3
 from gymnasium.vector import SyncVectorEnv
 
 import runner
-from runner import execution
 from runner.config import load
-from runner.job import Job
+from runner.config.job import Job
+from runner.execution import session
+from runner.loops import loop
 from runner.recording import open as open_recording
 from runner.replay.tables import last_step, tables_at
-from runner.runs import Run
-from runner.wrappers import loop
-from tests.runner.wrappers.loops import Leaving, drive, parallel, play
-from tests.runner.wrappers.loops import make as make_env
+from runner.runs.run import Run
+from tests.runner.loops.making import Leaving, drive, parallel, play
+from tests.runner.loops.making import make as make_env
 
 HERE = Path(__file__).parent
 NAMES = ("cooperative", "competitive")
@@ -71,7 +71,7 @@ def loop_expectations(path: Path) -> dict[str, Any]:
 
 def make(name: str) -> None:
     """Make one of them, with nothing in it that tells of the machine but its kind."""
-    execution.provenance = made_by
+    session.provenance = made_by
     config = load(HERE / f"{name}.yaml")
     facts = {
         "run_id": name,
@@ -81,7 +81,7 @@ def make(name: str) -> None:
     }
     with tempfile.TemporaryDirectory() as folder:
         run = Run(Path(folder), facts | {"status": "running", "config": config.to_mapping()})
-        done = execution.run_job(Job(config, config.seeds[0]), run)
+        done = session.run_job(Job(config, config.seeds[0]), run)
         done.recording.replace(HERE / f"{name}.mcap")
 
 

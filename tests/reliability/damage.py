@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from runner.errors import RunnerError
-from runner.verify import verify
+from runner.execution.verify import verify
 from tests.reliability.reading import small_recordings
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import atheris
 
-with atheris.instrument_imports(include=["runner.recording", "runner.mdp"]):
+with atheris.instrument_imports(include=["runner.recording", "runner.environments.mdp"]):
     from runner.recording.repair import repair
 
 from runner.errors import RunnerError

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from runner.config import from_mapping
+from runner.environments.naming import action_names, states_in_words
 from runner.errors import RunnerError
 from runner.recording import Recording, schema
 from runner.recording import open as open_recording
 from runner.recording.integrity import check_integrity
-from runner.words import action_names, states_in_words
 from tests.runner.recording.making import LAKE, make_run
 
 TINY: dict[str, Any] = {

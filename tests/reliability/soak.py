@@ -36,17 +36,17 @@ from typing import Any
 from mcap.reader import make_reader
 
 from runner.config import ExperimentConfig
+from runner.config.job import Job
 from runner.errors import RecordingError, RunnerError
-from runner.execution import run_job
-from runner.finding import find_run
-from runner.job import Job
+from runner.execution.resume import resume
+from runner.execution.session import run_job
+from runner.execution.verify import verify
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.recorder import Recorder
 from runner.recording.repair import repair
-from runner.resume import resume
-from runner.runs import Run, create_run, list_runs
-from runner.verify import verify
+from runner.runs.resolve import find_run
+from runner.runs.run import Run, create_run, list_runs
 from tests.runner.recording.making import SMALL_MAP, experiment
 
 COMMON: dict[str, Any] = {

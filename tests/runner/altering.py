@@ -11,8 +11,8 @@ import numpy as np
 from runner.recording import open as open_recording
 from runner.recording.blocks import HEADER, HEADER_BYTES
 from runner.recording.chunks import Packing, encode_chunk
-from runner.recording.contents import survey
 from runner.recording.repair import repair
+from runner.recording.scan import survey
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
 

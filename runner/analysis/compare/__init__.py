@@ -15,12 +15,12 @@ from typing import Final
 
 import numpy as np
 
-from runner.amounts import listed
 from runner.analysis.compare import statistics
 from runner.analysis.compare.moments import Moment, higher_is_better, value_of
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.groups import Group
 from runner.analysis.series import is_loop, points_of, title_of
+from runner.util.humanize import listed
 
 THRESHOLDS: Final = 101
 Measured = dict[int, tuple[list[str], float]]

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from runner.amounts import listed
 from runner.analysis.compare import Comparison, GroupResult, MetricResult, PairResult
 from runner.analysis.compare.statistics import Estimate
 from runner.analysis.sections import Grid, Section
+from runner.util.humanize import listed
 
 _LEVELS = 5
 """So many points of a performance profile are printed."""

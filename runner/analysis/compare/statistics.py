@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.extras import require
+from runner.util.extras import require
 
 Values = NDArray[np.float64]
 

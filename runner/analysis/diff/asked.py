@@ -10,7 +10,7 @@ from typing import Any
 from runner.analysis.diff import PARTS, Change, RunDiff
 from runner.analysis.diff.settings import changes_in
 from runner.errors import RunnerError
-from runner.runs import Run
+from runner.runs.run import Run
 
 
 def with_seconds(difference: RunDiff, a: Run, b: Run) -> RunDiff:

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from runner.analysis.diff.tables import own_actions_in_words
 from runner.analysis.diff.trajectory import Parting
+from runner.analysis.frames import agents_of
+from runner.environments.naming import actions_in_words, agent_actions, exploration_in_words, states_in_words
 from runner.errors import RecordingError
-from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.checks import check_steps
-from runner.words import actions_in_words, agent_actions, exploration_in_words, states_in_words
 
 if TYPE_CHECKING:
     from runner.learning.learner import Held

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from runner.analysis.frames import agents_of
 from runner.errors import RunnerError, nearest
-from runner.frames import agents_of
 from runner.recording.reader import Recording
 
 SERIES = {

@@ -8,7 +8,7 @@ from typing import Any
 
 from runner.analysis.diff import NOT_CONTENT, Cause, Change, Parting, RunDiff
 from runner.analysis.sections import Grid, Section
-from runner.words import spoken
+from runner.environments.naming import spoken
 
 MOST_NAMED = 4
 """So many settings are named in the first sentences."""

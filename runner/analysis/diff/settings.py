@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.mdp import Mdp
-from runner.words import actions_in_words, states_in_words
+from runner.environments.mdp import Mdp
+from runner.environments.naming import actions_in_words, states_in_words
 
 EXAMPLES = 10
 """How many differing transitions are spelled out."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.mdp import Mdp
+from runner.environments.naming import action_names, actions_in_words, states_in_words
 from runner.errors import RecordingError
-from runner.mdp import Mdp
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
-from runner.words import action_names, actions_in_words, states_in_words
 
 LARGEST = 5
 """How many cells with the largest differences are named."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.mdp import Mdp
-from runner.words import states_in_words
+from runner.environments.mdp import Mdp
+from runner.environments.naming import states_in_words
 
 MOST = 5
 """So many states are named."""

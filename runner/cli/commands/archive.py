@@ -13,7 +13,7 @@ from runner.cli.output import draw, facts, print_json, say, size
 
 if TYPE_CHECKING:
     from runner.archive.runs import Archived
-    from runner.runs import Run
+    from runner.runs.run import Run
 
 
 @click.command("archive")
@@ -52,7 +52,7 @@ def command(
     from runner.archive.runs import archive_run
     from runner.cli.progress import steps_line
     from runner.cli.working import announcing
-    from runner.runs import recordings_folder
+    from runner.runs.run import recordings_folder
 
     target = to or default_target(recordings_folder(recordings))
     for run in _to_do([find(name, recordings) for name in dict.fromkeys(run_names)]):

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from runner.analysis.compare import Comparison
     from runner.analysis.groups import Group
     from runner.analysis.series import RunSeries
-    from runner.runs import Run
+    from runner.runs.run import Run
 
 
 @click.command("compare")
@@ -123,8 +123,8 @@ def _read(runs: list[Run]) -> list[RunSeries]:
 
 def _write_page(path: Path, force: bool, comparison: Comparison, groups: list[Group]) -> str:
     """Write the page; return what there is to say of it."""
-    from runner.export.compare_page import render_comparison
     from runner.export.places import write_text_new
+    from runner.export.reports.compare import render_comparison
 
     page = render_comparison(comparison, groups)
     write_text_new(path, force, page)

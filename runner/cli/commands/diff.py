@@ -95,8 +95,8 @@ def command(
 
 def _write_page(path: Path, force: bool, difference: RunDiff, a: Recording, b: Recording) -> str:
     """Write the page; return what there is to say of it."""
-    from runner.export.diff_page import render_diff
     from runner.export.places import write_text_new
+    from runner.export.reports.diff import render_diff
 
     write_text_new(path, force, render_diff(difference, a, b))
     return f"{path}: {size(path.stat().st_size)}"

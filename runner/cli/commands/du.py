@@ -12,8 +12,8 @@ from runner.cli.options import filter_argument, folders_option, json_option
 from runner.cli.output import UNKNOWN, draw, facts, print_json, say, size, table, title
 
 if TYPE_CHECKING:
-    from runner.catalogue.index import Index
-    from runner.catalogue.usage import Usage
+    from runner.runs.catalogue.index import Index
+    from runner.runs.catalogue.usage import Usage
 
 
 @click.command("du")
@@ -40,10 +40,10 @@ def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as
       dualtaxi du
       dualtaxi du status:finished age:>30d --limit 5
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.catalogue.columns import with_originals
-    from runner.catalogue.filters import parse
-    from runner.catalogue.index import look
-    from runner.catalogue.usage import USED_BY, freeable_of, totals, usages
+    from runner.runs.catalogue.columns import with_originals
+    from runner.runs.catalogue.filters import parse
+    from runner.runs.catalogue.index import look
+    from runner.runs.catalogue.usage import USED_BY, freeable_of, totals, usages
 
     chosen = parse(" ".join(words))
 
@@ -63,7 +63,7 @@ def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as
 
 
 def _as_json(usage: Usage) -> dict[str, Any]:
-    from runner.catalogue.usage import totals
+    from runner.runs.catalogue.usage import totals
 
     row = usage.row
     told = {key: row[key] for key in ("name", "status", "same_as")}
@@ -72,7 +72,7 @@ def _as_json(usage: Usage) -> dict[str, Any]:
 
 
 def _draw(found: Sequence[Usage], freeable: dict[str, int], limit: int) -> None:
-    from runner.catalogue.usage import totals
+    from runner.runs.catalogue.usage import totals
 
     every = dict(
         zip(("recording", "exports", "restored", "other", "total"), totals(found).values(), strict=True)

@@ -14,7 +14,7 @@ from runner.cli.output import console, draw, facts, print_json, say
 from runner.cli.working import at_work, run_as_json, run_in_words
 
 if TYPE_CHECKING:
-    from runner.runs import Run
+    from runner.runs.run import Run
 
 TRIALS = 200
 
@@ -71,8 +71,8 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     if every_start and (trials is not None or start is not None):
         raise click.UsageError("--all plays each start state once: leave out --trials and --start.")
-    from runner.again import evaluate
-    from runner.runs import recordings_folder
+    from runner.execution.rerecord import evaluate
+    from runner.runs.run import recordings_folder
 
     source, folder = find_recorded(run_name, recordings), recordings_folder(recordings)
     count = None if every_start else trials or TRIALS
@@ -91,8 +91,8 @@ def command(
 
 
 def _summarise(run: Run, origin: dict[str, object]) -> None:
+    from runner.analysis.frames import evaluation_records
     from runner.cli.evaluations import evaluation_table
-    from runner.frames import evaluation_records
     from runner.recording.reader import open_recording
 
     with open_recording(run.recording) as recording:

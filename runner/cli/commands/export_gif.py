@@ -76,10 +76,10 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     if episode is not None and trial is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
-    from runner.export import report_replay as replay
     from runner.export.contents import require_steps, shortcomings
     from runner.export.gif import require_packages, require_states, write_gif
     from runner.export.places import write_new
+    from runner.export.reports import episode as replay
     from runner.recording.reader import open_recording
 
     require_packages()

@@ -15,8 +15,8 @@ from runner.cli.options import filter_argument, folders_option, json_option
 from runner.cli.output import json_lines, say
 
 if TYPE_CHECKING:
-    from runner.catalogue.filters import Filter
-    from runner.catalogue.index import Index
+    from runner.runs.catalogue.filters import Filter
+    from runner.runs.catalogue.index import Index
 
 MAX_PROBLEMS: Final = 5
 """Damaged runs whose problems are printed."""
@@ -81,9 +81,9 @@ def command(
       dualtaxi ls 'created:[2026-01-01 TO *] (seed:<3 OR age:<12h)' --columns id,seed,config,digest
       dualtaxi ls --quiet name:quick
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.catalogue.columns import PROGRAMS, columns_of
-    from runner.catalogue.filters import parse
     from runner.cli import listing
+    from runner.runs.catalogue.columns import PROGRAMS, columns_of
+    from runner.runs.catalogue.filters import parse
 
     if sum((quiet, as_csv, as_json)) > 1:
         raise click.UsageError("--quiet, --csv and --json are three ways to print; choose one.")
@@ -121,7 +121,7 @@ def _ids(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> Iterator[str
 
 
 def _objects(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> Iterator[str]:
-    from runner.catalogue.columns import as_json
+    from runner.runs.catalogue.columns import as_json
 
     return json_lines(as_json(row, columns) for row in rows)
 
@@ -139,8 +139,8 @@ def _stream(
     """
     import tempfile
 
-    from runner.catalogue.columns import needed_for, with_same_as
-    from runner.catalogue.index import look, order_of
+    from runner.runs.catalogue.columns import needed_for, with_same_as
+    from runner.runs.catalogue.index import look, order_of
 
     order = order_of(wanted.sort)
     needed = needed_for([*columns, "same_as"] if "same_as" in columns else columns)
@@ -182,8 +182,8 @@ def _found(
     recordings: tuple[Path, ...], wanted: _Wanted, columns: Sequence[str]
 ) -> tuple[list[dict[str, Any]], int]:
     """Return the rows to show, and how many fit the filter."""
-    from runner.catalogue.columns import needed_for, with_originals
-    from runner.catalogue.index import look, order_of
+    from runner.runs.catalogue.columns import needed_for, with_originals
+    from runner.runs.catalogue.index import look, order_of
 
     order, needed = order_of(wanted.sort), needed_for([*columns, "same_as"])
 

@@ -31,7 +31,7 @@ def command(run_name: str, text: str | None, clear: bool, recordings: Path | Non
       dualtaxi note k3v9m2xq
       dualtaxi note k3v9m2xq - < observations.txt
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.runs import relabel
+    from runner.runs.run import relabel
 
     if clear and text is not None:
         raise click.UsageError("found TEXT and --clear, expected one of them.")

@@ -86,9 +86,9 @@ def _chosen(recording: Recording, episode: int | None, trial: tuple[int, int] | 
         RecordingError: the recording has no such evaluation or trial.
     """
     from runner.analysis.evaluations import evaluation_after, evaluations_of
-    from runner.export.report_replay import last_whole_evaluation, typical_trial
+    from runner.environments.naming import trial_in_words
+    from runner.export.reports.episode import last_whole_evaluation, typical_trial
     from runner.recording.schema import TRAIN_EPISODE
-    from runner.words import trial_in_words
 
     evaluations = [] if episode is not None else evaluations_of(recording)
     if trial is None and not evaluations:

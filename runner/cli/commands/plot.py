@@ -46,10 +46,10 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     from runner.analysis.series import values_left_out
     from runner.export.contents import shortcomings
     from runner.export.places import write_new
-    from runner.export.plots import panels_of
-    from runner.export.plots_figure import check_suffix, matplotlib_of, save_figure
+    from runner.export.plots.figure import check_suffix, matplotlib_of, save_figure
+    from runner.export.plots.metrics import panels_of
     from runner.recording.reader import open_recording
-    from runner.runs import recordings_folder
+    from runner.runs.run import recordings_folder
     from runner.sweep.names import is_sweep
 
     check_suffix(output)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.catalogue.fields import STATUSES
 from runner.cli.options import filter_argument, folders_option, json_option
 from runner.cli.output import say
 from runner.cli.removing import carry_out, dry_run_option, force_option, yes_option
 from runner.errors import RunnerError
+from runner.runs.catalogue.fields import STATUSES
 
 if TYPE_CHECKING:
-    from runner.catalogue.removal import Removal, Wish
+    from runner.runs.catalogue.removal import Removal, Wish
 
 
 @click.command("prune")
@@ -59,8 +59,8 @@ def command(
       dualtaxi prune --older-than 30d --keep-last 5 --status interrupted --dry-run
       dualtaxi prune 'config:quick success_percent:<50' --yes
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.catalogue.filters import parse
-    from runner.catalogue.removal import Wish
+    from runner.runs.catalogue.filters import parse
+    from runner.runs.catalogue.removal import Wish
 
     wish = Wish(parse(" ".join(words)), _seconds(older_than), keep_last, statuses)
     if wish.filter.condition is None and older_than is None and keep_last is None and not statuses:
@@ -84,7 +84,7 @@ def _seconds(text: str | None) -> float | None:
     Raises:
         RunnerError: there is none.
     """
-    from runner.catalogue.values import span_seconds
+    from runner.runs.catalogue.values import span_seconds
 
     try:
         return None if text is None else span_seconds(text)
@@ -94,9 +94,9 @@ def _seconds(text: str | None) -> float | None:
 
 def _chosen(recordings: tuple[Path, ...], wish: Wish, force: bool) -> tuple[list[Removal], Counter[str]]:
     """Return what may go, and how many runs are protected, by reason."""
-    from runner.catalogue.index import look
-    from runner.catalogue.removal import plan, unwanted
-    from runner.runs import runs_in
+    from runner.runs.catalogue.index import look
+    from runner.runs.catalogue.removal import plan, unwanted
+    from runner.runs.run import runs_in
 
     rows, protected = look(recordings, lambda index: unwanted(index, wish, time.time()), say)
     places = [(Path(row["root"]), row["entry"]) for row in rows]

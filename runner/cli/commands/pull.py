@@ -44,9 +44,9 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     from runner.cli.progress import bytes_line
     from runner.cli.working import tell_received
-    from runner.runs import recordings_folder
-    from runner.service.address import found_token
-    from runner.service.client import Client
+    from runner.client.address import found_token
+    from runner.client.http import Client
+    from runner.runs.run import recordings_folder
 
     with (
         Client(required(server), found_token(token, token_file), tell=say) as client,

@@ -25,9 +25,9 @@ from runner.errors import RunnerError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from runner.runs import Run
-    from runner.service.client import Report
-    from runner.service.parcel import Sent
+    from runner.client.http import Report
+    from runner.client.upload_source import Sent
+    from runner.runs.run import Run
 
     Push = Callable[[Report], tuple[Sent, str, int]]
     """Pushes a run; returns what became of it, its name and its bytes."""
@@ -64,7 +64,7 @@ def command(
       dualtaxi push k3v9m2xq 7wd2qhmz --server https://runs.example.org --token-file ~/.dualtaxi-token
       dualtaxi push --outbox
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.service.address import found_token
+    from runner.client.address import found_token
 
     if bool(names) == outbox:
         raise click.UsageError("expected either runs or --outbox.")
@@ -91,9 +91,9 @@ def _runs(
     names: tuple[str, ...], server: str, token: str | None, recordings: Path | None
 ) -> Iterator[tuple[str, Push]]:
     """Yield what is to be pushed, and what pushes it."""
+    from runner.client.http import Client
+    from runner.client.upload_source import Parcel
     from runner.packing.packing import SUFFIX
-    from runner.service.client import Client
-    from runner.service.parcel import Parcel
 
     def push(name: str, report: Report) -> tuple[Sent, str, int]:
         packed = name.endswith(SUFFIX)
@@ -108,8 +108,8 @@ def _runs(
 
 def _outbox(server: str | None, token: str | None) -> Iterator[tuple[str, Push]]:
     """Yield the runs in the outbox, and what pushes each."""
-    from runner.service.client import Client
-    from runner.service.outbox import deliver, outbox_folder, waiting
+    from runner.client.http import Client
+    from runner.client.outbox import deliver, outbox_folder, waiting
 
     def push(run: Run, url: str, report: Report) -> tuple[Sent, str, int]:
         size = run.recording.stat().st_size

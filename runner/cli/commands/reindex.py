@@ -14,7 +14,7 @@ from runner.cli.options import folders_option, json_option
 from runner.cli.output import duration, facts, print_json, say
 
 if TYPE_CHECKING:
-    from runner.catalogue.index import Index
+    from runner.runs.catalogue.index import Index
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ def command(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
       dualtaxi reindex
       dualtaxi reindex --recordings /data/runs --recordings recordings
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.catalogue.database import index_path
-    from runner.catalogue.index import look
+    from runner.runs.catalogue.database import index_path
+    from runner.runs.catalogue.index import look
 
     began = time.monotonic()
     found = look(recordings, _found, say, anew=True)
@@ -55,8 +55,8 @@ def command(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
 
 
 def _found(index: Index) -> _Found:
-    from runner.catalogue.columns import with_same_as
-    from runner.catalogue.filters import Filter
+    from runner.runs.catalogue.columns import with_same_as
+    from runner.runs.catalogue.filters import Filter
 
     rows = index.rows(Filter(None), columns=("root", "entry", "status", "digest"))
     statuses: Counter[str] = Counter()

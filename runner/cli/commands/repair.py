@@ -15,7 +15,7 @@ from runner.cli.working import recording_of
 
 if TYPE_CHECKING:
     from runner.recording.repair import Repair
-    from runner.runs import Run
+    from runner.runs.run import Run
 
 _WORDS: Final = {
     "/train/step": "training steps",
@@ -59,8 +59,8 @@ def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json:
       dualtaxi repair backup/recording.mcap
     """  # noqa: D301 - Click wants the backspace itself
     from runner.cli.progress import bytes_line
+    from runner.execution.verify import refuse_foreign
     from runner.recording.repair import repair
-    from runner.verify import refuse_foreign
 
     path, run = recording_of(run_name, recordings)
     refuse_foreign(path)
@@ -78,7 +78,7 @@ def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json:
 
 def _kept(run: Run | None) -> contextlib.AbstractContextManager[Any]:
     """Return a context in which no other process writes to the run."""
-    from runner.locking import locked
+    from runner.runs.locking import locked
 
     return contextlib.nullcontext() if run is None else locked(run)
 

@@ -67,8 +67,8 @@ def command(
       dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
     """  # noqa: D301 - Click wants the backspace itself
     from runner.export.places import write_new
-    from runner.export.report import require_packages, write_report
-    from runner.runs import recordings_folder
+    from runner.export.reports.report import require_packages, write_report
+    from runner.runs.run import recordings_folder
     from runner.sweep.names import is_sweep
 
     require_packages()

@@ -28,7 +28,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
       dualtaxi run quick --set recording.steps=none
       dualtaxi rerecord @latest
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.again import holds_steps, rerecord
+    from runner.execution.rerecord import holds_steps, rerecord
 
     run = find(run_name, recordings)
     refuse_running(run)

@@ -33,7 +33,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     from runner.archive.targets import S3
     from runner.cli.progress import steps_line
     from runner.cli.working import announcing, run_as_json, run_in_words
-    from runner.runs import recordings_folder
+    from runner.runs.run import recordings_folder
 
     is_place = run_name.startswith(S3) or (Path(run_name) / MANIFEST).is_file()
     with announcing(), steps_line("restoring") as report:

@@ -41,7 +41,7 @@ def command(
       dualtaxi resume @latest
       dualtaxi resume k3v9m2xq --json
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.resume import is_finished, resume
+    from runner.execution.resume import is_finished, resume
 
     run = find(run_name, recordings)
     nothing_to_do = is_finished(run)

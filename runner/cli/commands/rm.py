@@ -10,7 +10,7 @@ from runner.cli.finding import find
 from runner.cli.options import json_option, recordings_option, runs_argument
 from runner.cli.removing import carry_out, dry_run_option, force_option, yes_option
 from runner.errors import RunnerError
-from runner.runs import recordings_folder
+from runner.runs.run import recordings_folder
 
 
 @click.command("rm")
@@ -34,7 +34,7 @@ def command(
       dualtaxi rm @latest --dry-run
       dualtaxi ls --quiet status:failed | xargs dualtaxi rm --yes
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.catalogue.removal import plan
+    from runner.runs.catalogue.removal import plan
 
     root = recordings_folder(recordings)
     runs = {run.folder.resolve(): run for run in (find(name, recordings) for name in run_names)}

@@ -21,9 +21,9 @@ if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
     from rich.console import RenderableType
 
     from runner.config import ExperimentConfig
+    from runner.config.job import Job
     from runner.export.rerun.live import LiveView
-    from runner.job import Job
-    from runner.runs import Run
+    from runner.runs.run import Run
 
     Watch = Callable[[Run], LiveView]
 
@@ -95,7 +95,7 @@ def command(
       dualtaxi run cooperative --live --live-every 100
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import checked_name, experiment_of, jobs_in
-    from runner.runs import recordings_folder
+    from runner.runs.run import recordings_folder
 
     experiment = experiment_of(config, overrides, seed)
     called, folder = checked_name(name), recordings_folder(recordings)
@@ -127,7 +127,7 @@ def _run_abreast(
     """Run an experiment's seeds side by side, and tell of each run."""
     from runner.api import abreast, interruptible, jobs_in
     from runner.cli.progress import counting
-    from runner.environments import load_mdp
+    from runner.environments.loading import load_mdp
 
     load_mdp(config.env.id, config.env.kwargs, config.rewards)  # refused before all else
     _announce(config, folder)
@@ -167,10 +167,10 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch
     """Run a job; return its run, and whether it was interrupted."""
     from runner.api import interruptible
     from runner.cli.progress import progress_line
-    from runner.runs import create_run, unless_empty
+    from runner.runs.run import create_run, unless_empty
 
     run = create_run(folder, job.config, job.seed, name)
-    from runner.environments import load_mdp
+    from runner.environments.loading import load_mdp
 
     label = f"seed {run.seed}" if len(job.config.seeds) > 1 else ""
     with unless_empty(run):
@@ -182,7 +182,7 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch
             progress_line(label, job.config.episodes) as report,
             contextlib.nullcontext() if watch is None else watch(run) as view,
         ):
-            from runner.execution import run_job
+            from runner.execution.session import run_job
 
             with announcing():
                 run = run_job(job, run, report, interrupt, view)
@@ -208,7 +208,7 @@ def _tell_left(config: ExperimentConfig, begun: int) -> None:
 
 def _announce(config: ExperimentConfig, folder: Path) -> None:
     """Tell what is to come; ask, where someone can answer, when the disk would not hold it."""
-    from runner.estimate import estimate, free_bytes, step_limit
+    from runner.execution.estimate import estimate, free_bytes, step_limit
 
     limit, seeds = step_limit(config), len(config.seeds)
     free = free_bytes(folder)
@@ -237,9 +237,9 @@ def _someone_answers() -> bool:
 
 def _summarise(run: Run, blank: bool) -> None:
     """Print what came of a run and what to type next."""
+    from runner.analysis.frames import evaluation_records
     from runner.cli.evaluations import evaluation_table, some
     from runner.cli.output import console, draw, facts
-    from runner.frames import evaluation_records
     from runner.recording.reader import open_recording
 
     with open_recording(run.recording) as recording:

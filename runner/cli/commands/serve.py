@@ -76,12 +76,12 @@ def command(
       dualtaxi serve --host 0.0.0.0 --allow-host runs.example.org --proxy 10.0.0.2
     """  # noqa: D301 - Click wants the backspace itself
     from runner.errors import StorageError
-    from runner.extras import require
+    from runner.util.extras import require
 
     require("fastapi", "uvicorn", "httptools", "httpx2", "jinja2", extra="service", purpose="the service")
     from runner.service import logs
     from runner.service.app import create_app
-    from runner.service.queue import require_free
+    from runner.service.jobs.queue import require_free
     from runner.service.server import bind, serve, url_of
     from runner.service.settings import Settings
 

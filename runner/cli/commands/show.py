@@ -28,7 +28,7 @@ from runner.cli.progress import stage_line
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from runner.runs import Run
+    from runner.runs.run import Run
 
 MOST_CYCLES: Final = 8
 """So many of the cycles that time-outs are stuck in are told."""
@@ -53,7 +53,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
       dualtaxi show k3v9m2xq --json
     """  # noqa: D301 - Click wants the backspace itself
     run = restored(find(run_name, recordings))
-    from runner.description import described
+    from runner.analysis.summary import described
 
     told = described(run, say)
     if as_json:
@@ -107,7 +107,7 @@ def _head(run: Run, told: dict[str, Any]) -> dict[str, str]:
 
 def _random_policy(run: Run) -> str:
     """Return what a random policy achieves, as a sentence or nothing: what an evaluation compares with."""
-    from runner.description import random_policy_sentence
+    from runner.analysis.summary import random_policy_sentence
     from runner.recording.reader import open_recording
 
     with stage_line("computing what a random policy achieves"), open_recording(run.recording) as recording:
@@ -131,9 +131,9 @@ def _loop_results(loop: dict[str, Any]) -> dict[str, str]:
 
 def _exactly(run: Run, measures: dict[str, Any]) -> dict[str, str]:
     """Return what the last exact measures say, beside what is possible."""
-    from runner.frames import agents_of
+    from runner.analysis.frames import agents_of
+    from runner.environments.naming import states_in_words
     from runner.recording.reader import open_recording
-    from runner.words import states_in_words
 
     with open_recording(run.recording) as recording:
         words, agents = states_in_words(recording.mdp), agents_of(recording)

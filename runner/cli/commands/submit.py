@@ -13,7 +13,7 @@ from runner.cli.output import draw, facts, print_json, say
 from runner.cli.parameters import ConfigName
 
 if TYPE_CHECKING:
-    from runner.service.watching import Happened, JobThere
+    from runner.client.jobs import Happened, JobThere
 
 
 @click.command("submit")
@@ -45,9 +45,9 @@ def command(
       dualtaxi submit quick --server http://localhost:8000
       dualtaxi submit hyperparameters --server http://localhost:8000 --watch
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.client.address import found_token
+    from runner.client.http import Client
     from runner.config.shipped import config_path
-    from runner.service.address import found_token
-    from runner.service.client import Client
 
     with Client(required(server), found_token(token, token_file), tell=say) as client:
         file = config_path(file)

@@ -116,7 +116,7 @@ def start(
       dualtaxi sweep start hyperparameters --resume
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import checked_name, interruptible
-    from runner.runs import recordings_folder
+    from runner.runs.run import recordings_folder
     from runner.sweep import state
     from runner.sweep.loading import load_sweep
     from runner.sweep.plan import plan_of, require_disk, room
@@ -194,7 +194,7 @@ def show(
     from runner.cli.sections import print_sections, require_one_form
     from runner.errors import RunnerError
     from runner.export.places import require_new, write_text_new
-    from runner.runs import recordings_folder
+    from runner.runs.run import recordings_folder
     from runner.sweep.results import SHOWN, results_of, sections
     from runner.sweep.state import read_sweep
 
@@ -238,7 +238,7 @@ def ls(recordings: Path | None, as_json: bool) -> None:
     Example:
       dualtaxi sweep ls
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.runs import recordings_folder
+    from runner.runs.run import recordings_folder
     from runner.sweep.names import sweeps_in
 
     names = sweeps_in(recordings_folder(recordings))

@@ -42,9 +42,9 @@ def command(env_id: str, overrides: tuple[str, ...], as_json: bool) -> None:
       dualtaxi table --set env.kwargs.slip=0.1 > slippery.csv
       dualtaxi table --env FrozenLake-v1 --set env.kwargs.is_slippery=false
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.analysis.frames import transition_columns
     from runner.config import from_mapping
-    from runner.environments import load_mdp
-    from runner.frames import transition_columns
+    from runner.environments.loading import load_mdp
 
     config = from_mapping({"env": {"id": env_id}, "episodes": 1}, overrides)
     columns = transition_columns(load_mdp(config.env.id, config.env.kwargs, config.rewards))

@@ -32,7 +32,7 @@ def command(
       dualtaxi tag k3v9m2xq --remove keep
       dualtaxi ls --quiet name:quick | xargs -I{} dualtaxi tag {} first-try
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.runs import relabel
+    from runner.runs.run import relabel
 
     run = find(run_name, recordings)
     missing = sorted(set(remove) - set(run.tags))

@@ -29,7 +29,7 @@ def command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) ->
     """  # noqa: D301 - Click wants the backspace itself
     from runner.cli.working import tell_received
     from runner.packing.unpacking import unpack
-    from runner.runs import recordings_folder
+    from runner.runs.run import recordings_folder
 
     unpacked = unpack(file, recordings_folder(recordings), as_new)
     run, manifest = unpacked.run, unpacked.manifest

@@ -13,7 +13,7 @@ from runner.cli.working import at_work, recording_of, refuse_running
 
 if TYPE_CHECKING:
     from runner.errors import Diverged
-    from runner.verify import Verification
+    from runner.execution.verify import Verification
 
 
 @click.command("verify")
@@ -43,7 +43,7 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
       dualtaxi verify backup/recording.mcap --json
     """  # noqa: D301 - Click wants the backspace itself
     from runner.cli.progress import bytes_line
-    from runner.verify import damage_of, verify
+    from runner.execution.verify import damage_of, verify
 
     path, run = recording_of(run_name, recordings)
     refuse_running(run)

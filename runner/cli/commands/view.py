@@ -16,8 +16,8 @@ from runner.cli.output import say
 from runner.cli.parameters import PictureSize, RunName, StepReference
 
 if TYPE_CHECKING:
-    from runner.export.rerun.spots import Spot
-    from runner.runs import Run
+    from runner.export.rerun.positions import Spot
+    from runner.runs.run import Run
 
 
 @click.command("view")
@@ -97,7 +97,7 @@ def command(
     request = request_of(episodes, evaluations, every, everything)
     with stage_line("loading Rerun") as stage:
         from runner.export.rerun.cache import exported
-        from runner.export.rerun.spots import with_spot
+        from runner.export.rerun.positions import with_spot
 
         parting = None
         if len(runs) == 2 and spot is None:
@@ -116,7 +116,7 @@ def command(
 
 def _parting(runs: list[Run]) -> tuple[int, ...] | None:
     """Return where two runs part, and say it."""
-    from runner.export.rerun.spots import where_they_part
+    from runner.export.rerun.positions import where_they_part
 
     spot, told = where_they_part(runs)
     say(told)

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Final
 
 from runner import __version__
-from runner.cache import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR
-from runner.cache import cache_folder as users_cache
 from runner.errors import StorageError
 from runner.export.rerun.selection import Request, Selection, select
 from runner.export.rerun.writing import Source, export
 from runner.recording.reader import open_recording
-from runner.runs import Run
+from runner.runs.run import Run
+from runner.util.cache import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR
+from runner.util.cache import cache_folder as users_cache
 
 KEPT: Final = 20
 """Exports in the cache; the ones that were not looked at for longest are removed."""

@@ -14,6 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.mdp import Mdp
+from runner.environments.naming import action_names, numbered_actions, spoken
 from runner.export.rerun.scene import (
     BAD_COLOUR,
     GOOD_COLOUR,
@@ -24,8 +26,6 @@ from runner.export.rerun.scene import (
     Scene,
     rgb,
 )
-from runner.mdp import Mdp
-from runner.words import action_names, numbered_actions, spoken
 
 MOST_REWARDS: Final = 2_000
 MOST_T: Final = 10_000

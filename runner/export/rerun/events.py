@@ -9,9 +9,9 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.analysis.outcomes import events_of
+from runner.environments.mdp import Mdp
+from runner.environments.naming import events_in_words, states_in_words
 from runner.export.rerun.columns import Batch, Sender, instances, texts
-from runner.mdp import Mdp
-from runner.words import events_in_words, states_in_words
 
 _OVER: Final = 1
 _TIME_OUT: Final = 2

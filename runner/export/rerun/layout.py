@@ -9,11 +9,11 @@ from typing import Any, Final
 import rerun as rr
 import rerun.blueprint as rrb
 
+from runner.environments.mdp import Mdp
+from runner.environments.naming import spoken
 from runner.export.rerun.maps import draw_blocks
 from runner.export.rerun.scene import Scene, rgb
 from runner.export.rerun.values import TOP, WIDTH, bar_rows, draw_table
-from runner.mdp import Mdp
-from runner.words import spoken
 
 FRAMES_A_SECOND: Final = 10.0
 PLOTS: Final = (

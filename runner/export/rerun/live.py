@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.mdp import Mdp
+from runner.environments.mdp import Mdp
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection

@@ -10,6 +10,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from runner.environments.mdp import Mdp
 from runner.export.rerun.classes import vocabulary_of
 from runner.export.rerun.columns import Batch, Sender, new_stream
 from runner.export.rerun.events import EventWriter
@@ -18,7 +19,6 @@ from runner.export.rerun.layout import Shown, blueprint, draw_background
 from runner.export.rerun.live import Piece
 from runner.export.rerun.metrics import MetricWriter
 from runner.export.rerun.scene import TRAIL_STEPS, marks_of, scene_of
-from runner.mdp import Mdp
 from runner.recording import schema
 
 LAST_SECONDS: Final = 5.0

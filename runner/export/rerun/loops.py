@@ -14,6 +14,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import Evaluation
+from runner.analysis.frames import agents_of
 from runner.errors import RecordingError
 from runner.export.contents import shortcomings
 from runner.export.rerun.classes import vocabulary_of
@@ -30,7 +31,6 @@ from runner.export.rerun.selection import (
     Span,
     chosen_spans,
 )
-from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import leaves_of

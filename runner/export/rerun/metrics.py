@@ -9,11 +9,11 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from runner.environments.naming import spoken
 from runner.export.rerun.events import evaluation_texts, send_text
 from runner.export.rerun.lines import palette, phase_colours, series_lines
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.words import spoken
 
 SCHEDULES: Final = ("epsilon", "step_size", "discount")
 _ONE_PHASE: Final = ("filled_percent", "reward_percent", "events", "episodes")

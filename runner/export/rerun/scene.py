@@ -14,8 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.mdp import Mdp
-from runner.words import action_names, spoken
+from runner.environments.mdp import Mdp
+from runner.environments.naming import action_names, spoken
 
 # Okabe and Ito (2008), told apart with any common colour blindness; mid-tones, for light and dark themes.
 MOVER_COLOURS: Final = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7")

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.mdp import Mdp
 from runner.export.rerun.columns import StepValues
 from runner.export.rerun.filling import best_of_joint
 from runner.export.rerun.scene import Placements, own_actions
-from runner.mdp import Mdp
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.replay.tables import StateProbe, TableReplay, known_steps

@@ -11,6 +11,8 @@ from collections.abc import Iterable
 import numpy as np
 import rerun as rr
 
+from runner.environments.mdp import Mdp
+from runner.environments.naming import spoken
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, scalars
 from runner.export.rerun.events import EventWriter
@@ -19,8 +21,6 @@ from runner.export.rerun.lines import phase_colours, series_lines
 from runner.export.rerun.maps import MapWriter
 from runner.export.rerun.scene import Marks, Scene
 from runner.export.rerun.values import ValueWriter
-from runner.mdp import Mdp
-from runner.words import spoken
 
 
 class StepWriter(Sender):

@@ -8,12 +8,12 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from runner.environments.mdp import Mdp
+from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, StepValues, instances, rgba, scalars, strips
 from runner.export.rerun.lines import series_lines
 from runner.export.rerun.scene import INK, MOVER_COLOURS, own_actions
-from runner.mdp import Mdp
-from runner.words import numbered_actions, spoken
 
 NAME_X: Final = 1.0
 BAR_LEFT: Final = 2.5

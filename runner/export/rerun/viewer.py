@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import RunnerError
-from runner.extras import missing
+from runner.util.extras import missing
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient

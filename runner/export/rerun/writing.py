@@ -14,6 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from runner.analysis.frames import agents_of
 from runner.errors import RecordingError, StorageError
 from runner.export.rerun.ahead import ahead
 from runner.export.rerun.classes import Vocabulary, vocabulary_of
@@ -24,7 +25,6 @@ from runner.export.rerun.scene import TRAIL_STEPS, Marks, Scene, marks_of, scene
 from runner.export.rerun.selection import Request, Selection, Span, select
 from runner.export.rerun.step_values import StepValueReader
 from runner.export.rerun.steps import StepWriter
-from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.checks import check_steps

@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 
-from runner.runs import Run
+from runner.runs.run import Run
 from runner.service import computed
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, recorded_run, state_of, timed_state_of
-from runner.service.kept import ALWAYS
 from runner.service.problems import answers
+from runner.service.response_cache import ALWAYS
 
 router = APIRouter(
     tags=["comparing"],

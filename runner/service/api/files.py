@@ -10,11 +10,11 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import FileResponse
 
-from runner.runs import Run
+from runner.runs.run import Run
 from runner.service import computed
 from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
+from runner.service.errors import Refused
 from runner.service.problems import answers
-from runner.service.refused import Refused
 
 router = APIRouter(
     prefix="/runs/{run}",

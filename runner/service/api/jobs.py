@@ -15,10 +15,10 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 
 from runner.service.dependencies import JobsOf
+from runner.service.errors import Refused
+from runner.service.jobs.queue import Job, Kind, NoSuchJob, State
+from runner.service.jobs.scheduler import SOURCE, Jobs, Standing
 from runner.service.problems import answers, content
-from runner.service.queue import Job, Kind, NoSuchJob, State
-from runner.service.refused import Refused
-from runner.service.work import SOURCE, Jobs, Standing
 
 LOOK_SECONDS: Final = 0.25
 """Between two looks at what is new; a look costs next to nothing."""

@@ -8,21 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel
 
-from runner.frames import Phase, episode_columns, step_columns
+from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.recording.reader import Recording
 from runner.service import computed
 from runner.service.computed import too_many
 from runner.service.dependencies import ApartOf, KeptOf, OpenRecording, RecordedRun, SettingsOf, state_of
-from runner.service.kept import ALWAYS
+from runner.service.errors import Refused
 from runner.service.problems import answers, content
-from runner.service.refused import Refused
+from runner.service.response_cache import ALWAYS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from runner.runs import Run
-    from runner.service.kept import Kept
+    from runner.runs.run import Run
     from runner.service.processes import ProcessPool
+    from runner.service.response_cache import Kept
     from runner.service.settings import Settings
 
 router = APIRouter(

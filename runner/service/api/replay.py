@@ -13,7 +13,7 @@ from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
 from runner.service.problems import answers
 
 if TYPE_CHECKING:
-    from runner.runs import Run
+    from runner.runs.run import Run
 
 router = APIRouter(
     prefix="/runs/{run}/replay",

@@ -9,23 +9,23 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
 
+from runner.analysis.summary import described
 from runner.api import checked_run_name
-from runner.catalogue.columns import PROGRAMS, columns_of, with_originals
-from runner.catalogue.columns import as_json as row_as_json
-from runner.catalogue.filters import parse
-from runner.catalogue.index import order_of
-from runner.description import described
-from runner.labels import MAX_NOTE, MAX_TAGS
-from runner.labels import Labels as Said
-from runner.runs import Run, relabel
+from runner.runs.catalogue.columns import PROGRAMS, columns_of, with_originals
+from runner.runs.catalogue.columns import as_json as row_as_json
+from runner.runs.catalogue.filters import parse
+from runner.runs.catalogue.index import order_of
+from runner.runs.labels import MAX_NOTE, MAX_TAGS
+from runner.runs.labels import Labels as Said
+from runner.runs.run import Run, relabel
 from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json
 from runner.service.dependencies import CatalogueOf, FoundRun, KeptOf, SettingsOf
+from runner.service.errors import Refused
 from runner.service.problems import answers
-from runner.service.refused import Refused
 
 if TYPE_CHECKING:
-    from runner.catalogue.index import Index
+    from runner.runs.catalogue.index import Index
     from runner.service.settings import Settings
 
 router = APIRouter(tags=["runs"])

@@ -16,11 +16,11 @@ from fastapi.concurrency import contextmanager_in_threadpool
 from pydantic import BaseModel
 from starlette.requests import ClientDisconnect
 
+from runner.service.errors import Refused
 from runner.service.problems import answers
 from runner.service.receiving.appending import Appending
 from runner.service.receiving.model import Announcement, Completion, State, Upload
 from runner.service.receiving.uploads import Uploads
-from runner.service.refused import Refused
 from runner.service.security import Token
 
 router = APIRouter(tags=["uploads"])

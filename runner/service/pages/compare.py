@@ -8,22 +8,22 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
-from runner import amounts
 from runner.analysis.groups import flat_config
 from runner.analysis.step_reference import episode_reference, parse_step_reference, step_reference
 from runner.errors import RunnerError
-from runner.runs import Run
+from runner.runs.run import Run
 from runner.service import played
 from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
 from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, timed_state_of
 from runner.service.pages.frame import head_of, is_loop, last_evaluation
 from runner.service.pages.rendering import link, page, picture_address
-from runner.service.pages.spots import (
+from runner.service.pages.step_address import (
     after_step,
     episode_in_words,
     episode_place,
 )
+from runner.util import humanize
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
 
@@ -47,7 +47,7 @@ async def overview(request: Request, catalogue: CatalogueOf, run: Names = None) 
 def _overview(request: Request, found: list[Run]) -> Response:
     settings = [{"seed": str(each.seed), **_flat(each)} for each in found]
     keys = list(dict.fromkeys(key for each in settings for key in each))
-    told = [(key, [each.get(key, amounts.UNKNOWN) for each in settings]) for key in keys]
+    told = [(key, [each.get(key, humanize.UNKNOWN) for each in settings]) for key in keys]
     return page(
         request,
         "compare_overview.html",
@@ -179,18 +179,18 @@ def _flat(run: Run) -> dict[str, str]:
 def _results(found: list[Run]) -> list[tuple[str, list[str]]]:
     """Return what came of runs, a row a measure."""
     last = [last_evaluation(each) for each in found]
-    returns = [amounts.number(each.mean_return) for each in last]
+    returns = [humanize.number(each.mean_return) for each in last]
     return [
         ("Status", [each.status for each in found]),
         *([("Mean return in the last evaluation", returns)] if any(map(is_loop, found)) else []),
-        ("Success in the last evaluation, %", [amounts.number(each.success_percent) for each in last]),
-        ("Mean length of its trials", [amounts.number(each.mean_length) for each in last]),
-        ("Penalties a trial", [amounts.number(each.mean_penalties) for each in last]),
-        ("Training episodes", [amounts.number(each.summary.episodes, 0) for each in found]),
-        ("Steps of training", [amounts.number(each.summary.train_steps, 0) for each in found]),
+        ("Success in the last evaluation, %", [humanize.number(each.success_percent) for each in last]),
+        ("Mean length of its trials", [humanize.number(each.mean_length) for each in last]),
+        ("Penalties a trial", [humanize.number(each.mean_penalties) for each in last]),
+        ("Training episodes", [humanize.number(each.summary.episodes, 0) for each in found]),
+        ("Steps of training", [humanize.number(each.summary.train_steps, 0) for each in found]),
         (
             "Content digest",
-            [str(each.summary.content_digest or amounts.UNKNOWN)[:16] for each in found],
+            [str(each.summary.content_digest or humanize.UNKNOWN)[:16] for each in found],
         ),
     ]
 
@@ -212,7 +212,7 @@ def _still(run: Run) -> str:
     """Return the picture of a run's grid with everything at its first cell; the script moves it."""
     import numpy as np
 
-    from runner.export import svg
+    from runner.drawing import svg
     from runner.recording.reader import open_recording
 
     with open_recording(run.recording) as recording:

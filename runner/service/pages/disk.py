@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from fastapi import APIRouter, Request, Response
 
-from runner.catalogue.columns import with_originals
-from runner.catalogue.filters import Filter
-from runner.catalogue.usage import USED_BY, freeable_of, totals, usages
+from runner.runs.catalogue.columns import with_originals
+from runner.runs.catalogue.filters import Filter
+from runner.runs.catalogue.usage import USED_BY, freeable_of, totals, usages
 from runner.service.dependencies import CatalogueOf, JobsOf, SettingsOf
 from runner.service.pages.rendering import page
 
 if TYPE_CHECKING:
-    from runner.catalogue.index import Index
+    from runner.runs.catalogue.index import Index
 
 router = APIRouter(include_in_schema=False)
 

@@ -7,13 +7,13 @@ from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 
-from runner.frames import episode_columns
+from runner.analysis.frames import episode_columns
+from runner.environments.naming import event_in_words
 from runner.recording.reader import Recording
-from runner.runs import Run
+from runner.runs.run import Run
 from runner.service.dependencies import OpenRecording, RecordedRun
 from runner.service.pages.frame import framed
 from runner.service.pages.rendering import link, page
-from runner.words import event_in_words
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from runner.analysis.frames import loop_summary
 from runner.errors import RecordingError
-from runner.frames import loop_summary
 from runner.recording.reader import open_recording
-from runner.run_file import EvaluationMetrics
-from runner.runs import Run
+from runner.recording.run_file import EvaluationMetrics
+from runner.runs.run import Run
 
 TABS: Final = (
     ("", "Overview"),

@@ -16,8 +16,8 @@ from runner.service.dependencies import JobsOf
 from runner.service.pages.rendering import link, page
 
 if TYPE_CHECKING:
-    from runner.service.queue import Job
-    from runner.service.work import Jobs
+    from runner.service.jobs.queue import Job
+    from runner.service.jobs.scheduler import Jobs
 
 router = APIRouter(prefix="/queue", include_in_schema=False)
 

@@ -16,9 +16,9 @@ import jinja2
 from fastapi import Request, Response
 from markupsafe import Markup
 
-from runner import amounts
-from runner.export.report import code
+from runner.export.reports.report import code
 from runner.service.pages import static
+from runner.util import humanize
 
 TEMPLATES: Final = files("runner.service.pages") / "templates"
 SECTIONS: Final = (
@@ -41,13 +41,13 @@ def templates() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined,
     )
     environment.filters |= {
-        "number": amounts.number,
-        "size": amounts.size,
-        "duration": amounts.duration,
+        "number": humanize.number,
+        "size": humanize.size,
+        "duration": humanize.duration,
         "age": _age,
         "code": code,
         "problem": _problem,
-        "count": lambda value: amounts.number(value, 0),
+        "count": lambda value: humanize.number(value, 0),
         "sentence": lambda text: f"{text[:1].upper()}{text[1:]}{'' if text[-1:] in '.:' else '.'}",
         "with_name": lambda value, name: (name, value),
         "with_prefix": lambda value, prefix: f"{prefix}{value}",
@@ -135,4 +135,4 @@ def _problem(message: str) -> Markup:
 def _age(moment: datetime | str) -> str:
     """Return how long ago a moment was, in words."""
     then = datetime.fromisoformat(moment) if isinstance(moment, str) else moment
-    return amounts.age((datetime.now(UTC) - then).total_seconds())
+    return humanize.age((datetime.now(UTC) - then).total_seconds())

@@ -13,14 +13,14 @@ from starlette.concurrency import run_in_threadpool
 from runner.analysis.step_reference import episode_reference
 from runner.errors import RunnerError
 from runner.recording.reader import Recording, open_recording
-from runner.runs import Run
+from runner.runs.run import Run
 from runner.service import played
 from runner.service.api.replay import part_of
 from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
 from runner.service.pages.frame import framed
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page
-from runner.service.pages.spots import episode_place
+from runner.service.pages.step_address import episode_place
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
@@ -115,7 +115,7 @@ def _shown(part: dict[str, Any], t: int) -> dict[str, Any]:
     """Return the picture and the words of a step."""
     import numpy as np
 
-    from runner.export import svg
+    from runner.drawing import svg
 
     episode = part["episode"]
     at = min(t, episode["length"])

@@ -17,7 +17,6 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from runner.analysis.step_reference import parse_step_reference
-from runner.cache import cache_folder
 from runner.errors import StorageError
 from runner.service import played
 from runner.service.api.replay import LONG
@@ -25,7 +24,8 @@ from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
 from runner.service.guard import POLICY
 from runner.service.pages.frame import framed
 from runner.service.pages.rendering import link, page
-from runner.service.pages.spots import episode_in_words, replay_address
+from runner.service.pages.step_address import episode_in_words, replay_address
+from runner.util.cache import cache_folder
 
 router = APIRouter(include_in_schema=False)
 
@@ -96,7 +96,7 @@ def version() -> str:
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import version as installed
 
-    from runner.extras import missing
+    from runner.util.extras import missing
 
     try:
         return installed("rerun-sdk")

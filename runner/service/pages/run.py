@@ -14,13 +14,13 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
-from runner import amounts
+from runner.analysis.frames import agents_of, evaluation_record, evaluation_records
+from runner.environments.naming import event_in_words
 from runner.errors import RecordingError, RunnerError
-from runner.frames import agents_of, evaluation_record, evaluation_records
-from runner.labels import MAX_NOTE
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
-from runner.runs import Run
+from runner.runs.labels import MAX_NOTE
+from runner.runs.run import Run
 from runner.service import played
 from runner.service.api.replay import LONG
 from runner.service.api.runs import Labels, relabelled
@@ -39,13 +39,13 @@ from runner.service.pages.forms import Form
 from runner.service.pages.frame import framed, is_loop, loop_results
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page
-from runner.words import event_in_words
+from runner.util import humanize
 
 if TYPE_CHECKING:
-    from runner.service.kept import Kept
+    from runner.service.jobs.scheduler import Jobs
     from runner.service.processes import ProcessPool
+    from runner.service.response_cache import Kept
     from runner.service.settings import Settings
-    from runner.service.work import Jobs
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
@@ -187,11 +187,11 @@ def _standing(run: Run, jobs: Jobs, settings: Settings) -> dict[str, Any]:
     done = summary.get("episode", summary.get("episodes"))
     to_do = run.episodes_to_do
     facts = _results(run, last) | {
-        "Training episodes": amounts.UNKNOWN if done is None else f"{done:,}",
-        "Steps of training": amounts.number(summary.get("train_steps"), 0),
-        "Steps of evaluation": amounts.number(summary.get("eval_steps"), 0),
+        "Training episodes": humanize.UNKNOWN if done is None else f"{done:,}",
+        "Steps of training": humanize.number(summary.get("train_steps"), 0),
+        "Steps of evaluation": humanize.number(summary.get("eval_steps"), 0),
         "Time": _seconds(run),
-        "Recording": amounts.size(summary["bytes"]) if summary.get("bytes") else amounts.UNKNOWN,
+        "Recording": humanize.size(summary["bytes"]) if summary.get("bytes") else humanize.UNKNOWN,
     }
     share, said = None, ""
     if run.status == "running" and to_do is not None and done is not None:
@@ -211,25 +211,25 @@ def _results(run: Run, last: Mapping[str, Any]) -> dict[str, str]:
     if not is_loop(run):
         return {
             "Success in the last evaluation": _percent(last.get("success_percent")),
-            "Mean length of its trials": amounts.number(last.get("mean_length")),
-            "Penalties a trial": amounts.number(last.get("mean_penalties")),
+            "Mean length of its trials": humanize.number(last.get("mean_length")),
+            "Penalties a trial": humanize.number(last.get("mean_penalties")),
         }
     results = loop_results(run)
     evaluation, recent = results["last_evaluation"] or {}, results["recent_training"]
     episodes = f"the last {recent['episodes']:,} training episodes"
     measures = {
         "Success in the last evaluation": _percent(evaluation.get("success_percent")),
-        "Mean return in the last evaluation": amounts.number(evaluation.get("mean_return")),
-        "Mean length of its trials": amounts.number(evaluation.get("mean_length")),
-        "Penalties a trial": amounts.number(evaluation.get("mean_penalties")),
-        f"Mean return of {episodes}": amounts.number(recent["mean_return"]),
-        f"Mean length of {episodes}": amounts.number(recent["mean_length"]),
+        "Mean return in the last evaluation": humanize.number(evaluation.get("mean_return")),
+        "Mean length of its trials": humanize.number(evaluation.get("mean_length")),
+        "Penalties a trial": humanize.number(evaluation.get("mean_penalties")),
+        f"Mean return of {episodes}": humanize.number(recent["mean_return"]),
+        f"Mean length of {episodes}": humanize.number(recent["mean_length"]),
     }
     logged = {
         f"Logged last: {name}": "not finite" if value is None else f"{value:,.4g}"
         for name, value in islice(results["logged"].items(), MOST_LOGGED)
     }
-    return {name: text for name, text in measures.items() if amounts.UNKNOWN not in text} | logged
+    return {name: text for name, text in measures.items() if humanize.UNKNOWN not in text} | logged
 
 
 def _job_of(run: Run, jobs: Jobs) -> tuple[int | None, dict[str, Any]]:
@@ -243,13 +243,13 @@ def _job_of(run: Run, jobs: Jobs) -> tuple[int | None, dict[str, Any]]:
 
 def _seconds(run: Run) -> str:
     if run.status == "running":
-        return f"{amounts.duration((datetime.now(UTC) - run.created).total_seconds())} so far"
+        return f"{humanize.duration((datetime.now(UTC) - run.created).total_seconds())} so far"
     seconds = run.summary.seconds
-    return amounts.UNKNOWN if seconds is None else amounts.duration(seconds)
+    return humanize.UNKNOWN if seconds is None else humanize.duration(seconds)
 
 
 def _percent(value: float | None) -> str:
-    return amounts.UNKNOWN if value is None else f"{amounts.number(value)} %"
+    return humanize.UNKNOWN if value is None else f"{humanize.number(value)} %"
 
 
 def _recorded_facts(
@@ -260,12 +260,12 @@ def _recorded_facts(
         "Run": run.run_id,
         "Begun": f"{run.created:%Y-%m-%d %H:%M:%S} UTC",
         "Content digest": run.summary.content_digest or "none: told when a run ends properly",
-        "Steps": f"{amounts.number(run.summary.get('train_steps'), 0)} of training, "
-        f"{amounts.number(run.summary.get('eval_steps'), 0)} of evaluation",
+        "Steps": f"{humanize.number(run.summary.get('train_steps'), 0)} of training, "
+        f"{humanize.number(run.summary.get('eval_steps'), 0)} of evaluation",
     }
     try:
         with open_recording(run.recording) as recording:
-            facts |= {"Job": recording.run.get("job", ""), "Size": amounts.size(recording.size)}
+            facts |= {"Job": recording.run.get("job", ""), "Size": humanize.size(recording.size)}
             return facts, recording.provenance, _log(recording)
     except RecordingError as error:
         return facts | {"Recording": settings.without_folders(str(error))}, {}, []

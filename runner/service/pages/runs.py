@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
-from runner.catalogue.columns import HEADINGS, columns_of, in_words, with_originals
-from runner.catalogue.fields import FIELDS, SETTING, Kind, field_of
-from runner.catalogue.filters import Filter, parse
-from runner.catalogue.index import order_of
 from runner.errors import RunnerError
+from runner.runs.catalogue.columns import HEADINGS, columns_of, in_words, with_originals
+from runner.runs.catalogue.fields import FIELDS, SETTING, Kind, field_of
+from runner.runs.catalogue.filters import Filter, parse
+from runner.runs.catalogue.index import order_of
 from runner.service.dependencies import CatalogueOf, KeptOf
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import Viewer, link, render, viewer_of
 
 if TYPE_CHECKING:
-    from runner.catalogue.index import Index
+    from runner.runs.catalogue.index import Index
     from runner.service.catalogue import Catalogue
 
 router = APIRouter(include_in_schema=False)

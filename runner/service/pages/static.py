@@ -17,7 +17,7 @@ from typing import Final
 
 from fastapi import APIRouter, HTTPException, Request, Response
 
-from runner.export import svg, svg_maps
+from runner.drawing import svg, svg_maps
 
 router = APIRouter(include_in_schema=False)
 

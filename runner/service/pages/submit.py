@@ -15,12 +15,12 @@ from starlette.concurrency import run_in_threadpool
 from runner.config.document import write_yaml
 from runner.config.schema import json_schema, without_references
 from runner.errors import RunnerError
-from runner.service.checking import SWEEP_KEYS, Checked
 from runner.service.dependencies import CatalogueOf, JobsOf
+from runner.service.errors import Refused
+from runner.service.jobs.checking import SWEEP_KEYS, Checked
 from runner.service.pages.forms import Form
 from runner.service.pages.rendering import page, viewer_of
 from runner.service.problems import trouble_of
-from runner.service.refused import Refused
 
 router = APIRouter(prefix="/submit", include_in_schema=False)
 

@@ -14,16 +14,16 @@ from fastapi import Path as InPath
 from fastapi.responses import HTMLResponse
 from starlette.concurrency import run_in_threadpool
 
-from runner.catalogue.filters import parse
 from runner.errors import RunnerError, RunNotFound
+from runner.runs.catalogue.filters import parse
 from runner.service import played
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CatalogueOf, JobsOf, KeptOf, SettingsOf, SweepProcesses
-from runner.service.kept import ALWAYS, Kept
 from runner.service.pages.jobs import shown_job
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page, picture_address, templates
 from runner.service.processes import ProcessPool
+from runner.service.response_cache import ALWAYS, Kept
 from runner.sweep.names import folder_of, sweeps_in, tag_of
 from runner.sweep.state import read_sweep
 

@@ -17,11 +17,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from runner.documents import sync, write_whole
 from runner.errors import StorageError
+from runner.service.jobs.folder_lock import hold
 from runner.service.receiving.appending import on_disk
 from runner.service.receiving.model import BODY_FILE, STATE_FILE, Upload, read_upload
-from runner.service.sole import hold
+from runner.util.files import sync, write_whole
 
 FOLDER: Final = ".uploads"
 LOCK_FILE: Final = "lock"

@@ -9,9 +9,9 @@ from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from runner.documents import read_object
 from runner.errors import MAX_MESSAGE, RunnerError
-from runner.labels import MAX_NOTE, MAX_TAGS
+from runner.runs.labels import MAX_NOTE, MAX_TAGS
+from runner.util.files import read_object
 
 STATE_FILE: Final = "upload.json"
 BODY_FILE: Final = "body"

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from runner.errors import RunNotFound, StorageError
-from runner.run_file import Summary
-from runner.runs import run_of_id
+from runner.recording.run_file import Summary
+from runner.runs.run import run_of_id
 from runner.service.logs import LOG
 from runner.service.receiving.appending import Appending
 from runner.service.receiving.folder import UploadFolder

@@ -21,12 +21,12 @@ from typing import Any, Final
 from filelock import FileLock
 from mcap.writer import MCAP0_MAGIC
 
-from runner.documents import sync
 from runner.errors import RunnerError, StorageError
-from runner.hashing import hash_of
-from runner.labels import labels_from
+from runner.runs.labels import labels_from
 from runner.service.receiving.model import BODY_FILE, Completion, read_upload
 from runner.service.settings import without_folders
+from runner.util.files import sync
+from runner.util.hashing import hash_of
 
 PATIENCE_SECONDS: Final = 120.0
 """A verification may last so long,"""

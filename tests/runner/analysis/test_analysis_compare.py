@@ -18,7 +18,7 @@ from runner.analysis.groups import groups_of
 from runner.analysis.sections import markdown
 from runner.analysis.series import RunSeries
 from runner.errors import RunnerError
-from runner.export.plots import panels_of
+from runner.export.plots.metrics import panels_of
 
 FINISH = [("success_percent", "")]
 

@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from runner import runs
 from runner.analysis.diff import Change, RunDiff, diff
 from runner.analysis.diff.sections import sections
 from runner.analysis.diff.settings import changes_in
@@ -21,12 +20,13 @@ from runner.analysis.diff.trajectory import FIELDS, first_difference
 from runner.analysis.sections import markdown
 from runner.cli import cli
 from runner.config import from_mapping
-from runner.execution import run_job
-from runner.job import Job
+from runner.config.job import Job
+from runner.environments.naming import states_in_words
+from runner.execution.session import run_job
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.replay.tables import tables_at
-from runner.words import states_in_words
+from runner.runs import run as runs
 from tests.runner.altering import altered, without_chunk
 from tests.runner.recording.making import stopping_after
 

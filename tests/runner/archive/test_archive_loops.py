@@ -17,13 +17,13 @@ import runner
 from runner.archive import layout
 from runner.archive.restoring import check, restore
 from runner.errors import RecordingError
+from runner.execution.verify import verify
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
-from runner.verify import verify
 from tests.runner.altering import altered
 from tests.runner.archive.whole import archived, contents
-from tests.runner.wrappers.loops import make, play
+from tests.runner.loops.making import make, play
 
 
 class Odd(gymnasium.Env):

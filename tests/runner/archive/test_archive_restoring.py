@@ -20,12 +20,12 @@ from runner.archive.reading import Archive
 from runner.archive.restoring import check, restore
 from runner.archive.runs import archive_run
 from runner.errors import RecordingError, RunnerError
+from runner.execution.verify import verify
 from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.repair import repair
-from runner.runs import run_at
-from runner.verify import verify
+from runner.runs.run import run_at
 from tests.runner.altering import altered
 from tests.runner.archive.whole import archived, contents
 from tests.runner.recording.making import LAKE, TAXIS, make_run
@@ -286,7 +286,7 @@ def test_a_pipe_in_place_of_a_file_is_refused_and_not_waited_for(taxis, tmp_path
 from pathlib import Path
 from runner.archive.runs import restore_run
 from runner.errors import RunnerError
-from runner.runs import run_at
+from runner.runs.run import run_at
 try:
     restore_run(run_at(Path({str(recordings / taxis.run_id)!r})))
 except RunnerError as error:

@@ -17,7 +17,7 @@ from runner.archive.restoring import check
 from runner.archive.targets import target_of
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.finding import find_run
+from runner.runs.resolve import find_run
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::ResourceWarning"),

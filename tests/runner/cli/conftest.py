@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 
 import runner
 from runner.cli import cli
-from runner.runs import Run
+from runner.runs.run import Run
 
 TINY = """\
 name: tiny

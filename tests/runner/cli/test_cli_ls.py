@@ -7,7 +7,7 @@ import pytest
 
 from runner.api import experiment_of
 from runner.config import from_mapping
-from runner.runs import RUN_FILE, create_run
+from runner.runs.run import RUN_FILE, create_run
 
 
 def test_json_lists_the_runs(recorded, recorded_run):

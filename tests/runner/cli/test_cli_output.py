@@ -5,10 +5,10 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from runner.cli import cli, output
-from runner.cli.drawing import Drawing, signs
 from runner.cli.evaluations import evaluation_table, some
 from runner.config import from_mapping
-from runner.estimate import estimate, step_limit
+from runner.drawing.text import Drawing, signs
+from runner.execution.estimate import estimate, step_limit
 
 
 @pytest.mark.parametrize(

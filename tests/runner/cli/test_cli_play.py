@@ -7,7 +7,7 @@ import sys
 import pytest
 
 import runner
-from runner.export.report_replay import typical_trial
+from runner.export.reports.episode import typical_trial
 
 
 def _frames(text):

@@ -10,10 +10,10 @@ import pytest
 import yaml
 
 import runner
-from runner.again import rerecord
 from runner.api import experiment_of
 from runner.errors import ConfigError, EnvironmentNotUsable
-from runner.runs import list_runs
+from runner.execution.rerecord import rerecord
+from runner.runs.run import list_runs
 
 
 def test_the_public_names():

@@ -14,12 +14,12 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from runner.cli import cli
-from runner.owner import owner
 from runner.recording import open as open_recording
 from runner.recording import schema
-from runner.recording.contents import survey
+from runner.recording.scan import survey
 from runner.replay.tables import tables_at
-from runner.runs import Run, list_runs
+from runner.runs.liveness import owner
+from runner.runs.run import Run, list_runs
 from tests.runner.altering import altered
 
 COMMANDS = ("resume", "rerecord", "evaluate", "verify", "repair", "qtable")
@@ -144,7 +144,7 @@ def test_nothing_to_resume(command, copied):
 
 
 def test_resume_refuses_a_living_run(command, copied):
-    from runner.runs import owner
+    from runner.runs.run import owner
 
     copied.update(status="running", owner=owner())
     for name in ("resume", "verify", "repair", "rerecord"):
@@ -154,7 +154,7 @@ def test_resume_refuses_a_living_run(command, copied):
 
 
 def test_accepted_changes(command, copied, monkeypatch):
-    from runner import verify
+    from runner.execution import verify
 
     here = verify.provenance()
     monkeypatch.setattr(verify, "provenance", lambda: here | {"dualtaxi": "9.9"})

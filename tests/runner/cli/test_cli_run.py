@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
-from runner import estimate
 from runner.cli.commands import run as run_command
-from runner.runs import list_runs
+from runner.execution import estimate
+from runner.runs.run import list_runs
 
 BESIDES = {"name", "seed", "status", "episodes"}
 PROMISED = {
@@ -171,7 +171,7 @@ def test_where_success_is_unknown_it_is_null(command, tiny):
 
 def test_a_run_stands_on_disk_before_anything_heavy_is_imported(tiny, tmp_path):
     program = (
-        "import sys\nimport runner.runs as runs\nmake = runs.create_run\n"
+        "import sys\nimport runner.runs.run as runs\nmake = runs.create_run\n"
         "def spy(*args):\n    run = make(*args)\n    assert (run.folder / 'run.json').is_file()\n"
         "    print(*sys.modules, file=sys.stderr)\n    sys.exit(5)\n"
         "runs.create_run = spy\nfrom runner.cli import main\n"

@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 
-from runner.runs import RUN_FILE, create_run
+from runner.runs.run import RUN_FILE, create_run
 
 
 def _numbers(value):

@@ -8,7 +8,7 @@ import sys
 import numba
 import pytest
 
-from runner.environments import load_mdp
+from runner.environments.loading import load_mdp
 from runner.learning.compilation import announced
 from runner.learning.model import build_model
 from runner.recording.reader import open_recording

@@ -17,9 +17,9 @@ import pytest
 
 from runner.cli import removing
 from runner.config import from_mapping
-from runner.labels import LABELS_FILE
-from runner.locking import locked
-from runner.runs import RECORDING_FILE, RUN_FILE, create_run, list_runs
+from runner.runs.labels import LABELS_FILE
+from runner.runs.locking import locked
+from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
 
 CONFIG = from_mapping({"name": "some", "episodes": 5})
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 import runner
-from runner.export.report import render_report
+from runner.export.reports.report import render_report
 from runner.recording.reader import open_recording
 
 _SHORT = {"evaluation": {"every": 20, "trials": 6}, "log": {"every_steps": 200, "window": 100}}

@@ -15,8 +15,8 @@ from runner.analysis.compare.moments import Moment
 from runner.analysis.diff import diff
 from runner.analysis.readings import read_series
 from runner.cli import cli
-from runner.export.compare_page import render_comparison
-from runner.export.diff_page import render_diff
+from runner.export.reports.compare import render_comparison
+from runner.export.reports.diff import render_diff
 from runner.recording.reader import open_recording
 from tests.runner.export.conftest import WORLDS
 from tests.runner.export.outline import check_page

@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
+from runner.analysis.frames import agents_of
 from runner.cli import cli
+from runner.drawing.svg import Drawing
 from runner.export.gif import Film, captions_of, render_svg
-from runner.export.report_replay import training_episode, trial, typical_trial
-from runner.export.svg import Drawing
-from runner.frames import agents_of
+from runner.export.reports.episode import training_episode, trial, typical_trial
 from runner.recording.reader import open_recording
 
 

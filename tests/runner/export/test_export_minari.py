@@ -15,8 +15,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import runner
 from runner.cli import cli
 from runner.export.minari_loops import space_of
-from runner.wrappers.described import describe_space
-from tests.runner.wrappers.loops import NAMES, Rooms, make, play
+from runner.loops.spaces import describe_space
+from tests.runner.loops.making import NAMES, Rooms, make, play
 
 pytest.importorskip("minari")
 

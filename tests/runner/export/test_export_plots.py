@@ -10,17 +10,17 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.figure import Figure
 
+from runner.analysis.frames import evaluation_records
 from runner.analysis.groups import groups_of
 from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries
 from runner.cli import cli
 from runner.errors import RunnerError
-from runner.export import plots_figure
-from runner.export.plots import panels_of
-from runner.export.plots_figure import draw_figure, draw_panel
-from runner.finding import find_run
-from runner.frames import evaluation_records
+from runner.export.plots import figure as plots_figure
+from runner.export.plots.figure import draw_figure, draw_panel
+from runner.export.plots.metrics import panels_of
 from runner.recording.reader import open_recording
+from runner.runs.resolve import find_run
 from tests.runner.recording.making import TAXIS, make_run, with_id
 
 

@@ -14,11 +14,11 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 
 from runner.cli import cli
-from runner.export.report import render_report
-from runner.export.report_replay import ranked_trials
-from runner.export.svg import Drawing, trail_points, transform
+from runner.drawing.svg import Drawing, trail_points, transform
+from runner.environments.naming import states_in_words
+from runner.export.reports.episode import ranked_trials
+from runner.export.reports.report import render_report
 from runner.recording.reader import open_recording
-from runner.words import states_in_words
 from tests.runner.export.outline import Outline, check_page
 
 
@@ -134,7 +134,7 @@ def test_what_is_not_there_is_refused(pictured, tmp_path):
 
 
 def test_names_cannot_break_out_of_the_page(pictured):
-    from runner.export.report import _embedded
+    from runner.export.reports.report import _embedded
 
     assert "</script>" not in _embedded({"a": "</script><b>"})
     assert json.loads(_embedded({"a": "</script>\u2028"})) == {"a": "</script>\u2028"}

@@ -12,8 +12,8 @@ from click.testing import CliRunner
 from runner.analysis.diff import diff
 from runner.cli import cli
 from runner.errors import MissingExtra, RecordingError
+from runner.export.rerun.positions import where_they_part, with_spot
 from runner.export.rerun.selection import Request, episodes_of, select
-from runner.export.rerun.spots import where_they_part, with_spot
 from runner.export.rerun.viewer import ViewerError, check_port, require_rerun
 from runner.recording import schema
 from runner.recording.reader import open_recording

@@ -9,6 +9,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
+from runner.analysis.frames import agents_of
 from runner.analysis.outcomes import events_of
 from runner.export.rerun.cache import TINTS
 from runner.export.rerun.layout import PLOTS
@@ -16,7 +17,6 @@ from runner.export.rerun.scene import marks_of, own_actions, scene_of
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import viewer_program
 from runner.export.rerun.writing import Source, export
-from runner.frames import agents_of
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, tables_at

@@ -24,8 +24,8 @@ from runner.export.rerun import live as live_view
 from runner.export.rerun import viewer, writing
 from runner.export.rerun.cache import exported
 from runner.export.rerun.live import LiveView
+from runner.export.rerun.positions import with_spot
 from runner.export.rerun.selection import Request
-from runner.export.rerun.spots import with_spot
 from runner.recording import schema
 from runner.recording.reader import open_recording
 

@@ -8,10 +8,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from runner.export import svg, svg_maps
-from runner.export.report_maps import maps_of, situation, stages_of
-from runner.export.svg import CELL, MARGIN, Drawing
-from runner.frames import agents_of
+from runner.analysis.frames import agents_of
+from runner.drawing import svg, svg_maps
+from runner.drawing.svg import CELL, MARGIN, Drawing
+from runner.export.reports.maps import maps_of, situation, stages_of
 from runner.recording.reader import open_recording
 
 NS = {"s": "http://www.w3.org/2000/svg"}

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from runner.analysis.series import SHARES
-from runner.export.plots import Curve, Panel
-from runner.export.svg_charts import Scale, panel_svg
+from runner.export.plots.metrics import Curve, Panel
+from runner.export.plots.svg import Scale, panel_svg
 
 
 def curve(values, group=0, line="", spread=0.0):

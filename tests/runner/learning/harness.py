@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig, from_mapping
-from runner.environments import load_mdp
+from runner.environments.loading import load_mdp
+from runner.environments.mdp import Mdp
 from runner.learning.learner import Learner
-from runner.mdp import Mdp
 from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts
 from tests.runner.learning.twin import Twin

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from runner.config import from_mapping
 from runner.config.model import Algorithm
+from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
 from runner.learning.learner import Learner
-from runner.mdp import Mdp
 from tests.runner.learning.harness import (
     ALGORITHMS,
     COMPETITIVE,

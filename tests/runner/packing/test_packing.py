@@ -22,13 +22,13 @@ from mcap.stream_reader import StreamReader
 
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError
-from runner.finding import find_run
-from runner.labels import Labels, change_labels, read_labels
+from runner.execution.verify import verify
 from runner.packing.packing import pack
 from runner.packing.unpacking import unpack
 from runner.recording.reader import open_recording
-from runner.runs import list_runs
-from runner.verify import verify
+from runner.runs.labels import Labels, change_labels, read_labels
+from runner.runs.resolve import find_run
+from runner.runs.run import list_runs
 from tests.runner.recording.making import LAKE, make_run
 
 

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runner.environments import load_mdp
+from runner.environments.loading import load_mdp
+from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
-from runner.mdp import Mdp
 from runner.planning import (
     baseline,
     best_response,

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from runner.config import ExperimentConfig, from_mapping
-from runner.execution import run_job
-from runner.job import Job
+from runner.config.job import Job
+from runner.execution.session import run_job
 from runner.recording.rewriting import rewrite
-from runner.runs import Run, create_run
+from runner.runs.run import Run, create_run
 
 SMALL_MAP = ["+---+", "|A: |", "| |B|", "+---+"]
 TAXIS: dict[str, Any] = {

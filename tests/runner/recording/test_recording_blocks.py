@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from runner.errors import RecordingError
 from runner.recording import open as open_recording
 from runner.recording import schema
-from runner.recording.store import RecordStore
+from runner.recording.chunk_cache import RecordStore
 from tests.runner.recording.making import LAKE, make_run
 
 topics = st.sampled_from(schema.BLOCK_TOPICS)

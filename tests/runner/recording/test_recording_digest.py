@@ -10,9 +10,9 @@ import pytest
 from blake3 import blake3
 from mcap.reader import make_reader
 
-from runner.environments import load_mdp
-from runner.execution import Session, recorder_for
-from runner.job import Job
+from runner.config.job import Job
+from runner.environments.loading import load_mdp
+from runner.execution.session import Session, recorder_for
 from runner.learning.learner import Learner
 from runner.recording import open as open_recording
 from runner.recording import pipeline, recorder, schema

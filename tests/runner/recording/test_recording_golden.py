@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from runner.config import load
-from runner.execution import run_job
-from runner.job import Job
-from runner.runs import create_run
+from runner.config.job import Job
+from runner.execution.session import run_job
+from runner.runs.run import create_run
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SHORT = (

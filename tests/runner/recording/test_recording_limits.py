@@ -13,15 +13,15 @@ from pathlib import Path
 
 import pytest
 
+from runner.config.job import Job
 from runner.errors import StorageError
-from runner.execution import run_job
-from runner.finding import find_run
-from runner.job import Job
+from runner.execution.session import run_job
 from runner.recording import open as open_recording
 from runner.recording import pipeline, schema
 from runner.recording.blocks import record_dtype
 from runner.recording.writer import RecordingFile
-from runner.runs import create_run
+from runner.runs.resolve import find_run
+from runner.runs.run import create_run
 from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
 
 LONG_RUN = """

@@ -15,9 +15,9 @@ from selenium.webdriver.support.ui import WebDriverWait
 from served import Served
 
 import runner
-from runner.export.svg import Drawing, transform
-from runner.finding import find_run
+from runner.drawing.svg import Drawing, transform
 from runner.recording.reader import open_recording
+from runner.runs.resolve import find_run
 
 ASKED = """\
 name: asked

@@ -10,8 +10,8 @@ import pytest
 
 from runner.config import load
 from runner.errors import ConfigError
-from runner.service import checking
-from runner.service.checking import Checker, check
+from runner.service.jobs import checking
+from runner.service.jobs.checking import Checker, check
 from runner.sweep import state
 from runner.sweep.loading import from_values
 

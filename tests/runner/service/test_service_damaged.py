@@ -10,11 +10,11 @@ from click.testing import CliRunner
 
 from runner.cli import cli
 from runner.errors import RecordingError
-from runner.labels import Labels
+from runner.execution.verify import verify
 from runner.packing.admission import admit
 from runner.recording import open as open_recording
-from runner.runs import RUN_FILE, list_runs
-from runner.verify import verify
+from runner.runs.labels import Labels
+from runner.runs.run import RUN_FILE, list_runs
 from tests.runner.altering import altered
 
 

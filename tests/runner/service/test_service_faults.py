@@ -18,7 +18,7 @@ import httpx2 as httpx
 import pytest
 from served import Served
 
-from runner.catalogue.database import index_path
+from runner.runs.catalogue.database import index_path
 from runner.service.app import create_app
 from runner.service.server import bind, serve
 from runner.service.settings import Limits
@@ -149,7 +149,7 @@ def test_a_full_disk_is_said(client, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("runner.labels.write_whole", full)
+    monkeypatch.setattr("runner.runs.labels.write_whole", full)
     answer = client.patch("/api/v1/runs/first", json={"note": "x"})
     assert answer.status_code == 507
     assert "No space left" in answer.json()["error"]["message"]

@@ -12,9 +12,9 @@ from submitted import ENDLESS, ICY
 
 import runner
 from runner.config import from_mapping
-from runner.runs import list_runs
-from runner.service import work
-from runner.service.work import Jobs
+from runner.runs.run import list_runs
+from runner.service.jobs import scheduler
+from runner.service.jobs.scheduler import Jobs
 from tests.waiting import until
 
 CONFIG = ICY | {"episodes": 200, "evaluation": {"every": 100, "trials": 5}}
@@ -214,11 +214,11 @@ def test_a_text_can_be_checked_without_being_queued(client):
 
 
 def test_what_the_disk_would_not_hold_is_refused_and_a_full_one_is_waited_for(client, submit, monkeypatch):
-    monkeypatch.setattr(work, "free_bytes", lambda _: 1000)
+    monkeypatch.setattr(scheduler, "free_bytes", lambda _: 1000)
     refused = client.post("/api/v1/jobs", content=json.dumps(CONFIG))
     assert refused.status_code == 507
     assert "its recordings need about" in refused.json()["error"]["message"]
-    monkeypatch.setattr(work, "free_bytes", lambda _: work.RESERVE_BYTES - 1)
+    monkeypatch.setattr(scheduler, "free_bytes", lambda _: scheduler.RESERVE_BYTES - 1)
     number = submit(CONFIG | {"seeds": [0]})
     time.sleep(0.5)
     assert job(client, number)["state"] == "queued"
@@ -262,7 +262,7 @@ def test_a_worker_that_cannot_be_started_is_waited_for_and_readiness_says_so(
     def refused(_):
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(work, "RETRY_SECONDS", 0.05)
+    monkeypatch.setattr(scheduler, "RETRY_SECONDS", 0.05)
     with monkeypatch.context() as full:
         full.setattr(SpawnProcess, "start", refused)
         number = jobs_of(client).queue.add("config", "icy", 1, "", one_seed()).number

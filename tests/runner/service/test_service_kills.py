@@ -12,7 +12,7 @@ import pytest
 from served import Served
 
 import runner
-from runner.runs import list_runs
+from runner.runs.run import list_runs
 from runner.sweep import state
 from runner.sweep.loading import from_values
 from runner.sweep.task import do

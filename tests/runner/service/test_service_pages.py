@@ -10,10 +10,10 @@ import re
 import pytest
 from submitted import ICY
 
-from runner.finding import find_run
+from runner.environments.naming import states_in_words
 from runner.recording import reader
 from runner.recording.reader import open_recording
-from runner.words import states_in_words
+from runner.runs.resolve import find_run
 from tests.runner.export.outline import Outline
 from tests.waiting import until
 
@@ -262,7 +262,7 @@ def test_an_error_that_is_no_text_is_no_fault(client, recordings, error):
 
 
 def test_the_page_of_a_run_is_live_from_when_a_job_will_go_on_with_it(client, recordings, monkeypatch):
-    monkeypatch.setattr("runner.service.work.RESERVE_BYTES", 1 << 62)  # so that no job is begun
+    monkeypatch.setattr("runner.service.jobs.scheduler.RESERVE_BYTES", 1 << 62)  # so that no job is begun
     run = find_run("first", recordings).update(status="interrupted")
     assert "data-live" not in page_of(client, "/runs/first")
     assert client.get("/runs/first/standing?status=interrupted").status_code == 204

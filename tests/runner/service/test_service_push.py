@@ -25,16 +25,16 @@ from served import Served
 
 import runner
 from runner.cli import cli
-from runner.finding import find_run
-from runner.labels import change_labels
+from runner.client import http as client_module
+from runner.client.address import checked_url, found_token
+from runner.client.backoff import Patience, ServerAway, ServerError
+from runner.client.http import Client
+from runner.client.outbox import outbox_folder
+from runner.client.upload_source import Parcel, Sent
 from runner.packing.packing import pack
-from runner.runs import list_runs
-from runner.service import client as client_module
-from runner.service.address import checked_url, found_token
-from runner.service.away import Patience, ServerAway, ServerError
-from runner.service.client import Client
-from runner.service.outbox import outbox_folder
-from runner.service.parcel import Parcel, Sent
+from runner.runs.labels import change_labels
+from runner.runs.resolve import find_run
+from runner.runs.run import list_runs
 from tests.runner.recording.making import TAXIS, make_run, with_id
 from tests.waiting import until
 
@@ -164,7 +164,7 @@ def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recor
 
 def test_what_is_waited_for_is_told_and_for_as_long_as_the_server_says(monkeypatch):
     slept, told = [], []
-    monkeypatch.setattr("runner.service.away.time.sleep", slept.append)
+    monkeypatch.setattr("runner.client.backoff.time.sleep", slept.append)
     locked = ServerAway("token: too many wrong ones; try again in 40 s.", 429, 40)
     patience = Patience(60, told.append)
     patience.wait(locked)
@@ -356,7 +356,7 @@ def test_a_loop_that_failed_at_length_is_pushed_with_the_beginning_of_its_error(
 
 
 def test_a_loop_whose_server_is_away_waits_in_the_outbox(own_server, outbox, monkeypatch):
-    monkeypatch.setattr("runner.service.outbox.LAST_SECONDS", 0.5)
+    monkeypatch.setattr("runner.client.outbox.LAST_SECONDS", 0.5)
     with pytest.warns(UserWarning, match="dualtaxi push --outbox"):  # noqa: SIM117
         with runner.record(gymnasium.make("FrozenLake-v1"), own_server.url, name="away") as rec:
             drive(rec, 500)

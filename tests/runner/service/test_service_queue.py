@@ -7,8 +7,8 @@ import os
 import pytest
 
 from runner.errors import RunnerError, StorageError
-from runner.service import queue as queues
-from runner.service.queue import NoSuchJob, Queue, QueueFull
+from runner.service.jobs import queue as queues
+from runner.service.jobs.queue import NoSuchJob, Queue, QueueFull
 
 CONFIG = {"episodes": 3}
 

@@ -9,8 +9,8 @@ from submitted import ENDLESS, ICY
 
 import runner
 from runner.recording.reader import open_recording
-from runner.runs import list_runs
-from runner.service.work import Jobs
+from runner.runs.run import list_runs
+from runner.service.jobs.scheduler import Jobs
 from tests.waiting import until
 
 pytest.importorskip("ray")

@@ -15,9 +15,9 @@ from click.testing import CliRunner
 import runner
 from runner.analysis.qtable import one_array
 from runner.cli import cli
-from runner.finding import find_run
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
+from runner.runs.resolve import find_run
 from runner.service.settings import Limits
 
 RUN = "/api/v1/runs/first"

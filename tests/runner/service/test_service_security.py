@@ -19,7 +19,7 @@ from starlette.testclient import TestClient
 
 from runner.cli import cli
 from runner.errors import RunnerError
-from runner.finding import find_run
+from runner.runs.resolve import find_run
 from runner.service import logs
 from runner.service.app import create_app
 from runner.service.guard import POLICY

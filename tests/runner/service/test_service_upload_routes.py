@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from blake3 import blake3
 
-from runner.runs import list_runs
+from runner.runs.run import list_runs
 from runner.service.security import Tokens
 from runner.service.settings import Limits
 

@@ -15,14 +15,14 @@ from pathlib import Path
 import pytest
 from blake3 import blake3
 
+from runner.config.job import Job
 from runner.errors import RunnerError, RunNotFound, StorageError
-from runner.execution import run_job
-from runner.finding import find_run
-from runner.job import Job
-from runner.labels import Labels, change_labels
+from runner.execution.resume import resume
+from runner.execution.session import run_job
 from runner.packing.packing import pack
-from runner.resume import resume
-from runner.runs import create_run, list_runs
+from runner.runs.labels import Labels, change_labels
+from runner.runs.resolve import find_run
+from runner.runs.run import create_run, list_runs
 from runner.service.receiving.folder import FOLDER
 from runner.service.receiving.model import (
     Announcement,

@@ -9,11 +9,11 @@ import pytest
 from served import Served
 from submitted import ENDLESS, ICY
 
+from runner.client.backoff import ServerError
+from runner.client.http import Client
+from runner.client.jobs import Happened, JobThere, events_in
 from runner.errors import RunnerError
-from runner.runs import list_runs
-from runner.service.away import ServerError
-from runner.service.client import Client
-from runner.service.watching import Happened, JobThere, events_in
+from runner.runs.run import list_runs
 
 CONFIG = {"name": "quick", "episodes": 600, "mode": "cooperative", "evaluation": {"every": 50, "trials": 400}}
 

@@ -13,7 +13,7 @@ from runner.archive.runs import archive_run
 from runner.cli import cli
 from runner.config import from_mapping
 from runner.errors import RunnerError
-from runner.runs import list_runs
+from runner.runs.run import list_runs
 from runner.sweep import state
 from runner.sweep.figure import draw_parameter
 from runner.sweep.loading import from_values

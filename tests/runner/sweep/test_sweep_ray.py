@@ -10,7 +10,7 @@ import pytest
 from sweeping import described, digests, swept
 
 from runner.errors import RunnerError
-from runner.runs import list_runs
+from runner.runs.run import list_runs
 from runner.sweep.loading import from_values
 from runner.sweep.task import Task
 

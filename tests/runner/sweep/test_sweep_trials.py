@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 from sweeping import Here, described, digests, swept
 
-from runner import verify
-from runner.again import rerecord
 from runner.config import from_mapping
+from runner.config.job import Job
 from runner.errors import RunnerError
-from runner.execution import run_job
-from runner.finding import find_run
-from runner.job import Job
-from runner.labels import read_labels
-from runner.runs import create_run, list_runs
+from runner.execution import verify
+from runner.execution.rerecord import rerecord
+from runner.execution.session import run_job
+from runner.runs.labels import read_labels
+from runner.runs.resolve import find_run
+from runner.runs.run import create_run, list_runs
 from runner.sweep import local, state
 from runner.sweep.loading import from_values
 from runner.sweep.local import LocalWorkers

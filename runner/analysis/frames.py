@@ -1,0 +1,460 @@
+"""A run's measures, episodes and steps under readable names: as plain records, and as pandas frames.
+
+    import runner
+
+    run = runner.run("quick")
+    runner.frames.evaluations(run).plot("episode", "success_percent")
+
+A run is a `Run`, an open `Recording`, or the path of a recording. pandas comes with the extra `frames`;
+the records need nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from runner.errors import RecordingError
+from runner.runs.run import Run
+from runner.util.extras import require
+
+if TYPE_CHECKING:
+    import numpy as np
+    import pandas as pd
+    from numpy.typing import NDArray
+
+    from runner.environments.mdp import Mdp
+    from runner.recording.reader import Recording
+
+    Source = Run | Recording | str | os.PathLike[str]
+
+Phase = Literal["train", "eval"]
+
+RECENT_EPISODES: Final = 100
+"""Training episodes that the summary of a loop averages, the last ones."""
+LARGEST: Final = 1e300
+"""Values beyond it are left out of means: their sums, and the margins of an axis, would overflow."""
+
+_BEFORE: Final = ("step", "episode", "t", "state", "action", "next_state", "next_observation")
+_BEHIND: Final = ("terminated", "truncated", "explored", "acted", "agents_terminated", "agents_truncated")
+"""The fields of a step in the order of its columns: those before the rewards, and those behind them."""
+
+
+def evaluations(run: Source) -> pd.DataFrame:
+    """Return a row for each evaluation: how the greedy policy did, and how training stood.
+
+    Columns: episode, success_percent (NaN where the environment does not say what success is),
+    mean_length, mean_penalties, ...; a column for each event, such as `taxi_1.drop_off`: how often it came
+    in all trials; `mean_return.AGENT` and `training.…` for training at that moment.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        RecordingError: the recording cannot be read.
+    """
+    with _opened(run) as recording:
+        return _frame(
+            [
+                _flat(record, {"events": "", "mean_returns": "mean_return."})
+                for record in evaluation_records(recording)
+            ]
+        )
+
+
+def training(run: Source) -> pd.DataFrame:
+    """Return a row for each report of training: mean length, rewards, fill of the tables, schedules.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        RecordingError: the recording cannot be read.
+    """
+    with _opened(run) as recording:
+        return _frame([_flat(record, {}) for record in training_records(recording)])
+
+
+def episodes(
+    run: Source,
+    phase: Phase = "train",
+    start: int = 0,
+    stop: int | None = None,
+) -> pd.DataFrame:
+    """Return a row for each episode of a phase, number `start` up to `stop`.
+
+    Columns: episode, length, penalties, success, terminated, truncated, last_step, `return.AGENT`, and a
+    column for each event.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        RecordingError: the recording cannot be read.
+    """
+    with _opened(run) as recording:
+        return _frame(episode_columns(recording, phase, start, stop))
+
+
+def steps(
+    run: Source,
+    phase: Phase = "train",
+    *,
+    episode: int | None = None,
+    start: int = 0,
+    stop: int | None = None,
+) -> pd.DataFrame:
+    """Return a row for each step of a phase: of one episode, or number `start` up to `stop`.
+
+    Columns: step, episode, t, state, action (joint), next_state, `reward.AGENT`, terminated, truncated,
+    explored (bit i: agent i); in spaces that are not `Discrete` action and next_observation, a column for
+    each part of a `Dict`, with an array in a cell where a value is several numbers. All steps of a long run
+    take some 70 bytes of memory each.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        RecordingError: the recording cannot be read, or has no such episode.
+    """
+    with _opened(run) as recording:
+        columns = step_columns(recording, phase, episode=episode, start=start, stop=stop)
+        return _frame({name: list(each) if each.ndim > 1 else each for name, each in columns.items()})
+
+
+def transition_table(
+    env_id: str = "dualtaxi:DualTaxi-v1", kwargs: Mapping[str, Any] | None = None, rewards: str = "team"
+) -> pd.DataFrame:
+    """Return an environment's transition table in words: a row for each outcome that can happen.
+
+    Columns: state, action, probability, next_state, reward (of all agents together), is_over, and
+    `reward.AGENT` where `rewards` is `individual`.
+
+    Raises:
+        MissingExtra: pandas is not installed.
+        EnvironmentNotUsable: the environment is unknown, or has no transition table.
+    """
+    from runner.environments.loading import load_mdp
+
+    return _frame(transition_columns(load_mdp(env_id, kwargs or {}, rewards)))
+
+
+def transition_columns(mdp: Mdp) -> dict[str, NDArray[Any]]:
+    """Return the columns of `transition_table`, a value for each outcome with a probability above 0."""
+    import numpy as np
+
+    from runner.environments.naming import actions_in_words, states_in_words
+
+    states, actions = states_in_words(mdp), actions_in_words(mdp)
+    state, action, outcome = np.nonzero(mdp.probability)
+    at = (state, action, outcome)
+    columns = {
+        "state": states[state],
+        "action": actions[action],
+        "probability": mdp.probability[at],
+        "next_state": states[mdp.next_state[at]],
+        "reward": mdp.summed_rewards[at],
+        "is_over": mdp.terminated[at],
+    }
+    shared = mdp.rewards.shape[-1] == 1
+    own = {} if shared else _by_name(mdp.rewards[at], [f"reward.{agent}" for agent in mdp.agents])
+    return columns | own
+
+
+# --- columns ------------------------------------------------------------------------------------------
+
+
+def episode_columns(
+    recording: Recording, phase: Phase = "train", start: int = 0, stop: int | None = None
+) -> dict[str, NDArray[Any]]:
+    """Return the columns of `episodes`, an array each.
+
+    Raises:
+        RecordingError: the recording cannot be read.
+    """
+    records = recording.episodes(phase, start, stop)
+    columns = _plain_columns(records, ("episode", "length", "penalties", "success"))
+    columns |= _plain_columns(records, ("terminated", "truncated", "last_step"))
+    columns |= _by_name(records["returns"], [f"return.{agent}" for agent in agents_of(recording)])
+    return columns | _by_name(records["events"], event_names_of(recording))
+
+
+def step_columns(
+    recording: Recording,
+    phase: Phase = "train",
+    *,
+    episode: int | None = None,
+    start: int = 0,
+    stop: int | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Return the columns of `steps`, an array each.
+
+    Raises:
+        RecordingError: the recording cannot be read, or has no such episode.
+    """
+    import numpy as np
+
+    topic = recording.topic(f"/{phase}/step")
+    if topic not in recording.dtypes:
+        raise RecordingError(
+            f"{recording.path}: its observations vary in size, so its steps are no columns; "
+            "`Recording.transitions` reads them one by one."
+        )
+    if episode is None:
+        blocks = [block.copy() for block in recording.blocks(topic, start, stop)]
+        records = np.concatenate(blocks) if blocks else np.empty(0, recording.dtypes[topic])
+    else:
+        records = recording.episode_steps(phase, episode)
+    names = records.dtype.names or ()
+    columns = _spread(_plain_columns(records, [name for name in _BEFORE if name in names]))
+    columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in agents_of(recording)])
+    return columns | _plain_columns(records, [name for name in _BEHIND if name in names])
+
+
+# --- plain records ------------------------------------------------------------------------------------
+
+
+def evaluation_records(recording: Recording) -> list[dict[str, Any]]:
+    """Return the evaluations of a recording, in order, as JSON can hold them.
+
+    Each has `episode` (training episodes before it), `success_percent` (None where the environment does
+    not say what success is), `mean_length`, `mean_penalties`, ..., `events` by name, summed over the
+    trials, and under `training` what `training_records` has.
+
+    The evaluations of a loop are its evaluation episodes between two training episodes. They have no `step`
+    and no `training`; `mean_penalties` is None where the environment does not define penalties; returns that
+    are not finite are left out of `mean_returns` and counted in `not_finite`.
+    """
+    agents, events = agents_of(recording), event_names_of(recording)
+    if recording.kind != "job":
+        return _loop_evaluations(recording, agents, events)
+    return [evaluation_record(metrics, agents, events) for metrics in recording.metrics("eval")]
+
+
+def loop_summary(recording: Recording) -> dict[str, Any]:
+    """Return the last results of a loop, computed from its recording.
+
+    Keys: `last_evaluation` (None if there was none) with `episode`, `trials`, `success_percent`,
+    `mean_length`, `mean_penalties` and `mean_return` (summed over agents); `recent_training` with
+    `episodes`, `mean_length` and `mean_return` of the last `RECENT_EPISODES`; `logged`, the last value logged
+    under each name. A value that is unknown or not finite is None.
+    """
+    from runner.recording import schema
+
+    total = recording.count(schema.TRAIN_EPISODE)
+    evaluations = evaluation_records(recording)
+    recent = recording.episodes("train", max(0, total - RECENT_EPISODES), total)
+    return {
+        "last_evaluation": None if not evaluations else _brief(evaluations[-1]),
+        "recent_training": {
+            "episodes": len(recent),
+            "mean_length": finite_mean(recent["length"]),
+            "mean_return": finite_mean(recent["returns"].sum(axis=1)),
+        },
+        "logged": _last_logged(recording),
+    }
+
+
+def _last_logged(recording: Recording) -> dict[str, float | None]:
+    """Return the last value logged under each name, from the result if that carries them."""
+    from runner.recording import schema
+
+    if "logged" in recording.result:
+        return dict(recording.result.logged)
+    return {
+        scalar["name"]: scalar["value"] if math.isfinite(scalar["value"]) else None
+        for scalar in recording.decoded(schema.SCALAR_TOPIC)
+    }
+
+
+def finite_mean(values: NDArray[Any]) -> float | None:
+    """Return the mean of those values that are finite and no larger than `LARGEST`; None without any."""
+    usable = is_usable(values)
+    return float(values[usable].mean()) if usable.any() else None
+
+
+def is_usable(values: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which values are finite and small enough that sums of them stay finite."""
+    return abs(values) <= LARGEST  # false for NaN
+
+
+def trained_before(recording: Recording) -> NDArray[np.int64]:
+    """Return for each evaluation episode of a loop how many training episodes had ended before it."""
+    import numpy as np
+
+    from runner.recording import schema
+
+    trained, tested = (
+        np.concatenate([np.empty(0, np.uint64), *(block["log_time"] for block in recording.blocks(topic))])
+        for topic in (schema.TRAIN_EPISODE, schema.EVAL_EPISODE)
+    )
+    return np.searchsorted(trained, tested)
+
+
+def training_records(recording: Recording) -> list[dict[str, Any]]:
+    """Return the reports of training of a recording, in order, as JSON can hold them."""
+    agents = agents_of(recording)
+    return [
+        {"episode": metrics["episode"], "step": metrics["step"]} | _training_side(metrics, agents)
+        for metrics in recording.metrics("train")
+    ]
+
+
+def agents_of(recording: Recording) -> list[str]:
+    """Return the names of the learners: one table and one reward each."""
+    return list(json.loads(recording.run["agents"]))
+
+
+def event_names_of(recording: Recording) -> list[str]:
+    """Return the names of the environment's events; none where it has none."""
+    return list(recording.environment["event_names"])
+
+
+def evaluation_record(
+    metrics: Mapping[str, Any], agents: Sequence[str], events: Sequence[str]
+) -> dict[str, Any]:
+    """Return an evaluation's metrics, as recorded, under the names of `evaluation_records`."""
+    known = metrics["successes"] >= 0
+    return {
+        "evaluation": metrics["evaluation"],
+        "episode": metrics["episode"],
+        "step": metrics["step"],
+        "trials": metrics["trials"],
+        "successes": metrics["successes"] if known else None,
+        "success_percent": metrics["success_percent"] if known else None,
+        "mean_length": metrics["eval_mean_length"],
+        "mean_penalties": metrics["mean_penalties"],
+        "terminations": metrics["terminations"],
+        "mean_returns": dict(zip(agents, metrics["mean_returns"], strict=True)),
+        "events": dict(zip(events, metrics["events"], strict=True)),
+        "training": _training_side(metrics, agents),
+    }
+
+
+def _loop_evaluations(
+    recording: Recording, agents: Sequence[str], events: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Return a record for each group of evaluation episodes with no training episode between them."""
+    import numpy as np
+
+    from runner.recording import schema
+
+    before, first = trained_before(recording), 0
+    found: dict[int, list[NDArray[np.void]]] = {}
+    for block in recording.blocks(schema.EVAL_EPISODE):
+        after, first = before[first : first + len(block)], first + len(block)
+        for episodes in np.unique(after).tolist():
+            found.setdefault(episodes, []).append(block[after == episodes])
+    environment = recording.environment
+    return [
+        _loop_evaluation(number, episode, np.concatenate(found[episode]), agents, events)
+        | ({} if environment["success_events"] else {"successes": None, "success_percent": None})
+        | ({} if environment["penalty_below"] is not None else {"mean_penalties": None})
+        for number, episode in enumerate(sorted(found))
+    ]
+
+
+def _loop_evaluation(
+    number: int, episode: int, trials: NDArray[np.void], agents: Sequence[str], events: Sequence[str]
+) -> dict[str, Any]:
+    returns = trials["returns"]
+    return {
+        "evaluation": number,
+        "episode": episode,
+        "trials": len(trials),
+        "successes": int(trials["success"].sum()),
+        "success_percent": 100 * float(trials["success"].mean()),
+        "mean_length": float(trials["length"].mean()),
+        "mean_penalties": float(trials["penalties"].mean()),
+        "terminations": int(trials["terminated"].sum()),
+        "mean_returns": {agent: finite_mean(returns[:, i]) for i, agent in enumerate(agents)},
+        "not_finite": int((~is_usable(returns)).sum()),
+        "events": dict(zip(events, trials["events"].sum(axis=0, dtype=int).tolist(), strict=True)),
+    }
+
+
+def _brief(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a summary has of an evaluation of a loop."""
+    returns = list(record["mean_returns"].values())
+    brief = {
+        key: record[key] for key in ("episode", "trials", "success_percent", "mean_length", "mean_penalties")
+    }
+    return brief | {"mean_return": None if None in returns else sum(returns)}
+
+
+def _training_side(metrics: Mapping[str, Any], agents: Sequence[str]) -> dict[str, Any]:
+    """Return how training stood; a mean over no episodes yet is None."""
+    length = metrics["mean_length"]
+    return {
+        "mean_length": None if math.isnan(length) else length,
+        "reward_counts": [
+            {"reward": reward, "steps": steps}
+            for reward, steps in zip(metrics["rewards"], metrics["reward_counts"], strict=True)
+        ],
+        "zero_cells": dict(zip(agents, metrics["zero_cells"], strict=True)),
+        "percent_filled": dict(zip(agents, metrics["percent_filled"], strict=True)),
+        "epsilon": metrics["epsilon"],
+        "step_size": metrics["step_size"],
+        "discount": metrics["discount"],
+    }
+
+
+# --- inside -------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _opened(run: Source) -> Iterator[Recording]:
+    """Give the run's recording, opened, if there is pandas; one that is open already stays open."""
+    from runner.recording.reader import Recording, open_recording
+
+    _frame([])
+    if isinstance(run, Recording):
+        yield run
+        return
+    with open_recording(_at_hand(run).recording if isinstance(run, Run) else Path(run)) as recording:
+        yield recording
+
+
+def _at_hand(run: Run) -> Run:
+    """Return a run whose recording can be read, also if it is in an archive alone."""
+    if run.status != "archived":
+        return run
+    from runner.archive.places import at_hand
+
+    return at_hand(run)
+
+
+def _frame(data: Any) -> pd.DataFrame:
+    """Return a frame of columns by name, or of rows."""
+    frame: pd.DataFrame = require("pandas", extra="frames", purpose="a frame").DataFrame(data)
+    return frame
+
+
+def _flat(record: Mapping[str, Any], prefixes: Mapping[str, str]) -> dict[str, Any]:
+    """Return a record with its mappings spread out; what is unknown (None) is NaN."""
+    flat: dict[str, Any] = {}
+    for key, value in record.items():
+        if isinstance(value, Mapping):
+            before = prefixes.get(key, f"{key}.")
+            flat |= {f"{before}{name}": part for name, part in _flat(value, {}).items()}
+        else:
+            flat[key] = math.nan if value is None else value
+    return flat
+
+
+def _plain_columns(records: NDArray[np.void], names: Sequence[str]) -> dict[str, Any]:
+    """Return fields of records as arrays of their own."""
+    return {name: records[name].copy() for name in names}
+
+
+def _spread(columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return columns of which those of composed values, such as a `Dict` space's, are a column a part."""
+    spread: dict[str, NDArray[Any]] = {}
+    for name, values in columns.items():
+        if values.dtype.names is None:
+            spread[name] = values
+        else:
+            spread |= _spread({f"{name}.{part}": values[part] for part in values.dtype.names})
+    return spread
+
+
+def _by_name(values: NDArray[Any], names: Sequence[str]) -> dict[str, Any]:
+    """Return the columns of [N, names] by name."""
+    return {name: values[:, i].copy() for i, name in enumerate(names)}

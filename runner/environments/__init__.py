@@ -1,0 +1,1 @@
+"""Tabular environments as arrays, with their scenes and names."""

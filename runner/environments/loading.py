@@ -1,0 +1,194 @@
+"""A tabular Gymnasium environment made, and read into arrays.
+
+It offers them as documented attributes of `env.unwrapped` (`transitions`, `agents`,
+`agent_action_counts`, `event_names`, `success_events`, `penalty_below`, `scene`, `scene_cells`,
+`scene_carriers`), or only Gymnasium's customary `P` and `initial_state_distrib`; for Gymnasium's own grid
+worlds `runner.environments.toy_text` says the rest. What it does not offer is left out, not invented.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import importlib
+import traceback
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.environments.mdp import Mdp, check_mdp
+from runner.environments.toy_text import grid_world
+from runner.errors import EnvironmentNotUsable
+
+
+def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> Mdp:
+    """Make the environment and return its arrays.
+
+    Args:
+        env_id: a Gymnasium id; the part before a colon is a module to import first.
+        kwargs: arguments of the environment.
+        rewards: `team`, or `individual` for a reward an agent (the environment's `competitive=True`).
+
+    Raises:
+        EnvironmentNotUsable: it is unknown, cannot be made, or has no transition table.
+    """
+    env = _make(env_id, dict(kwargs) | ({"competitive": True} if rewards == "individual" else {}))
+    try:
+        with contextlib.closing(env):
+            mdp = _read(env_id, kwargs, env, rewards)
+    except EnvironmentNotUsable:
+        raise
+    except Exception as error:  # its attributes may raise anything
+        raise EnvironmentNotUsable(
+            f"environment {env_id!r}: what it tells of itself cannot be read "
+            f"({type(error).__name__}: {error}); docs/architecture.md says what is expected."
+        ) from error
+    check_mdp(mdp)
+    if rewards == "individual" and mdp.rewards.shape[-1] != len(mdp.agents):
+        raise _one_reward_only(env_id)
+    return mdp
+
+
+def mdp_of(env: Any, kwargs: Mapping[str, Any]) -> Mdp:
+    """Return the arrays of an environment that is made already, with `kwargs`; its agents share the reward.
+
+    Raises:
+        EnvironmentNotUsable: it has no transition table, or one that makes no sense.
+    """
+    spec = env.spec
+    env_id = spec.id if spec is not None else type(env.unwrapped).__qualname__
+    try:
+        mdp = _read(env_id, kwargs, env, "team")
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise EnvironmentNotUsable(
+            f"environment {env_id!r}: what it tells of itself makes no sense."
+        ) from error
+    check_mdp(mdp)
+    return mdp
+
+
+def _read(env_id: str, kwargs: Mapping[str, Any], env: Any, rewards: str) -> Mdp:
+    """Return what an environment tells of itself, not yet checked; a team shares the summed reward."""
+    from runner.config.values import plain  # reading a recording needs none of it
+
+    base = env.unwrapped
+    limit = env.spec.max_episode_steps if env.spec is not None else None
+    transitions = _transitions(env_id, base)
+    joint = transitions["next_state"].shape[1]
+    described = grid_world(env_id, base, transitions)
+    said: Any = described or base
+    if described is not None:
+        transitions["events"] = described.events
+    if rewards == "team":
+        transitions["rewards"] = transitions["rewards"].sum(axis=-1, keepdims=True)
+    return Mdp(
+        env_id=env_id,
+        kwargs=plain(kwargs),
+        **transitions,
+        start=np.ascontiguousarray(base.initial_state_distrib, dtype=np.float64),
+        step_limit=int(limit or 0),
+        agents=tuple(getattr(said, "agents", ("agent",))),
+        action_counts=tuple(int(n) for n in getattr(base, "agent_action_counts", (joint,))),
+        event_names=tuple(getattr(said, "event_names", ())),
+        success_events=tuple(getattr(said, "success_events", ())),
+        penalty_below=float(getattr(said, "penalty_below", -np.inf)),
+        scene=getattr(said, "scene", None),
+        scene_cells=getattr(said, "scene_cells", None),
+        scene_carriers=getattr(said, "scene_carriers", None),
+    )
+
+
+def _one_reward_only(env_id: str) -> EnvironmentNotUsable:
+    return EnvironmentNotUsable(
+        f"environment {env_id!r} does not pay its agents one by one: set `rewards: team` "
+        "(`mode: competitive` means individual rewards)."
+    )
+
+
+def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
+    """Return the environment, without the wrappers that only check or render."""
+    import gymnasium
+
+    module, _, name = env_id.rpartition(":")
+    if module:
+        try:
+            importlib.import_module(module)
+        except ModuleNotFoundError as error:
+            raise EnvironmentNotUsable(
+                f"environment {env_id!r}: there is no module {error.name!r}; "
+                "install the package that brings it, set PYTHONPATH to the folder it is in, or mend `env.id`."
+            ) from error
+        except Exception as error:  # a module may raise anything
+            raise EnvironmentNotUsable(
+                f"environment {env_id!r}: the module {module!r} cannot be imported ({_raised(error)})."
+            ) from error
+    if name not in gymnasium.registry:
+        stems = {known.rpartition("-v")[0]: known for known in gymnasium.registry}  # the newest comes last
+        near = difflib.get_close_matches(name.rpartition("-v")[0], stems, n=1, cutoff=0.6)
+        before = (
+            f"{module}:" if module and near and stems[near[0]].startswith(name.rpartition("-v")[0]) else ""
+        )
+        hint = f" Did you mean '{before}{stems[near[0]]}'?" if near else ""
+        raise EnvironmentNotUsable(f"environment {env_id!r}: Gymnasium knows no such id.{hint}")
+    try:
+        return gymnasium.make(name, disable_env_checker=True, **kwargs)
+    except Exception as error:  # an environment may raise anything
+        if "competitive" in kwargs and "keyword argument 'competitive'" in str(error):
+            raise _one_reward_only(env_id) from error
+        given = ", ".join(f"{key}={value!r}" for key, value in kwargs.items()) or "no arguments"
+        speaks = isinstance(error, TypeError | ValueError | ImportError | gymnasium.error.Error)
+        raise EnvironmentNotUsable(
+            f"environment {env_id!r} cannot be made with {given}: {error if speaks else _raised(error)}"
+        ) from error
+
+
+def _raised(error: Exception) -> str:
+    """Return what somebody's code raised, and where: `KeyError: 'goal' (corridor.py, line 12)`."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    at = "" if isinstance(error, SyntaxError) else f" ({Path(place.filename).name}, line {place.lineno})"
+    return f"{type(error).__name__}: {error}{at}"
+
+
+def _transitions(env_id: str, base: Any) -> dict[str, NDArray[Any]]:
+    """Return the transition arrays, from the environment's own or from its `P`."""
+    if hasattr(base, "transitions"):
+        own = base.transitions
+        return {
+            "next_state": np.ascontiguousarray(own.next_state, dtype=np.int32),
+            "probability": np.ascontiguousarray(own.probability, dtype=np.float64),
+            "rewards": np.ascontiguousarray(own.rewards, dtype=np.float64),
+            "terminated": np.ascontiguousarray(own.terminated, dtype=np.bool_),
+            "events": np.ascontiguousarray(own.events, dtype=np.uint32),
+        }
+    if not hasattr(base, "P") or not hasattr(base, "initial_state_distrib"):
+        raise EnvironmentNotUsable(
+            f"environment {env_id!r} offers no transition table (`P` and `initial_state_distrib`), which "
+            "tabular learning here needs. DualTaxi-v1, Taxi-v4, FrozenLake-v1 and CliffWalking-v1 have one."
+        )
+    return _transitions_from_p(base.P)
+
+
+def _transitions_from_p(
+    p: Mapping[int, Mapping[int, list[tuple[float, int, Any, bool]]]],
+) -> dict[str, NDArray[Any]]:
+    """Return arrays from Gymnasium's `P[state][action] = [(probability, next state, reward, terminated)]`."""
+    states, actions = len(p), len(p[0])
+    most = max(len(outcomes) for row in p.values() for outcomes in row.values())
+    shape = (states, actions, most)
+    next_state, probability = np.zeros(shape, np.int32), np.zeros(shape)
+    rewards, terminated = np.zeros((*shape, 1)), np.zeros(shape, np.bool_)
+    for s, row in p.items():
+        for a, outcomes in row.items():
+            for k, (chance, successor, reward, over) in enumerate(outcomes):
+                next_state[s, a, k], probability[s, a, k] = successor, chance
+                rewards[s, a, k, 0], terminated[s, a, k] = float(np.sum(reward)), over
+    return {
+        "next_state": next_state,
+        "probability": probability,
+        "rewards": rewards,
+        "terminated": terminated,
+        "events": np.zeros(shape, np.uint32),
+    }

@@ -1,0 +1,291 @@
+"""A tabular environment as arrays: all that the runner ever learns of it, whichever it was."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.environments.scene import is_text, is_whole, scene_mistake
+from runner.errors import EnvironmentNotUsable
+
+MAX_EVENTS = 31
+MAX_AGENTS = 31
+MAX_ARRAYS_BYTES = 128 << 20
+"""What all arrays of an environment may take, so that a recording of it can be read again."""
+_DTYPES = {
+    "next_state": np.int32,
+    "probability": np.float64,
+    "rewards": np.float64,
+    "terminated": np.bool_,
+    "events": np.uint32,
+    "start": np.float64,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Mdp:
+    """A Markov decision process: S states, J joint actions, at most K outcomes a pair, R reward columns."""
+
+    env_id: str
+    kwargs: Mapping[str, Any]
+    next_state: NDArray[np.int32]
+    """[S, J, K]."""
+    probability: NDArray[np.float64]
+    """[S, J, K]; 0 where a pair has fewer outcomes, those come last."""
+    rewards: NDArray[np.float64]
+    """[S, J, K, R]; R is 1 (all agents share it), or the number of agents."""
+    terminated: NDArray[np.bool_]
+    """[S, J, K]."""
+    events: NDArray[np.uint32]
+    """[S, J, K]: bit i is `event_names[i]`."""
+    start: NDArray[np.float64]
+    """[S]: probability that an episode starts there."""
+    step_limit: int
+    """Steps after which an episode is truncated; 0 for never."""
+    agents: tuple[str, ...]
+    action_counts: tuple[int, ...]
+    """Actions of each agent; a joint action counts them up like digits, the first agent's foremost."""
+    event_names: tuple[str, ...] = ()
+    success_events: tuple[str, ...] = ()
+    penalty_below: float = -np.inf
+    """A step whose summed reward is lower counts as a penalty."""
+    scene: Mapping[str, Any] | None = None
+    scene_cells: NDArray[np.int16] | None = None
+    """[S, things]: the cell of each thing, row * columns + column."""
+    scene_carriers: NDArray[np.int8] | None = None
+    """[S, things]: which thing carries it, or -1."""
+
+    @property
+    def states(self) -> int:
+        """Number of states."""
+        return len(self.next_state)
+
+    @property
+    def joint_actions(self) -> int:
+        """Number of joint actions."""
+        return int(self.next_state.shape[1])
+
+    @property
+    def success_mask(self) -> int:
+        """The bits of `events` that mean success; 0 if the environment names none."""
+        return sum(1 << self.event_names.index(name) for name in self.success_events)
+
+    @property
+    def summed_rewards(self) -> NDArray[np.float64]:
+        """[S, J, K]: the reward of all agents together."""
+        return np.asarray(self.rewards.sum(axis=-1))
+
+    def outcomes_to(
+        self, state: NDArray[Any], action: NDArray[Any], next_state: NDArray[Any]
+    ) -> NDArray[np.bool_]:
+        """Return which outcomes of steps, [N] each, lead to their next states: [N, K]; none if unknown."""
+        known = (state >= 0) & (state < self.states) & (action >= 0) & (action < self.joint_actions)
+        at = np.where(known, state, 0), np.where(known, action, 0)
+        leads = (self.next_state[at] == next_state[:, np.newaxis]) & (self.probability[at] > 0)
+        return np.asarray(leads & known[:, np.newaxis])
+
+    def rewards_of(self, learners: int) -> NDArray[np.float64]:
+        """Return rewards as [S, J, K, learners]: their own where there are several, else the shared one."""
+        if self.rewards.shape[-1] in (learners, 1):
+            return np.broadcast_to(self.rewards, (*self.rewards.shape[:-1], learners))
+        raise EnvironmentNotUsable(
+            f"{self.env_id} pays {self.rewards.shape[-1]} agents one by one, but one table for all is to "
+            "learn from the reward: set `rewards: team`, or `tables: per_agent`."
+        )
+
+    def description(self) -> dict[str, Any]:
+        """Return all that is not an array, as JSON can hold it."""
+        return {
+            "env_id": self.env_id,
+            "kwargs": dict(self.kwargs),
+            "step_limit": self.step_limit,
+            "agents": list(self.agents),
+            "action_counts": list(self.action_counts),
+            "event_names": list(self.event_names),
+            "success_events": list(self.success_events),
+            "penalty_below": None if np.isinf(self.penalty_below) else self.penalty_below,
+            "scene": None if self.scene is None else dict(self.scene),
+        }
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays by field name."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
+
+
+def step_counts(
+    mdp: Mdp,
+    rewards: NDArray[np.float64],
+    state: NDArray[Any],
+    action: NDArray[Any],
+    next_state: NDArray[Any],
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return events and penalties of steps, [N, events + 1], and which rewards the table excludes, [N].
+
+    A step has the events of the outcome that leads to its next state, of several that with its reward. Its
+    reward is excluded if outcomes lead there and none of them pays it.
+    """
+    likely = mdp.outcomes_to(state, action, next_state)
+    found = likely.any(axis=1)
+    at = np.where(found, state, 0), np.where(found, action, 0)
+    paid = likely & (mdp.rewards[at].sum(axis=-1) == rewards[:, np.newaxis])
+    counts = np.zeros((len(rewards), len(mdp.event_names) + 1), np.int64)
+    counts[:, -1] = rewards < mdp.penalty_below
+    if mdp.event_names:
+        outcome = np.argmax(likely * 2 + paid, axis=1)
+        events = np.where(found, mdp.events[*at, outcome], np.uint32(0))
+        names = np.arange(len(mdp.event_names), dtype=np.uint32)
+        counts[:, :-1] = (events[:, np.newaxis] >> names) & 1
+    return counts, found & ~paid.any(axis=1)
+
+
+def from_parts(description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Mdp:
+    """Return the Mdp that `description()` and `arrays()` came from, checked like a new one.
+
+    Raises:
+        EnvironmentNotUsable: they do not describe an environment.
+    """
+    try:
+        penalty = description["penalty_below"]
+        mdp = Mdp(
+            env_id=description["env_id"],
+            kwargs=description["kwargs"],
+            step_limit=description["step_limit"],
+            agents=tuple(description["agents"]),
+            action_counts=tuple(description["action_counts"]),
+            event_names=tuple(description["event_names"]),
+            success_events=tuple(description["success_events"]),
+            penalty_below=-np.inf if penalty is None else penalty,
+            scene=description["scene"],
+            **arrays,
+        )
+        check_mdp(mdp)
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError, RecursionError) as error:
+        raise EnvironmentNotUsable(f"what is said of the environment makes no sense: {error!r}") from error
+    return mdp
+
+
+def check_mdp(mdp: Mdp) -> None:
+    """Refuse parts that contradict each other: an environment, or a recording, may bring anything.
+
+    One expectation relies on those before it.
+    """
+    with np.errstate(all="ignore"):
+        for expectations in (_descriptions_right(mdp), _arrays_right(mdp)):
+            for expectation, holds, found in expectations:
+                if not holds:
+                    raise EnvironmentNotUsable(
+                        f"environment {mdp.env_id!r}: {expectation}; found {_in_words(found)}."
+                    )
+    mistake = scene_mistake(mdp.scene, mdp.scene_cells, mdp.scene_carriers, mdp.states)
+    if mistake is not None:
+        raise EnvironmentNotUsable(f"environment {mdp.env_id!r}: {mistake}.")
+
+
+def _descriptions_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
+    """Yield what must hold of all but the arrays, whether it does, and what was found."""
+    agents, counts, events = mdp.agents, mdp.action_counts, mdp.event_names
+    yield "an id must be text", is_text(mdp.env_id), mdp.env_id
+    yield "kwargs must be a mapping", isinstance(mdp.kwargs, Mapping), mdp.kwargs
+    yield f"1 to {MAX_AGENTS} agents", 1 <= len(agents) <= MAX_AGENTS, len(agents)
+    yield "an agent has a name", all(map(is_text, agents)), agents
+    yield "each agent needs a number of actions", len(agents) == len(counts), counts
+    yield "each agent needs at least one action", all(is_whole(n, 1, 2**31) for n in counts), counts
+    yield f"at most {MAX_EVENTS} events", len(events) <= MAX_EVENTS, len(events)
+    yield "an event has a name of its own", _distinct(events), events
+    successes = mdp.success_events
+    known = _distinct(successes) and set(successes) <= set(events)
+    yield f"success events must be some of the events {events}", known, successes
+    penalty = mdp.penalty_below
+    yield "penalty_below must be a number", isinstance(penalty, int | float), penalty
+    limit = mdp.step_limit
+    yield "the step limit must be a number from 0", is_whole(limit, 0, 2**31 - 1), limit
+
+
+def _arrays_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
+    """Yield what must hold of the arrays, whether it does, and what was found."""
+    for name, kind in _DTYPES.items():
+        array = getattr(mdp, name)
+        yield f"{name} must be an array of {np.dtype(kind)}", _is_array(array, kind), array
+    shape, size = mdp.next_state.shape, sum(array.nbytes for array in mdp.arrays().values())
+    limit = f"its arrays may take {MAX_ARRAYS_BYTES:,} bytes, to be recorded"
+    yield limit, size <= MAX_ARRAYS_BYTES, f"{size:,}"
+    three = mdp.next_state.ndim == 3 and mdp.next_state.size > 0
+    yield "next_state must have three axes", three, mdp.next_state
+    states = f"next_state must name states, 0 to {shape[0] - 1}"
+    yield states, _within(mdp.next_state, 0, shape[0]), lambda: _range(mdp.next_state)
+    others = {name: getattr(mdp, name).shape for name in ("probability", "terminated", "events")}
+    alike = all(other == shape for other in others.values())
+    yield f"shapes must agree with next_state's, {shape}", alike, others
+    stray = mdp.events >> np.uint32(len(mdp.event_names))
+    bits = f"events must have no other bits than the {len(mdp.event_names)} that have names"
+    yield bits, not stray.any(), lambda: hex(int(mdp.events.max()))
+    adds = mdp.rewards.ndim == 4 and mdp.rewards.shape[:-1] == shape
+    yield f"rewards must add one axis to next_state's, {shape}", adds, mdp.rewards
+    each = mdp.rewards.shape[-1] in (1, len(mdp.agents))
+    yield f"rewards must be 1, or one for each of the {len(mdp.agents)} agents", each, mdp.rewards.shape[-1]
+    finite = np.isfinite(mdp.rewards)
+    yield "rewards must be finite", bool(finite.all()), lambda: str(mdp.rewards[~finite][0])
+    sums = "probabilities of a pair must be from 0 on and add up to 1"
+    yield sums, _sums_to_one(mdp.probability), lambda: _sums(mdp.probability)
+    distribution = mdp.start.shape == shape[:1] and _sums_to_one(mdp.start)
+    start = f"start must be a distribution over the {shape[0]} states"
+    yield start, distribution, lambda: _sums(mdp.start) if mdp.start.shape == shape[:1] else mdp.start
+    joint = math.prod(mdp.action_counts)
+    yield f"the agents' actions must make the {shape[1]} joint actions", joint == shape[1], joint
+    rows = [_rows(mdp.scene_cells), _rows(mdp.scene_carriers)]
+    same = mdp.scene_cells is None or mdp.scene_carriers is None or rows[0] == shape[0]
+    fits = same and rows[0] == rows[1]
+    yield f"each of the scene's arrays must have a row for each of the {shape[0]} states", fits, rows
+
+
+def _in_words(found: Any) -> str:
+    """Return what was found, or what a function gives, as a message can hold it: arrays by type and shape."""
+    if callable(found):
+        found = found()
+    if isinstance(found, np.ndarray):
+        return f"an array of {found.dtype}, shape {found.shape}"
+    if isinstance(found, str):
+        return found[:100]
+    return f"{found!r:.100}"
+
+
+def _range(values: NDArray[Any]) -> str:
+    return f"{values.min()} to {values.max()}" if values.size else "none"
+
+
+def _sums(probability: NDArray[np.float64]) -> str:
+    """Return the lowest value, and the sums along the last axis, in words."""
+    if not probability.size:
+        return "none"
+    return f"values from {probability.min():g} on, sums {_range(probability.sum(axis=-1))}"
+
+
+def _distinct(names: tuple[Any, ...]) -> bool:
+    return all(map(is_text, names)) and len(set(names)) == len(names)
+
+
+def _is_array(array: Any, kind: Any) -> bool:
+    return isinstance(array, np.ndarray) and array.dtype == kind
+
+
+def _within(values: NDArray[Any], low: int, high: int) -> bool:
+    return bool(values.size) and int(values.min()) >= low and int(values.max()) < high
+
+
+def _rows(array: NDArray[Any] | None) -> int | None:
+    return None if array is None or not array.ndim else len(array)
+
+
+def _sums_to_one(probability: NDArray[np.float64]) -> bool:
+    """Return whether the last axis adds up to 1, as well as decimal fractions can."""
+    if not probability.size or not (probability >= 0).all():
+        return False
+    total = np.asarray(probability.sum(axis=-1))
+    return bool(total.min() >= 1 - 1e-5 and total.max() <= 1 + 1e-5)

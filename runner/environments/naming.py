@@ -1,0 +1,121 @@
+"""States, joint actions, events and trials, said in words.
+
+The words come from the scene that the environment, or the recording, brings along:
+
+    taxi 1 (0,0), taxi 2 (3,2), passenger at R, destination B        a state
+    south + pickup                                                   a joint action
+
+Without a scene they are `state 17` and `action 3`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.environments.mdp import Mdp
+
+
+def states_in_words(mdp: Mdp) -> NDArray[np.object_]:
+    """Return the words of every state, [S] of str: index it by a state, or by an array of states."""
+    scene, cells, carriers = mdp.scene, mdp.scene_cells, mdp.scene_carriers
+    if scene is None or cells is None:
+        return _texts([f"state {state}" for state in range(mdp.states)])
+    if carriers is None:
+        carriers = np.full(cells.shape, -1, np.int8)
+    things = [
+        _thing_in_words(scene, thing, cells[:, i], carriers[:, i]) for i, thing in enumerate(scene["things"])
+    ]
+    return _texts([", ".join(words) for words in zip(*things, strict=True)])
+
+
+def actions_in_words(mdp: Mdp) -> NDArray[np.object_]:
+    """Return the words of every joint action, [J] of str: `south + pickup`."""
+    named = action_names(mdp)
+    if named is None:
+        return _texts([f"action {action}" for action in range(mdp.joint_actions)])
+    return _texts([" + ".join(words) for words in itertools.product(*named)])
+
+
+def action_names(mdp: Mdp) -> list[list[str]] | None:
+    """Return the words of each agent's actions; None where the scene does not name them."""
+    actions = [] if mdp.scene is None else mdp.scene.get("actions", [])
+    if any(count != len(actions) for count in mdp.action_counts):
+        return None
+    names = [spoken(action["name"]) for action in actions]
+    return [names for _ in mdp.agents]
+
+
+def numbered_actions(mdp: Mdp) -> list[list[str]]:
+    """Return the words of each agent's actions; `action 3` where the scene does not name them."""
+    return action_names(mdp) or [[f"action {i}" for i in range(count)] for count in mdp.action_counts]
+
+
+def agent_actions(mdp: Mdp, action: int) -> tuple[int, ...]:
+    """Return the action of each agent in a joint action."""
+    return tuple(int(own) for own in np.unravel_index(action, mdp.action_counts))
+
+
+def exploration_in_words(mask: int, learners: Sequence[str]) -> str:
+    """Return who explored in a step: `explored` if all learners did, `taxi 1 explored`, or nothing.
+
+    Args:
+        mask: the step's `explored`: bit i is learner i.
+        learners: their names.
+    """
+    explorers = [spoken(name) for i, name in enumerate(learners) if mask >> i & 1]
+    if not explorers or len(explorers) == len(learners):
+        return "explored" if explorers else ""
+    return f"{' and '.join(explorers)} explored"
+
+
+def event_in_words(name: str) -> str:
+    """Return an event's name as people say it: `taxi_1.drop_off` is `taxi 1 drop-off`."""
+    agent, _, event = name.rpartition(".")
+    return f"{agent.replace('_', ' ')} {spoken(event)}".strip()
+
+
+def events_in_words(mdp: Mdp, mask: int) -> str:
+    """Return the events of a bit mask in words, parted by commas."""
+    return ", ".join(event_in_words(name) for bit, name in enumerate(mdp.event_names) if mask >> bit & 1)
+
+
+def spoken(name: str) -> str:
+    """Return a name as people write it: `drop_off` is `drop-off`, `illegal_pickup` is `illegal pickup`."""
+    return name.replace("drop_off", "drop-off").replace("_", " ")
+
+
+def trial_in_words(after: int, number: int) -> str:
+    """Return what a trial, counted from 0, is called: that of the evaluation after so many episodes."""
+    return f"trial {number:,} of the evaluation after {after:,} episodes"
+
+
+def _thing_in_words(
+    scene: Mapping[str, Any], thing: Mapping[str, Any], cells: NDArray[Any], carriers: NDArray[Any]
+) -> list[str]:
+    """Return what is said of one thing in every state.
+
+    A mover is at a cell; anything else in what carries it, at a landmark if there is one, or at a cell.
+    """
+    label = thing["label"]
+    columns = scene["columns"]
+    places = [f"{label} ({cell // columns},{cell % columns})" for cell in range(scene["rows"] * columns)]
+    if thing["kind"] != "mover":
+        between = " " if thing["kind"] == "goal" else " at "
+        for mark in scene["landmarks"]:
+            row, column = mark["cell"]
+            places[row * columns + column] = f"{label}{between}{mark['name']}"
+    carried = [f"{label} in {carrier['label']}" for carrier in scene["things"]]
+    where: Sequence[int] = (np.where(carriers >= 0, carriers + len(places), cells)).tolist()
+    words = places + carried
+    return [words[index] for index in where]
+
+
+def _texts(words: list[str]) -> NDArray[np.object_]:
+    array = np.empty(len(words), dtype=object)
+    array[:] = words
+    return array

@@ -1,0 +1,115 @@
+"""What a scene must be, so that whoever draws it, or says it in words, need not look again.
+
+An environment, or the recording of one, brings the scene along as plain data (see `runner.environments.mdp`); either
+may be anyone's.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_CELLS: Final = 2**15 - 1
+"""Cells are numbered in int16."""
+MAX_TEXT: Final = 200
+_COLOUR: Final = re.compile(r"#[0-9A-Fa-f]{6}")
+_KEYS: Final = {"rows", "columns", "walls", "landmarks", "things", "actions"}
+
+
+def is_text(value: Any) -> bool:
+    """Return whether this is a short text that can be printed."""
+    return isinstance(value, str) and 0 < len(value) <= MAX_TEXT and value.isprintable()
+
+
+def is_whole(value: Any, low: int, high: int) -> bool:
+    """Return whether this is an integer from `low` to `high`."""
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
+
+
+def scene_mistake(
+    scene: Any, cells: NDArray[Any] | None, carriers: NDArray[Any] | None, states: int
+) -> str | None:
+    """Return what is wrong with a scene and its arrays; None if nothing is.
+
+    Args:
+        scene: `rows` and `columns`; `walls` (pairs of [row, column]); `landmarks` (`name`, `cell`, `colour`);
+            `things` (`name`, `label`, `kind`); `actions` (`name`, and `move` in [rows, columns] or None).
+        cells: the cell of each thing in each state, [S, things].
+        carriers: which thing carries it, or -1, [S, things].
+        states: S.
+    """
+    if scene is None:
+        return None if cells is None and carriers is None else "the scene's arrays need a scene; found none"
+    if not isinstance(scene, Mapping) or not set(scene) >= _KEYS:
+        keys = ", ".join(sorted(map(str, scene))) if isinstance(scene, Mapping) else f"{scene!r}"
+        return f"a scene must have {', '.join(sorted(_KEYS))}; found {keys:.100}"
+    rows, columns = scene["rows"], scene["columns"]
+    if not is_whole(rows, 1, MAX_CELLS) or not is_whole(columns, 1, MAX_CELLS) or rows * columns > MAX_CELLS:
+        return (
+            f"a scene has rows and columns, and at most {MAX_CELLS:,} cells; "
+            f"found {rows!r:.40} rows and {columns!r:.40} columns"
+        )
+
+    def is_cell(value: Any) -> bool:
+        return _is_pair(value) and is_whole(value[0], 0, rows - 1) and is_whole(value[1], 0, columns - 1)
+
+    expected: dict[str, tuple[Callable[[Any], bool], str]] = {
+        "walls": (lambda wall: _is_pair(wall) and all(map(is_cell, wall)), "two cells"),
+        "landmarks": (lambda mark: _is_landmark(mark, is_cell), "a name, a cell and a colour"),
+        "things": (_is_thing, "a name, a label and a kind"),
+        "actions": (_is_action, "a name, and a move or none"),
+    }
+    for key, (is_one, what) in expected.items():
+        if not isinstance(scene[key], list | tuple):
+            return f"the scene's {key} must be a list; found {scene[key]!r:.100}"
+        for one in scene[key]:
+            if not is_one(one):
+                return f"each of the scene's {key} needs {what}; found {one!r:.100}"
+    things = len(scene["things"])
+    return _array_mistake("cells", cells, np.int16, (states, things), (0, rows * columns - 1)) or (
+        _array_mistake("carriers", carriers, np.int8, (states, things), (-1, things - 1))
+    )
+
+
+def _array_mistake(
+    name: str, array: NDArray[Any] | None, kind: Any, shape: tuple[int, int], bounds: tuple[int, int]
+) -> str | None:
+    if array is None:
+        return None
+    if array.dtype != kind or array.shape != shape:
+        return f"scene_{name} must be {np.dtype(kind)} {shape}; found {array.dtype} {array.shape}"
+    if array.size and not bounds[0] <= int(array.min()) <= int(array.max()) <= bounds[1]:
+        return f"scene_{name} must be from {bounds[0]} to {bounds[1]}; found {array.min()} to {array.max()}"
+    return None
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, list | tuple) and len(value) == 2
+
+
+def _has_texts(value: Any, *keys: str) -> bool:
+    return isinstance(value, Mapping) and all(is_text(value.get(key)) for key in keys)
+
+
+def _is_landmark(value: Any, is_cell: Callable[[Any], bool]) -> bool:
+    named = _has_texts(value, "name", "colour") and is_cell(value.get("cell"))
+    return named and bool(_COLOUR.fullmatch(value["colour"])) and _is_optional(value, "label", "kind")
+
+
+def _is_thing(value: Any) -> bool:
+    return _has_texts(value, "name", "label", "kind") and _is_optional(value, "agent", "colour")
+
+
+def _is_optional(value: Mapping[str, Any], *keys: str) -> bool:
+    return all(value.get(key) is None or is_text(value[key]) for key in keys)
+
+
+def _is_action(value: Any) -> bool:
+    if not _has_texts(value, "name"):
+        return False
+    move = value.get("move")
+    return move is None or (_is_pair(move) and all(is_whole(part, -MAX_CELLS, MAX_CELLS) for part in move))

@@ -1,0 +1,167 @@
+"""A recorded run taken up again: its steps recorded later, its table played in new episodes."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from runner.config import ExperimentConfig, from_mapping
+from runner.config.job import Job
+from runner.environments.loading import load_mdp
+from runner.errors import Diverged, RunnerError, StorageError
+from runner.execution.initial_tables import address
+from runner.execution.session import Report, Session, Stop, describe, recorder_for, run_job
+from runner.execution.verify import initial_tables
+from runner.learning.learner import Learner
+from runner.recording.metadata_writing import write_result
+from runner.recording.reader import open_recording
+from runner.recording.scan import survey
+from runner.recording.writer import RecordingFile
+from runner.replay.tables import last_step, tables_at
+from runner.runs import run as runs
+from runner.runs.locking import locked
+from runner.runs.provenance import provenance
+from runner.runs.run import Run, unless_empty
+
+Start = int | Literal["random", "each"]
+
+
+def holds_steps(run: Run) -> bool:
+    """Return whether a run's recording holds its steps."""
+    with open_recording(run.recording) as recording:
+        return bool(recording.config["recording"]["steps"] == "all")
+
+
+def rerecord(run: Run, report: Report = lambda _: None, stop: Stop = lambda: False) -> Run:
+    """Record the steps of a run that left them out; proven by the digest that they had.
+
+    The new recording takes the old one's place when it is complete and has the same content digest. A run
+    that holds its steps is returned as it is.
+
+    Raises:
+        RunnerError: the run is not finished, or its folder cannot be used.
+        Diverged: the job gives another content here than it gave then; the recording stays as it is.
+        KeyboardInterrupt: `stop` said so; the recording stays as it is.
+    """
+    with locked(run) as current:
+        if current.status != "finished":
+            from_mapping(current.file.config)  # refuses a loop's run, which nobody can resume
+            raise RunnerError(
+                f"run {run.run_id} is {current.status}; `dualtaxi resume {run.run_id}` finishes it first."
+            )
+        if holds_steps(current):
+            return current
+        return _rerecord(current, report, stop)
+
+
+def _rerecord(run: Run, report: Report, stop: Stop) -> Run:
+    config = from_mapping(run.file.config)
+    config = _with(config, recording=config.to_mapping()["recording"] | {"steps": "all"})
+    fresh = run.recording.with_suffix(".rerecording")
+    started = time.monotonic()
+    try:
+        fresh.unlink(missing_ok=True)
+        summary = _record(Job(config, run.seed), run, fresh, report, stop)
+        fresh.replace(run.recording)
+    except OSError as error:
+        raise StorageError(f"{fresh}: cannot be written ({error.strerror}).") from error
+    finally:
+        fresh.unlink(missing_ok=True)
+    summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": run.recording.stat().st_size}
+    return run.update(config=config.to_mapping(), summary=summary)
+
+
+def evaluate(
+    run: Run,
+    recordings: Path,
+    step: int | None = None,
+    trials: int | None = 200,
+    start: Start = "random",
+    seed: int = 0,
+    report: Report = lambda _: None,
+    stop: Stop = lambda: False,
+) -> Run:
+    """Play a run's table of some moment, greedily, in new episodes, recorded as a run of its own.
+
+    Args:
+        run: whose table; the new run's `initial_q` names it.
+        recordings: the folder for the new run.
+        step: after how many training steps; None for the last.
+        trials: how many episodes; None for one in each start state.
+        start: where they start: at random, in each start state in turn, or in one state.
+        seed: fixes the new run's draws.
+        report: called with the progress a few times a second.
+        stop: asked every few milliseconds whether to stop.
+
+    Raises:
+        RunnerError: the table cannot be had, or the new run not be recorded.
+    """
+    config = evaluation_of(run, recordings, step, trials, start, seed)
+    fresh = runs.create_run(recordings, config, seed)
+    with unless_empty(fresh):
+        return run_job(Job(config, seed), fresh, report, stop)
+
+
+def evaluation_of(
+    run: Run, recordings: Path, step: int | None, trials: int | None, start: Start, seed: int
+) -> ExperimentConfig:
+    """Return the experiment that plays a run's table; arguments and errors as for `evaluate`."""
+    with open_recording(run.recording) as recording:
+        chosen = last_step(recording) if step is None else step
+        tables_at(recording, chosen)  # refused here, before there is a run
+        states = recording.mdp.states
+        if isinstance(start, int) and not 0 <= start < states:
+            raise RunnerError(f"--start: found state {start}, expected one of 0 to {states - 1}.")
+        starts = int(np.count_nonzero(recording.mdp.start))
+        original = from_mapping(recording.config)
+    return _with(
+        original,
+        name=f"{run.name[:90]}.evaluated",
+        seeds=[seed],
+        episodes=0,
+        initial_q={"run": address(run, recordings), "step": chosen},
+        evaluation={
+            "every": 1,
+            "trials": starts if trials is None else trials,
+            "start": "each" if trials is None else start,
+        },
+        snapshots={"every": None},
+        recording=original.to_mapping()["recording"] | {"steps": "all"},
+    )
+
+
+def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict[str, Any]:
+    """Do the job again into a new file; return its summary, proven to be the old one's."""
+    mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
+    with open_recording(run.recording) as recording:
+        learner = Learner(job.config, mdp, job.seed, initial_tables(recording))
+        expected, made_by = recording.result["content_digest"], recording.provenance
+        names = [entry.name for entry in survey(run.recording).metadata]
+        resumed = {name: recording.metadata(name) for name in names if name.startswith("resume/")}
+    with RecordingFile(fresh) as file:
+        describe(file, job, run, learner, made_by)
+        for name, entries in resumed.items():
+            file.add_metadata(name, entries)
+        file.add_metadata("rerecord", provenance())
+        session = Session(job, learner, recorder_for(job, learner, file, beat=run.beat), report, stop)
+        try:
+            done = session.run()
+            topics = session.recorder.drain()
+        except BaseException:
+            session.recorder.abandon()
+            raise
+        if not done:
+            raise KeyboardInterrupt(f"the recording of run {run.run_id} is as it was")
+        summary = session.summary(topics)
+        if summary["content_digest"] != expected:
+            raise Diverged("the recording", "content digest", summary["content_digest"], expected)
+        write_result(file, "finished", summary)
+    return summary
+
+
+def _with(config: ExperimentConfig, **changes: Any) -> ExperimentConfig:
+    """Return the configuration with other values for some keys."""
+    return from_mapping(config.to_mapping() | changes)

@@ -1,0 +1,376 @@
+"""Running a job: the only place where learning meets recording."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.config.job import Job
+from runner.environments.loading import load_mdp
+from runner.environments.mdp import Mdp
+from runner.errors import Diverged, RunnerError, StorageError, kept_message
+from runner.execution.initial_tables import configured_tables, settle
+from runner.execution.observer import Observer
+from runner.learning.learner import Learner
+from runner.planning import Yardstick
+from runner.recording import schema
+from runner.recording.chunks import Packing
+from runner.recording.messages import QTable, encode, encode_log, encode_q_table
+from runner.recording.metadata_writing import (
+    Attachments,
+    environment_attachments,
+    run_facts,
+    write_description,
+    write_result,
+)
+from runner.recording.recorder import Recorder
+from runner.recording.reference import Past
+from runner.recording.writer import RecordingFile, create_recording
+from runner.runs import run as runs
+from runner.runs.provenance import provenance
+from runner.runs.run import Run
+
+REPORT_SECONDS: Final = 0.1
+
+
+@dataclass
+class Progress:
+    """How far a run is, as its `report` is told a few times a second."""
+
+    episodes: int
+    """Training episodes to do."""
+    episode: int = 0
+    train_steps: int = 0
+    eval_steps: int = 0
+    bytes_written: int = 0
+    evaluations: list[dict[str, Any]] = field(default_factory=list)
+    """The metrics of every evaluation so far; under `optimality` the exact ones, if they are taken."""
+    log: list[str] = field(default_factory=list)
+    """What the run said of itself so far; of one that is gone on with, what it had not said before."""
+
+
+Report = Callable[[Progress], None]
+Stop = Callable[[], bool]
+
+
+def run_job(
+    job: Job,
+    run: Run,
+    report: Report = lambda _: None,
+    stop: Stop = lambda: False,
+    observer: Observer | None = None,
+    mdp: Mdp | None = None,
+    threads: bool = True,
+) -> Run:
+    """Train, evaluate and record a job; return its run, finished or interrupted.
+
+    Args:
+        job: what to do.
+        run: the folder made for it by `create_run`.
+        report: called with the progress a few times a second, and after every evaluation.
+        stop: asked every few milliseconds; when it says True the recording is closed properly and the
+            run is marked interrupted.
+        observer: shown every step and metric as they come.
+        mdp: the job's environment, if it is loaded already.
+        threads: False records in the thread that learns: quicker where it has one processor to itself.
+
+    Raises:
+        RunnerError: the environment cannot be used, or the disk is full; the run is then marked failed.
+    """
+    started = time.monotonic()
+    with _failing(run):
+        mdp = mdp or load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
+        job, run = settle(job, run)
+        learner = Learner(job.config, mdp, job.seed, configured_tables(job, run, mdp))
+        file = create_recording(run.folder / runs.RECORDING_FILE)
+    with file:
+        with _failing(run):
+            made_by = provenance()
+            describe(file, job, run, learner, made_by)
+            run = run.update(provenance={key: made_by[key] for key in runs.MADE_BY if key in made_by})
+        recorder = recorder_for(job, learner, file, beat=run.beat, threads=threads)
+        return execute(Session(job, learner, recorder, report, stop, observer), file, run, started)
+
+
+def execute(session: Session, file: RecordingFile, run: Run, started: float) -> Run:
+    """Do what is left of a session's job, and close its recording; return the run as it then is."""
+    try:
+        status = "finished" if session.run() else "interrupted"
+        summary = session.summary(session.recorder.drain())
+        write_result(file, status, summary)
+    except BaseException as error:
+        session.recorder.abandon()
+        status = "interrupted" if isinstance(error, KeyboardInterrupt | Diverged) else "failed"
+        with contextlib.suppress(StorageError):  # a full disk may still have room for the index
+            write_result(file, status, {"error": kept_message(error)})
+        with contextlib.suppress(StorageError):  # nor need there be room for this
+            run.update(status=status, summary={"error": kept_message(error), "bytes": file.size})
+        _tell_what_next(run, error)
+        raise
+    summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": file.size}
+    return run.update(status=status, summary=summary)
+
+
+@contextlib.contextmanager
+def _failing(run: Run) -> Iterator[None]:
+    """Mark the run failed if what is done here is refused."""
+    try:
+        yield
+    except RunnerError as error:
+        with contextlib.suppress(StorageError):
+            run.update(status="failed", summary={"error": kept_message(error)})
+        _tell_what_next(run, error)
+        raise
+
+
+def _tell_what_next(run: Run, error: BaseException) -> None:
+    """Add to the error of a full disk how to go on with what was recorded."""
+    if isinstance(error, StorageError) and run.recording.exists():
+        error.add_note(f"`dualtaxi resume {run.run_id}` goes on when there is room.")
+
+
+class Session:
+    """One execution: alternates training and evaluation, and hands every block to the recorder."""
+
+    def __init__(
+        self,
+        job: Job,
+        learner: Learner,
+        recorder: Recorder,
+        report: Report = lambda _: None,
+        stop: Stop = lambda: False,
+        observer: Observer | None = None,
+    ) -> None:
+        self._config = job.config
+        self._observer = observer
+        self._learner = learner
+        self.recorder = recorder
+        self._report = report
+        self._stop = stop
+        self._progress = Progress(job.config.episodes)
+        self._evaluated = 0
+        self._last_report = 0.0
+
+    @property
+    def learners(self) -> tuple[str, ...]:
+        """The names of what learns: the agents, or `agency` for one joint table."""
+        return self._learner.agents
+
+    def run(self) -> bool:
+        """Do the whole job; return False if it was stopped before the end."""
+        if self._observer is not None:
+            self._observer.begin(self._learner.mdp, self._learner.agents)
+        self._log(f"training {self._config.episodes} episodes with {self._config.algorithm}")
+        for episode in self._boundaries():
+            if not self._train(episode):
+                break
+            if self._snapshot_is_due(episode):
+                self._snapshot()
+            if not self._evaluate(episode):
+                break
+        else:
+            self._log("finished")
+            return True
+        self._log("interrupted", "WARNING")
+        return False
+
+    def summary(self, topics: dict[str, str]) -> dict[str, Any]:
+        """Return what is worth knowing of the run without opening its recording."""
+        last = self._progress.evaluations[-1] if self._progress.evaluations else None
+        return self.recorder.totals(topics) | {
+            "episodes": self._learner.episode,
+            "steps_recorded": self._config.recording.steps == "all",
+            "last_evaluation": last and evaluation_brief(last),
+        }
+
+    def _boundaries(self) -> Iterator[int]:
+        """Yield the episodes at which training pauses for an evaluation or a snapshot, and the last one."""
+        last = self._config.episodes
+        evaluation = self._config.evaluation
+        paces = [every for every in (evaluation and evaluation.every, self._config.snapshots.every) if every]
+        episode = 0
+        while episode < last:
+            yield episode
+            episode = min([last, *(episode - episode % every + every for every in paces)])
+        yield last
+
+    def _train(self, until_episode: int) -> bool:
+        """Train up to an episode, reporting metrics on the way; return False if stopped."""
+        recorder, learner = self.recorder, self._learner
+        every = self._config.log.every_steps if self._config.log else 2**62
+        while learner.episode < until_episode:
+            if self._stop():
+                return False
+            next_log = (learner.step // every + 1) * every
+            records, ends = recorder.block(schema.TRAIN_STEP), recorder.block(schema.TRAIN_EPISODE)
+            steps, episodes = learner.train(records, ends, until_episode, next_log)
+            self._show("train", records[:steps])
+            recorder.commit("train", steps, episodes)
+            if learner.step == next_log:
+                self._measure("train", schema.TRAIN_METRICS_TOPIC, learner.training_side())
+            self._tell()
+        return True
+
+    def _evaluate(self, episode: int) -> bool:
+        """Evaluate if it is due at this episode; return False if stopped."""
+        plan = self._config.evaluation
+        if plan is None or (episode % plan.every and episode != self._config.episodes):
+            return True
+        recorder, learner = self.recorder, self._learner
+        learner.begin_evaluation()
+        first = self._evaluated * plan.trials
+        done, trials = first, []
+        while done < first + plan.trials:
+            if self._stop():
+                return False
+            records = recorder.block(schema.EVAL_EPISODE)
+            played = recorder.block(schema.EVAL_STEP)
+            steps, ended = learner.evaluate(played, records, first + plan.trials)
+            self._show("eval", played[:steps])
+            trials.append(records[:ended].copy())
+            recorder.commit("eval", steps, ended)
+            done += ended
+            self._tell()
+        metrics = evaluation_metrics(learner, self._evaluated, np.concatenate(trials))
+        self._measure("eval", schema.EVAL_METRICS_TOPIC, metrics)
+        self._evaluated += 1
+        self._progress.evaluations.append(metrics)
+        if plan.exact:
+            self._measure_exactly(metrics)
+        self._log(f"evaluation after {episode} episodes: {metrics['success_percent']:.1f} % success")
+        self._tell(now=True)
+        return True
+
+    def _show(self, phase: str, steps: NDArray[np.void]) -> None:
+        """Show the observer steps that are not committed yet."""
+        if self._observer is not None:
+            self._observer.steps(phase, sum(self.recorder.steps.values()), steps)
+
+    def _measure(self, phase: str, topic: schema.Topic, metrics: dict[str, Any]) -> None:
+        """Record metrics, and show them to the observer."""
+        self.recorder.message(topic, encode(topic.message, metrics))
+        if self._observer is not None:
+            self._observer.metrics(phase, sum(self.recorder.steps.values()), metrics)
+
+    def _measure_exactly(self, metrics: dict[str, Any]) -> None:
+        """Record what the evaluated policy gets from every start state, beside what is possible."""
+        exact = self._yardstick.measure(self._learner.policy, metrics["discount"])
+        position = {name: metrics[name] for name in ("step", "episode", "evaluation")}
+        topic = schema.OPTIMALITY_TOPIC
+        self.recorder.message(topic, encode(topic.message, position | exact))
+        self._progress.evaluations[-1] = metrics | {"optimality": exact}
+
+    @cached_property
+    def _yardstick(self) -> Yardstick:
+        return Yardstick(self._learner.mdp, len(self._learner.agents))
+
+    def _snapshot_is_due(self, episode: int) -> bool:
+        every = self._config.snapshots.every
+        return episode in (0, self._config.episodes) or bool(every and episode % every == 0)
+
+    def _snapshot(self) -> None:
+        learner = self._learner
+        for number, values in enumerate(learner.snapshot()):
+            agent = learner.agents[number % len(learner.agents)]
+            table = QTable(learner.step, learner.episode, agent, number, values)
+            self.recorder.message(schema.Q_TABLE_TOPIC, encode_q_table(table))
+
+    def _log(self, text: str, level: str = "INFO") -> None:
+        steps = sum(self.recorder.steps.values())
+        said = encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level)
+        if self.recorder.message(schema.LOG_TOPIC, said):
+            self._progress.log.append(text)
+
+    def _tell(self, now: bool = False) -> None:
+        """Report the progress, not more often than is worth it."""
+        moment = time.monotonic()
+        if not now and moment - self._last_report < REPORT_SECONDS:
+            return
+        self._last_report = moment
+        progress = self._progress
+        progress.episode = self._learner.episode
+        progress.train_steps, progress.eval_steps = (
+            self.recorder.steps["train"],
+            self.recorder.steps["eval"],
+        )
+        progress.bytes_written = self.recorder.bytes_written
+        self._report(progress)
+
+
+def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> dict[str, Any]:
+    """Return the measures of an evaluation from its episode records, and training's at that moment."""
+    known = bool(learner.mdp.success_events)
+    successes = int(trials["success"].sum())
+    return learner.training_side() | {
+        "evaluation": evaluation,
+        "trials": len(trials),
+        "successes": successes if known else -1,
+        "success_percent": 100.0 * successes / len(trials) if known else float("nan"),
+        "eval_mean_length": float(trials["length"].mean()),
+        "mean_penalties": float(trials["penalties"].mean()),
+        "terminations": int(trials["terminated"].sum()),
+        "mean_returns": trials["returns"].mean(axis=0).tolist(),
+        "events": trials["events"].sum(axis=0, dtype=np.int64).tolist(),
+    }
+
+
+def evaluation_brief(metrics: dict[str, Any]) -> dict[str, Any]:
+    """Return the four figures of an evaluation that people quote; finish percent None if unknown."""
+    finished = metrics["success_percent"]
+    return {
+        "episode": metrics["episode"],
+        "success_percent": None if math.isnan(finished) else finished,
+        "mean_length": metrics["eval_mean_length"],
+        "mean_penalties": metrics["mean_penalties"],
+    }
+
+
+def recorder_for(
+    job: Job,
+    learner: Learner,
+    file: RecordingFile | None,
+    past: Past | None = None,
+    beat: Callable[[], None] = lambda: None,
+    threads: bool = True,
+) -> Recorder:
+    """Return a recorder for what a learner does, into a file, packed as the job's configuration says."""
+    plan = job.config.recording
+    return Recorder(
+        file,
+        learners=len(learner.agents),
+        events=len(learner.mdp.event_names),
+        packing=Packing(plan.compression, plan.level or 0, plan.index),
+        chunk_steps=plan.chunk_steps,
+        record_steps=plan.steps == "all",
+        past=past,
+        beat=beat,
+        threads=threads,
+    )
+
+
+def describe(
+    file: RecordingFile, job: Job, run: Run, learner: Learner, made_by: Mapping[str, str] | None = None
+) -> None:
+    """Write what makes the recording self-contained; `made_by` is its provenance if not this process's.
+
+    Raises:
+        StorageError: the disk is full or failing.
+    """
+    events = len(learner.mdp.event_names)
+    facts = run_facts(run.run_id, run.name, job.seed, job.identity, run.created_text, learner.agents, events)
+    config, environment = job.config.to_mapping(), _environment(learner.mdp)
+    write_description(file, facts, config, made_by or provenance(), environment)
+
+
+@lru_cache(maxsize=4)
+def _environment(mdp: Mdp) -> Attachments:
+    """Return the attachments that tell of an environment."""
+    return environment_attachments(mdp.description(), mdp.arrays())

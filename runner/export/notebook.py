@@ -1,0 +1,136 @@
+"""Runs in a notebook: a run shows itself, plots of several, and the Rerun viewer inline.
+
+    import runner
+    from runner.export.notebook import plot, rerun_view
+
+    run = runner.run("quick")
+    run                       # summary, replay, plots and maps
+    plot(run, other)          # the learning curves of both
+    rerun_view(run)           # the Rerun viewer, where rerun-notebook is installed
+
+All of it is read from the recordings.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from typing import Any, Final
+
+from runner.errors import MissingExtra
+from runner.runs.run import Run
+from runner.util.extras import require
+
+HEIGHT: Final = 760
+"""Pixels of a notebook's page that a run takes; it scrolls inside."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Something that a notebook shows as HTML."""
+
+    html: str
+
+    def _repr_html_(self) -> str:
+        return self.html
+
+
+def run_html(run: Run) -> str:
+    """Return how a run shows itself: its report in a frame, or its facts where packages are missing."""
+    if not run.recording.is_file():
+        return facts_html(run)
+    try:
+        return report(run).html
+    except MissingExtra as error:
+        return facts_html(run) + f"<p>{escape(str(error))}</p>"
+
+
+def report(*runs: Run, height: int = HEIGHT) -> Shown:
+    """Return the report of runs (summary, replay, plots, maps) in a frame of its own.
+
+    Raises:
+        MissingExtra: Jinja2 or Matplotlib is not installed.
+        RecordingError: a recording cannot be read.
+    """
+    from runner.archive.places import at_hand
+    from runner.export.reports.report import render_report
+
+    page, _ = render_report([at_hand(run).recording for run in runs])
+    title = ", ".join(f"{run.name}, run {run.run_id}" for run in runs)
+    return Shown(
+        f'<iframe title="{escape(title)}" srcdoc="{escape(page)}" width="100%" height="{height}" '
+        'style="border: 1px solid #8888; border-radius: 6px" sandbox="allow-scripts"></iframe>'
+    )
+
+
+def plot(*runs: Run) -> Shown:
+    """Return the learning curves of runs in one figure, runs of one configuration as median and band.
+
+    Raises:
+        MissingExtra: Matplotlib is not installed.
+        RecordingError: a recording cannot be read.
+    """
+    from runner.analysis.groups import groups_of
+    from runner.analysis.readings import read_series
+    from runner.archive.places import at_hand
+    from runner.export.plots.figure import draw_figure
+    from runner.export.plots.metrics import panels_of
+    from runner.recording.reader import open_recording
+
+    series = []
+    for run in runs:
+        with open_recording(at_hand(run).recording) as recording:
+            series.append(read_series(recording))
+    groups = groups_of(series)
+    buffer = io.StringIO()
+    draw_figure(groups, panels_of(groups)).savefig(buffer, format="svg", facecolor="white")
+    svg = buffer.getvalue()
+    return Shown(svg[svg.index("<svg") :])
+
+
+def rerun_view(
+    *runs: Run,
+    episodes: Sequence[tuple[int, int | None]] = (),
+    evaluations: Sequence[int] = (),
+    width: int = 1000,
+    height: int = 640,
+) -> Any:
+    """Return the Rerun viewer with runs in it, as a widget.
+
+    Args:
+        runs: what to show.
+        episodes: ranges of training episodes (start, stop); a spread of them unless given.
+        evaluations: evaluations, named by the training episodes before them.
+        width: pixels.
+        height: pixels.
+
+    Raises:
+        MissingExtra: rerun-notebook is not installed.
+        RecordingError: a recording cannot be read, or has not what is asked for.
+    """
+    notebook = require("rerun_notebook", extra="notebook", purpose="the Rerun viewer in a notebook")
+    from runner.export.rerun.cache import exported
+    from runner.export.rerun.selection import Request
+
+    path, _ = exported(runs, Request(episodes=tuple(episodes), evaluations=tuple(evaluations)))
+    viewer = notebook.Viewer(width=width, height=height)
+    viewer.send_rrd(path.read_bytes())
+    return viewer
+
+
+def facts_html(run: Run) -> str:
+    """Return what `run.json` says of a run, as a small table."""
+    evaluation = asdict(run.summary.last_evaluation) if run.summary.last_evaluation else {}
+    facts = {
+        "run": f"{run.run_id}, {run.status}",
+        "name": f"{run.title}",
+        "recording": str(run.recording),
+        **{f"last evaluation: {key.replace('_', ' ')}": value for key, value in evaluation.items()},
+    }
+    rows = "".join(
+        f'<tr><th scope="row" style="text-align:left">{escape(key)}</th><td>{escape(str(value))}</td></tr>'
+        for key, value in facts.items()
+    )
+    return f"<table>{rows}</table>"

@@ -1,0 +1,315 @@
+"""One recorded episode as arrays: what replay, film and notebook show of it.
+
+Frame k is the state after k steps; with it go the step that led there and the Q-values of what is chosen
+there next. So an episode of T steps has T + 1 frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.analysis.evaluations import evaluation_after, evaluations_of
+from runner.analysis.frames import agents_of
+from runner.analysis.outcomes import events_of
+from runner.environments.mdp import Mdp
+from runner.environments.naming import (
+    action_names,
+    actions_in_words,
+    agent_actions,
+    event_in_words,
+    numbered_actions,
+    spoken,
+    states_in_words,
+    trial_in_words,
+)
+from runner.errors import RecordingError
+from runner.export.contents import require_steps
+from runner.recording import schema
+from runner.recording.reader import Recording
+from runner.replay.checks import check_steps
+from runner.replay.tables import TableReplay, tables_at
+
+MOST_STEPS: Final = 1000
+"""Steps of an episode that a page shows; the page says so where an episode has more."""
+MOST_VALUES: Final = 6
+"""Q-values of a state that a page shows: the highest, and that of the action taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class Episode:
+    """A recorded episode; arrays of its T shown steps, and of T + 1 states."""
+
+    title: str
+    phase: str
+    number: int
+    length: int
+    """Steps it has, of which T are here."""
+    total: float
+    """What the rewards of all of them sum to."""
+    ended: str
+    """How it ended: `success`, `terminated`, `truncated`, `reset` before its end, or `cut off`."""
+    states: NDArray[np.int64]
+    actions: NDArray[np.int64]
+    rewards: NDArray[np.float64]
+    """[T, learners]."""
+    events: NDArray[np.int64]
+    explored: NDArray[np.int64]
+    values: tuple[NDArray[np.float64], ...]
+    """For each learner the Q-values in the first T states, [T, actions]; none where they cannot be had."""
+    names: tuple[str, ...] = ()
+    """Why it is shown."""
+    first: int = 0
+    """Steps before those that are here."""
+    before: tuple[float, ...] = ()
+    """What each learner's rewards in them sum to; nothing where there are none."""
+
+    @property
+    def steps(self) -> int:
+        """The steps that are here."""
+        return len(self.actions)
+
+    def called(self, name: str) -> Episode:
+        """Return it with one more name before its title: `best trial`."""
+        return replace(self, names=(*self.names, name))
+
+    @property
+    def heading(self) -> str:
+        """Its names and its title: `best trial: trial 3 of ...`."""
+        names = " and ".join(self.names)
+        text = f"{names}: {self.title}" if names else self.title
+        return text[0].upper() + text[1:]
+
+    @property
+    def description(self) -> str:
+        """Length, end and return in words, and how many of its steps are here if not all are."""
+        part = "" if self.steps == self.length else f" Shown are the first {self.steps:,} steps."
+        return self.outcome + part
+
+    @property
+    def outcome(self) -> str:
+        """Length, end and return in words."""
+        words = {"success": "ended in success", "terminated": "ended", "truncated": "ended by the step limit"}
+        words["reset"] = "reset before its end"
+        ended = words.get(self.ended, "cut off with the recording")
+        return f"{self.length:,} steps, {ended}. Rewards sum to {self.total:g}."
+
+
+def training_episode(recording: Recording, number: int, most: int = MOST_STEPS, first: int = 0) -> Episode:
+    """Return a training episode, counted from 0, also one that never ended: `most` steps from `first` on.
+
+    Raises:
+        RecordingError: there is no such episode, or no steps.
+    """
+    require_steps(recording, "show")
+    title = f"training episode {number:,}"
+    return _episode(recording, "train", number, title, range(first, first + most))
+
+
+def trial(recording: Recording, after: int, number: int, most: int = MOST_STEPS, first: int = 0) -> Episode:
+    """Return a trial, counted from 0, of the evaluation after so many training episodes.
+
+    It is `most` of its steps, from `first` on.
+
+    Raises:
+        RecordingError: there is no such evaluation or trial, or no steps.
+    """
+    require_steps(recording, "show")
+    where = str(recording.path)
+    evaluation = evaluation_after(evaluations_of(recording), after, where)
+    index = evaluation.trial(number, where)
+    shown = range(first, first + most)
+    return _episode(recording, "eval", index, trial_in_words(after, number), shown, evaluation.train_step)
+
+
+def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
+    """Return the worst, the median and the best trial of an evaluation: by success, return and length."""
+    evaluation = evaluation_after(evaluations_of(recording), after, str(recording.path))
+    records = recording.episodes("eval", evaluation.start, evaluation.stop)
+    order = np.lexsort(
+        (-records["length"].astype(np.int64), records["returns"].sum(axis=1), records["success"])
+    )
+    return int(order[0]), int(order[len(order) // 2]), int(order[-1])
+
+
+def deeds_in_words(mdp: Mdp) -> list[str]:
+    """Return the words of every joint action, saying whose: `taxi 1 south, taxi 2 pickup`."""
+    words = [str(word) for word in actions_in_words(mdp)]
+    if len(mdp.agents) < 2 or action_names(mdp) is None:
+        return words
+    names = [spoken(agent) for agent in mdp.agents]
+    return [
+        ", ".join(f"{name} {own}" for name, own in zip(names, word.split(" + "), strict=True))
+        for word in words
+    ]
+
+
+def typical_trial(recording: Recording) -> tuple[int, int]:
+    """Return the last evaluation (training episodes before it) and its median trial.
+
+    Raises:
+        RecordingError: there is no evaluation, or no steps.
+    """
+    require_steps(recording, "show")
+    after = last_whole_evaluation(recording)
+    if after is None:
+        raise RecordingError(f"{recording.path}: has no whole evaluation; choose a training episode.")
+    return after, ranked_trials(recording, after)[1]
+
+
+def last_episode(recording: Recording) -> int:
+    """Return the number of the last training episode that ended; 0 if none did."""
+    return max(0, recording.count(schema.TRAIN_EPISODE) - 1)
+
+
+def last_whole_evaluation(recording: Recording) -> int | None:
+    """Return the training episodes before the last evaluation all of whose trials are there.
+
+    A recording that was cut off may have an evaluation's metrics without its trials. A loop has none: where
+    its evaluations end nobody said.
+    """
+    if recording.kind != "job":
+        return None
+    episodes, steps = recording.count(schema.EVAL_EPISODE), recording.count(schema.EVAL_STEP)
+    for one in reversed(evaluations_of(recording)):
+        if (
+            one.stop <= episodes
+            and recording.episodes("eval", one.stop - 1, one.stop)[0]["last_step"] < steps
+        ):
+            return one.after
+    return None
+
+
+def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[str, Any]:
+    """Return what a page needs to show episodes, as JSON can hold it: lists of numbers, words once.
+
+    Args:
+        recording: the run.
+        episodes: which.
+        places: from states to places as `svg.Drawing.places` gives them; None without a scene.
+    """
+    mdp, agents = recording.mdp, agents_of(recording)
+    own = numbered_actions(mdp)
+    joint = actions_in_words(mdp).tolist()
+    return {
+        "actions": deeds_in_words(mdp),
+        "choices": [joint] if len(agents) == 1 else own,
+        "learners": [spoken(agent) for agent in agents],
+        "events": [event_in_words(name) for name in mdp.event_names],
+        "episodes": [_packed(mdp, episode, places) for episode in episodes],
+    }
+
+
+# --- inside -------------------------------------------------------------------------------------------
+
+
+def _episode(
+    recording: Recording, phase: str, number: int, title: str, part: range, table_step: int = -1
+) -> Episode:
+    steps = recording.episode_steps(phase, number)
+    shown, last = steps[part.start : part.stop], steps[-1]
+    if not len(shown):
+        raise RecordingError(
+            f"{recording.path}: {title} has {len(steps):,} steps, from 0; found no step {part.start:,}."
+        )
+    mdp = recording.mdp
+    check_steps(shown, mdp, str(recording.path))
+    return Episode(
+        title=title,
+        phase=phase,
+        number=number,
+        length=len(steps),
+        total=float(steps["rewards"].sum()),
+        ended=_end(recording, phase, number, last),
+        states=np.append(shown["state"], shown["next_state"][-1]).astype(np.int64),
+        actions=shown["action"].astype(np.int64),
+        rewards=shown["rewards"].astype(np.float64),
+        events=events_of(mdp, shown).astype(np.int64),
+        explored=shown["explored"].astype(np.int64),
+        values=_values(recording, shown, table_step),
+        first=part.start,
+        before=tuple(steps["rewards"][: part.start].sum(axis=0).tolist()) if part.start else (),
+    )
+
+
+def _end(recording: Recording, phase: str, number: int, last: np.void) -> str:
+    if not (last["terminated"] or last["truncated"]):
+        return "reset" if number < recording.count(recording.topic(f"/{phase}/episode")) else "cut off"
+    record = recording.episodes(phase, number, number + 1)
+    if len(record) and record[0]["success"]:
+        return "success"
+    return "terminated" if last["terminated"] else "truncated"
+
+
+def _values(
+    recording: Recording, steps: NDArray[np.void], table_step: int
+) -> tuple[NDArray[np.float64], ...]:
+    """Return each learner's Q-values in the states of steps; none where the tables cannot be had."""
+    if recording.kind != "job":
+        return ()  # what somebody's own loop learned is not known
+    try:
+        if table_step >= 0:
+            tables = tables_at(recording, table_step)
+            return tuple(table[steps["state"]] for table in tables)
+        first = int(steps["step"][0])
+        replay = TableReplay(recording, first)
+        widths = [table.shape[1] for table in replay.tables]
+        rows = replay.rows(first + len(steps))
+    except RecordingError:
+        return ()
+    return tuple(rows[:, i, :width] for i, width in enumerate(widths))
+
+
+def _packed(mdp: Mdp, episode: Episode, places: Any) -> dict[str, Any]:
+    """Return an episode's arrays; what belongs to a state is there once."""
+    distinct, which = np.unique(episode.states, return_inverse=True)
+    chosen = [agent_actions(mdp, action) for action in episode.actions.tolist()]
+    return {
+        "title": episode.heading,
+        "description": episode.description,
+        "states": [str(word) for word in states_in_words(mdp)[distinct]],
+        "places": [] if places is None else places(distinct).reshape(len(distinct), -1).tolist(),
+        "state": which.tolist(),
+        "action": episode.actions.tolist(),
+        "reward": [[_short(reward) for reward in row] for row in episode.rewards.tolist()],
+        "event": episode.events.tolist(),
+        "explored": episode.explored.tolist(),
+        "values": [
+            _rows(
+                values,
+                [
+                    own[i] if len(episode.values) > 1 else joint
+                    for own, joint in zip(chosen, episode.actions.tolist(), strict=True)
+                ],
+            )
+            for i, values in enumerate(episode.values)
+        ],
+    }
+
+
+def _rows(values: NDArray[np.float64], taken: list[int]) -> dict[str, Any]:
+    """Return the highest Q-values of each step, [action, value] pairs, and the action taken."""
+    rows: dict[str, int] = {}
+    which: list[int] = []
+    packed: list[list[list[Any]]] = []
+    for row, action in zip(values, taken, strict=True):
+        best = np.argsort(-row, kind="stable")[:MOST_VALUES].tolist()
+        shown = best if action in best else [*best[:-1], action]
+        if len(row) <= MOST_VALUES:
+            shown = sorted(shown)
+        pairs = [[int(choice), _short(float(row[choice]))] for choice in shown]
+        key = str(pairs)
+        if key not in rows:
+            rows[key] = len(packed)
+            packed.append(pairs)
+        which.append(rows[key])
+    return {"rows": packed, "row": which, "taken": [int(action) for action in taken], "of": values.shape[1]}
+
+
+def _short(value: float) -> float | int:
+    """Return a value rounded to five significant digits, as the page says."""
+    rounded = float(f"{value:.5g}")
+    return int(rounded) if rounded == int(rounded) else rounded

@@ -1,0 +1,323 @@
+"""`runner.record_vector` and `runner.record_parallel`: vector environments, and PettingZoo's games."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
+
+from runner.environments.mdp import MAX_AGENTS
+from runner.errors import ConfigError, EnvironmentNotUsable
+from runner.loops.env import Recorded, given
+from runner.loops.loop import Loop
+from runner.loops.options import plan_of
+from runner.loops.spaces import Described, describe, kind_of
+from runner.loops.staging import AgentRows
+from runner.loops.vector_buffer import VectorRows
+
+
+class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any]):
+    """A vector environment whose every reset and step is recorded; made by `record_vector`."""
+
+    env: VectorEnv[Any, Any, Any]
+
+    def __init__(self, env: VectorEnv[Any, Any, Any], loop: Loop[VectorRows], mode: AutoresetMode) -> None:
+        VectorWrapper.__init__(self, env)
+        self._has_finals = mode == AutoresetMode.SAME_STEP
+        self._own(loop)
+        self._phase, self._rows = "train", loop.rows("train")
+
+    def _enter(self, phase: str) -> None:
+        with self._loop.lock:
+            over = self._rows.over
+            super()._enter(phase)
+            self._rows.over = over  # the environments are the same ones
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Take a step in every environment, and record it."""
+        result = self.env.step(actions)
+        observations, rewards, terminated, truncated, infos = result
+        final = _final_observations(infos) if self._has_finals else None
+        with self._loop.lock:
+            if self._loop.active is not self._rows:
+                self._loop.activate(self._rows)
+            self._rows.take(actions, observations, rewards, terminated, truncated, final)
+        if self._loop.plan.info:
+            self._loop.info(self._phase, _by_environment(infos))
+        return result
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Reset all environments, or those of `options["reset_mask"]`, and record it."""
+        n, asked = self.env.num_envs, dict(options) if options else {}
+        mask = asked.pop("reset_mask", None)
+        which = np.ones(n, np.bool_) if mask is None else np.array(mask, np.bool_)
+        result = self.env.reset(**given(seed=seed, options=options))
+        seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            self._rows.reset(result[0], seeds, which)
+        self._loop.reset_info(self._phase, _by_environment(result[1]), asked, None)
+        return result
+
+
+def record_vector(
+    envs: VectorEnv[Any, Any, Any],
+    recordings: str | os.PathLike[str] | None = None,
+    *,
+    name: str | None = None,
+    seed: int | None = None,
+    config: object = None,
+    info: Sequence[str] = (),
+    autoreset_mode: AutoresetMode | str | None = None,
+    **packing: Any,
+) -> RecordedVector:
+    """Return a vector environment, recording whatever any loop does with it.
+
+        with runner.record_vector(gymnasium.make_vec("CartPole-v1", 8), config={"lr": 3e-4}) as envs:
+            observations, infos = envs.reset(seed=0)
+
+    All environments are recorded into one run; step number n of it was taken in environment n modulo
+    their number. Each way of resetting by itself (`AutoresetMode`) is recorded as what it is.
+
+    Args:
+        envs: a vector environment.
+        recordings: as for `record`, like what follows.
+        name: what the run is called.
+        seed: what the run is listed with.
+        config: your own settings.
+        info: fields of the vector's infos to record.
+        autoreset_mode: how the environments reset themselves, where their metadata does not state it:
+            "NextStep", "SameStep" or "Disabled". SuperSuit's reset in the "SameStep".
+        packing: as for `record`.
+
+    Raises:
+        EnvironmentNotUsable: a space cannot be recorded, or has values of varying size.
+        ConfigError: an argument cannot be used.
+        StorageError: the recordings folder cannot be written.
+    """
+    if not isinstance(envs, VectorEnv):
+        raise ConfigError(
+            f"found {type(envs).__name__}, expected a vector environment, such as gymnasium.make_vec gives"
+        )
+    mode = _autoreset_mode(envs, autoreset_mode)
+    described = _described_vector(envs)
+    _require_fixed(described)
+    plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
+    rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
+    return RecordedVector(envs, Loop(described, plan, rows), mode)
+
+
+def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str | None) -> AutoresetMode:
+    """Return the way in which environments reset themselves: the chosen one, else the stated one.
+
+    Raises:
+        ConfigError: there is no such mode.
+        EnvironmentNotUsable: none is chosen and none is stated.
+    """
+    if chosen is not None:
+        try:
+            return AutoresetMode(chosen)
+        except ValueError as error:
+            modes = ", ".join(repr(mode.value) for mode in AutoresetMode)
+            raise ConfigError(f"autoreset_mode: found {chosen!r}, expected one of {modes}") from error
+    stated = (getattr(envs, "metadata", None) or {}).get("autoreset_mode")
+    if not isinstance(stated, AutoresetMode):
+        raise EnvironmentNotUsable(
+            f'found metadata["autoreset_mode"] {stated!r}, expected one of gymnasium.vector.AutoresetMode: '
+            "without it, resets cannot be told from steps. State it: record_vector(envs, "
+            'autoreset_mode="NextStep"), or "SameStep" (SuperSuit) or "Disabled".'
+        )
+    return stated
+
+
+def _described_vector(envs: VectorEnv[Any, Any, Any]) -> Described:
+    """Return the description of a vector environment.
+
+    Older ones have no `single_` spaces: their spaces are those of one environment.
+    """
+    observation = getattr(envs, "single_observation_space", None) or envs.observation_space
+    action = getattr(envs, "single_action_space", None) or envs.action_space
+    with _one_of(envs) as first:
+        described = describe(first, observation, action)
+    return replace(described, environments=envs.num_envs, mdp=None, agents=("agent",))
+
+
+@contextlib.contextmanager
+def _one_of(envs: VectorEnv[Any, Any, Any]) -> Iterator[Any]:
+    """Yield what has the registration of the environments: the vector, or one of its environments.
+
+    Those of an AsyncVectorEnv are in other processes, which end if a registration cannot be sent; so one is
+    made here, as AsyncVectorEnv itself does, without moving the global random generators.
+    """
+    unwrapped = envs.unwrapped
+    if getattr(envs, "spec", None) is not None:
+        yield envs
+    elif inside := getattr(unwrapped, "envs", None):
+        yield inside[0]
+    elif isinstance(unwrapped, AsyncVectorEnv):
+        states = random.getstate(), np.random.get_state()
+        try:
+            with contextlib.closing(unwrapped.env_fns[0]()) as own:
+                yield own
+        finally:
+            random.setstate(states[0])
+            np.random.set_state(states[1])
+    else:
+        yield envs
+
+
+def _final_observations(infos: Any) -> Any:
+    """Return the last observations of the episodes that ended in a step, by environment."""
+    if isinstance(infos, Mapping):
+        return infos.get("final_obs")
+    last = [info.get("terminal_observation") for info in infos]
+    return last if any(value is not None for value in last) else None
+
+
+def _by_environment(infos: Any) -> Mapping[str, Any]:
+    """Return infos by field; SuperSuit gives a list of them, one for each environment."""
+    if isinstance(infos, Mapping):
+        return infos
+    return _by_field({str(i): info for i, info in enumerate(infos)})
+
+
+class RecordedParallel(Recorded[AgentRows]):
+    """A PettingZoo parallel environment whose every reset and step is recorded; made by `record_parallel`.
+
+    What it does not have itself it has of the environment: `agents`, `action_space`, ...
+    """
+
+    def __init__(self, env: Any, loop: Loop[AgentRows]) -> None:
+        self.env = env
+        self._own(loop)
+        self._enter("train")
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "env":
+            raise AttributeError(name)
+        return getattr(self.env, name)
+
+    @property
+    def unwrapped(self) -> Any:
+        """The environment inside of all wrappers."""
+        return self.env.unwrapped
+
+    def step(self, actions: Mapping[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
+        """Take a step of all agents, and record it."""
+        result = self.env.step(actions)
+        observations, rewards, terminated, truncated, infos = result
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            over = not self.env.agents
+            self._rows.take(actions, observations, rewards, terminated, truncated, over)
+        if self._loop.plan.info:
+            self._loop.info(self._phase, _by_field(infos))
+        return result  # type: ignore[no-any-return]
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        """Reset the environment, and record it."""
+        result = self.env.reset(**given(seed=seed, options=options))
+        with self._loop.lock:
+            self._loop.activate(self._rows)
+            self._rows.reset(result[0], seed)
+        self._loop.reset_info(self._phase, _by_field(result[1]), options, seed)
+        return result  # type: ignore[no-any-return]
+
+
+def record_parallel(
+    env: Any,
+    recordings: str | os.PathLike[str] | None = None,
+    *,
+    name: str | None = None,
+    seed: int | None = None,
+    config: object = None,
+    info: Sequence[str] = (),
+    **packing: Any,
+) -> RecordedParallel:
+    """Return a PettingZoo parallel environment, recording whatever any loop does with it.
+
+    Each agent of `possible_agents` has its own reward column and its own part of observation and action;
+    a step says which agents acted and for which it was the last.
+
+    Args:
+        env: a `pettingzoo.ParallelEnv`; `pettingzoo.utils.aec_to_parallel` makes one of a game in turns.
+        recordings: as for `record`, like what follows.
+        name: what the run is called.
+        seed: what the run is listed with.
+        config: your own settings.
+        info: fields of the agents' infos to record, where they come.
+        packing: as for `record`.
+
+    Raises:
+        EnvironmentNotUsable: a space cannot be recorded, or there are more than 31 agents.
+        ConfigError: an argument cannot be used.
+        StorageError: the recordings folder cannot be written.
+    """
+    if hasattr(env, "agent_iter") and hasattr(env, "last"):
+        raise ConfigError(
+            f"found {type(env).__name__}, a game in turns (AECEnv), expected a PettingZoo ParallelEnv: "
+            "pettingzoo.utils.aec_to_parallel makes one of many games in turns."
+        )
+    if not all(hasattr(env, part) for part in ("possible_agents", "observation_space", "action_space")):
+        raise ConfigError(
+            f"found {type(env).__name__}, expected a PettingZoo ParallelEnv with possible_agents"
+        )
+    described = _game(env)
+    _require_fixed(described)
+    plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
+    return RecordedParallel(env, Loop(described, plan, AgentRows))
+
+
+def _require_fixed(described: Described) -> None:
+    """Refuse spaces whose values vary in size, before there is a run.
+
+    Raises:
+        EnvironmentNotUsable: there is one.
+    """
+    if described.kind == "variable":
+        raise EnvironmentNotUsable(
+            "found a Text space, whose values vary in size; of several environments or agents at once "
+            "only spaces of fixed size can be recorded."
+        )
+
+
+def _game(env: Any) -> Described:
+    """Return what is to be said of a PettingZoo parallel environment."""
+    agents = tuple(env.possible_agents)
+    if not 1 <= len(agents) <= MAX_AGENTS:
+        raise EnvironmentNotUsable(f"found {len(agents)} possible agents, expected 1 to {MAX_AGENTS}.")
+    for agent in agents:
+        if not isinstance(agent, str | Integral):
+            raise EnvironmentNotUsable(f"found the agent {agent!r}, expected a name or a number for each.")
+    observation = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
+    action = spaces.Dict({agent: env.action_space(agent) for agent in agents})
+    name = env.metadata.get("name") if isinstance(getattr(env, "metadata", None), Mapping) else None
+    return Described(
+        kind=kind_of(observation, action),
+        observation=observation,
+        action=action,
+        env_id=str(name or type(env).__name__),
+        kwargs={},
+        step_limit=0,
+        agents=agents,
+    )
+
+
+def _by_field(infos: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the infos of agents by field, then by agent."""
+    fields: dict[str, dict[str, Any]] = {}
+    for agent, info in infos.items():
+        for key, value in info.items():
+            fields.setdefault(key, {})[agent] = value
+    return fields

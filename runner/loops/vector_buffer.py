@@ -1,0 +1,342 @@
+"""The steps of a vector environment: whole batches copied as they come, records made for many steps at once.
+
+A step copies five arrays. What follows from the order of steps (their numbers, the lengths and returns of
+episodes, the resets that environments do by themselves) is computed for a block of steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.loops.spaces import Described, parts_of
+from runner.loops.staging import Flags, StagedRows
+from runner.loops.values import filler, leaves, put_batch, put_chosen
+from runner.recording import schema
+from runner.recording.recorder import Recorder
+
+_MOST_STEPS: Final = 2048
+"""Steps of the vector environment in a block; fewer if the recorder's blocks hold fewer records."""
+
+
+@dataclass(frozen=True)
+class _Reset:
+    """A reset, called by the user, of environments whose episodes had ended."""
+
+    row: int
+    """The row of the block that comes after it."""
+    which: NDArray[np.intp]
+    observation: NDArray[Any]
+    seeds: Sequence[int | None]
+
+
+@dataclass(frozen=True)
+class _Final:
+    """The last observations of episodes that ended in a step whose observations are of the next ones."""
+
+    row: int
+    which: NDArray[np.intp]
+    observation: NDArray[Any]
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """What follows from the ends of episodes in a block; arrays are [rows, N] or [rows + 1, N]."""
+
+    over: Flags
+    only_reset: Flags
+    """Where no step was taken: the environment ignored its action and was reset."""
+    ended_before: NDArray[np.int64]
+    """Episodes that ended in the block before each row, and before its end."""
+    t: NDArray[np.int64]
+    length: NDArray[np.int64]
+    """Steps of the episode up to and with each row."""
+    returns: NDArray[np.float64]
+    """Sums of the episode's rewards up to and with each row."""
+
+
+class VectorRows(StagedRows):
+    """The steps of one phase of a vector environment that are not committed yet.
+
+    Args:
+        recorder: takes their records.
+        described: the environments and their spaces.
+        phase: `train` or `eval`.
+        first_action: called with the first action of the phase before it is recorded; may call `reshape`.
+        next_step: whether an environment whose episode is over ignores its next action and is reset.
+    """
+
+    def __init__(
+        self,
+        recorder: Recorder,
+        described: Described,
+        phase: str,
+        first_action: Callable[[Any], None],
+        next_step: bool,
+    ) -> None:
+        super().__init__(recorder, described, phase, first_action)
+        self._discrete = described.kind == "step"
+        self._next_step = next_step
+        self._state_start, self._action_start = (
+            int(space.start) if self._discrete else 0  # type: ignore[attr-defined]
+            for space in (described.observation, described.action)
+        )
+        self._observation_dtype = recorder.blank(self._resets, 1).dtype["observation"]
+        self._room = 0
+        self._filled = 0
+        """Rows of the block that are in use, of `_room`."""
+        self._over = np.zeros(self._n, np.bool_)
+        self._state = np.full(self._n, -self._state_start)
+        """The states before the first row, where both spaces are discrete."""
+        self._user_resets: list[_Reset] = []
+        self._finals: list[_Final] = []
+        self._counted, self._ended_here = 0, 0
+        """Rows of the block of which `place` has counted the ends of episodes, and those ends."""
+
+    def _set_leaves(self, described: Described) -> None:
+        self._observation_leaves = leaves(
+            parts_of(described.observation, "the observation space"), "observation"
+        )
+        self._action_leaves = leaves(parts_of(described.recorded_action, "the action space"), "action")
+
+    def _make_room(self) -> None:
+        """Allocate the block; the dtype of actions is known."""
+        n = self._n
+        self._room = rows = max(1, min(_MOST_STEPS, self._recorder.capacity(self._steps) // n))
+        records = self._recorder.blank(self._steps, 1).dtype
+        action = self._action_leaves[0].base if self._discrete else records["action"]
+        self._actions = np.empty((rows, n), action)
+        self._observations = np.empty((rows, n), self._observation_dtype)
+        self._rewards = np.empty((rows, n))
+        self._terminated = np.empty((rows, n), np.bool_)
+        self._truncated = np.empty((rows, n), np.bool_)
+        self._put_action = filler(self._action_leaves, self._actions, (n,))
+        self._put_observation = filler(self._observation_leaves, self._observations, (n,))
+
+    # --- what a loop does -----------------------------------------------------------------------------
+
+    @property
+    def filled(self) -> int:
+        """Steps, of single environments, that the recorder has not taken yet."""
+        return self._filled * self._n
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """The steps of the phase so far, and how many episodes have ended."""
+        if self._counted < self._filled:
+            new = slice(self._counted, self._filled)
+            self._ended_here += int(np.count_nonzero(self._terminated[new] | self._truncated[new]))
+            self._counted = self._filled
+        return self._recorder.steps[self._phase] + self.filled, self._ended + self._ended_here
+
+    @property
+    def over(self) -> Flags:
+        """[N]: the environments whose episode ended with the last step and that were not reset since."""
+        if not self._filled:
+            return self._over
+        over: Flags = self._terminated[self._filled - 1] | self._truncated[self._filled - 1]
+        for reset in self._user_resets:
+            if reset.row == self._filled:
+                over[reset.which] = False
+        return over
+
+    @over.setter
+    def over(self, over: Flags) -> None:
+        self.commit()
+        self._over = over
+
+    def take(
+        self, actions: Any, observations: Any, rewards: Any, terminated: Any, truncated: Any, final: Any
+    ) -> None:
+        """Record a step of all environments.
+
+        Args:
+            actions: batched, as the vector environment takes it.
+            observations: batched, as it returns it.
+            rewards: [N].
+            terminated: [N].
+            truncated: [N].
+            final: the last observations of episodes that ended, where `observations` are already of the
+                next ones; None where they are not.
+        """
+        if not self._room:
+            self._settle(actions)
+            self._make_room()
+        row = self._filled
+        self._put_action(row, actions)
+        self._put_observation(row, observations)
+        if rewards.__class__ is not np.ndarray or rewards.shape != (self._n,):
+            rewards = np.asarray(rewards, np.float64).reshape(self._n)
+        self._rewards[row] = rewards
+        self._terminated[row] = terminated
+        self._truncated[row] = truncated
+        if final is not None:
+            self._keep_final(row, final)
+        self._filled = row + 1
+        if self._filled == self._room:
+            self.commit()
+
+    def _keep_final(self, row: int, final: Any) -> None:
+        which = np.flatnonzero(self._terminated[row] | self._truncated[row])
+        if len(which):
+            last = np.zeros(self._n, self._observation_dtype)
+            put_chosen(self._observation_leaves, final, last, which)
+            self._finals.append(_Final(row, which, last[which]))
+
+    def reset(self, observation: Any, seeds: Sequence[int | None], which: Flags) -> None:
+        """Record a reset of some environments; episodes under way in them end by it."""
+        chosen = np.flatnonzero(which)
+        own = [seeds[i] if len(seeds) else None for i in chosen.tolist()]
+        now = np.zeros(self._n, self._observation_dtype)
+        put_batch(self._observation_leaves, observation, now, (self._n,))
+        over = self.over
+        if self._filled and over[chosen].all():
+            self._user_resets.append(_Reset(self._filled, chosen, now[chosen], own))
+            return
+        self.commit()
+        self._abandon(chosen)
+        self._over = self._over & ~which
+        if self._discrete:
+            self._state[chosen] = now[chosen].astype(np.int64) - self._state_start
+        self._begin(chosen, now[chosen], own)
+
+    # --- blocks ---------------------------------------------------------------------------------------
+
+    def commit(self) -> None:
+        """Make the records of the block and hand them to the recorder.
+
+        Raises:
+            StorageError: the disk is full or failing.
+        """
+        rows, n = self._filled, self._n
+        if not rows:
+            return
+        first, over_after = self._recorder.steps[self._phase], self.over
+        counts = self._count()
+        self._put_records(counts, first)
+        self._recorder.steps[self._phase] += rows * n
+        row, which = np.nonzero(counts.over)
+        if len(row):
+            self._put_ends(
+                first + row * n + which,
+                counts.length[row, which],
+                counts.returns[row, which, np.newaxis],
+                self._terminated[row, which],
+                self._truncated[row, which],
+            )
+        self._put_block_resets(counts, first)
+        ended = counts.over[-1]
+        self._episode += counts.ended_before[-1]
+        self._length = np.where(ended, 0, counts.length[-1])
+        self._return = np.where(ended, 0.0, counts.returns[-1])[:, np.newaxis]
+        self._over = over_after
+        self._filled = self._counted = self._ended_here = 0
+        self._user_resets, self._finals = [], []
+
+    def _count(self) -> _Counts:
+        rows, n = self._filled, self._n
+        over = self._terminated[:rows] | self._truncated[:rows]
+        only_reset = np.zeros((rows, n), np.bool_)
+        if self._next_step:
+            only_reset[0], only_reset[1:] = self._over, over[:-1]
+            for reset in self._user_resets:
+                only_reset[reset.row : reset.row + 1, reset.which] = False
+        ended_before = np.zeros((rows + 1, n), np.int64)
+        np.cumsum(over, axis=0, out=ended_before[1:])
+        taken = np.zeros((rows + 1, n), np.int64)
+        np.cumsum(~only_reset, axis=0, out=taken[1:])
+        # What `taken` was when the episode began; its steps before the block count as taken before it.
+        began = np.where(np.vstack([np.zeros(n, np.bool_), over]), taken, -self._length)
+        np.maximum.accumulate(began, axis=0, out=began)
+        t = np.where(only_reset, schema.NEVER, taken[:-1] - began[:-1])
+        returns = self._returns(over, only_reset)
+        return _Counts(over, only_reset, ended_before, t, taken[1:] - began[:-1], returns)
+
+    def _returns(self, over: Flags, only_reset: Flags) -> NDArray[np.float64]:
+        """Return each episode's rewards, added one after the other: other orders round otherwise."""
+        sums = np.where(only_reset, 0.0, self._rewards[: len(over)])
+        carried = np.where(only_reset[0], 0.0, self._return[:, 0])
+        begin = 0
+        for end in [*np.flatnonzero(over[:-1].any(axis=1)).tolist(), len(over) - 1]:
+            part = sums[begin : end + 1]
+            part[0] += carried
+            np.add.accumulate(part, axis=0, out=part)
+            carried = np.where(over[end], 0.0, part[-1])
+            begin = end + 1
+        return sums
+
+    def _put_records(self, counts: _Counts, first: int) -> None:
+        """Fill the recorder's blocks with the records of the steps."""
+        rows, n = self._filled, self._n
+        terminated, truncated = self._terminated[:rows], self._truncated[:rows]
+        last = self._observations[:rows]
+        if self._finals:
+            last = last.copy()
+            for final in self._finals:
+                last[final.row, final.which] = final.observation
+        columns: dict[str, NDArray[Any]] = {
+            "rewards": self._rewards[:rows, :, np.newaxis],
+            "step": first + np.arange(rows * n).reshape(rows, n),
+            "episode": self._episode + counts.ended_before[:-1],
+            "t": counts.t,
+            "terminated": terminated,
+            "truncated": truncated,
+        }
+        if self._discrete:
+            columns["state"] = self._states()
+            columns["action"] = self._actions[:rows].astype(np.int64) - self._action_start
+            columns["next_state"] = last.astype(np.int64) - self._state_start
+        else:
+            columns["action"], columns["next_observation"] = self._actions[:rows], last
+            columns["acted"] = np.ones((rows, n), np.uint32)
+            columns["agents_terminated"], columns["agents_truncated"] = terminated, truncated
+        flat = {name: values.reshape(rows * n, *values.shape[2:]) for name, values in columns.items()}
+        positions = sum(self._recorder.steps.values()) + np.arange(1, rows * n + 1, dtype=np.uint64)
+        done = 0
+        while done < rows * n:
+            block = self._recorder.block(self._steps)[: rows * n - done]
+            part = slice(done, done + len(block))
+            for name, values in flat.items():
+                block[name] = values[part]
+            self._recorder.take(self._steps, positions[part])
+            done += len(block)
+
+    def _states(self) -> NDArray[np.int64]:
+        """Return the states before each row; keep those after the last."""
+        states = np.empty((self._filled + 1, self._n), np.int64)
+        states[0], states[1:] = self._state, self._observations[: self._filled]
+        states[1:] -= self._state_start
+        for reset in self._user_resets:
+            states[reset.row, reset.which] = reset.observation.astype(np.int64) - self._state_start
+        self._state = states[-1].copy()
+        return states[:-1]
+
+    def _put_block_resets(self, counts: _Counts, first: int) -> None:
+        """Record the resets between and within the steps of the block, in their order."""
+        only_rows, only = np.nonzero(counts.only_reset)
+        # The row after each reset, its order among those before that row, environments, observations, seeds.
+        found: list[tuple[Any, int, NDArray[Any], NDArray[Any], Sequence[int | None]]] = [
+            (only_rows, 2, only, self._observations[only_rows, only], [None] * len(only))
+        ]
+        for final in self._finals:
+            after = self._observations[final.row, final.which]
+            found.append((final.row + 1, 0, final.which, after, [None] * len(final.which)))
+        found += [(reset.row, 1, reset.which, reset.observation, reset.seeds) for reset in self._user_resets]
+        rows = np.concatenate([np.broadcast_to(entry[0], len(entry[2])) for entry in found])
+        if not len(rows):
+            return
+        orders = np.repeat([entry[1] for entry in found], [len(entry[2]) for entry in found])
+        order = np.argsort(3 * rows + orders, kind="stable")
+        which = np.concatenate([entry[2] for entry in found])[order]
+        seeds = [seed for entry in found for seed in entry[4]]
+        self._put_resets(
+            which,
+            np.concatenate([entry[3] for entry in found])[order],
+            [seeds[i] for i in order.tolist()],
+            self._episode[which] + counts.ended_before[rows[order], which],
+            first + rows[order] * self._n,
+        )

@@ -1,0 +1,129 @@
+"""What people say of a run: another name, tags, a note.
+
+    recordings/k3v9m2xq/labels.json      {"name": "patient", "tags": ["keep"], "note": "the one of figure 3"}
+
+It stands beside `run.json`, which its owner rewrites while it trains, so that the two never meet. It is
+replaced whole, under a lock.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from runner.errors import RunnerError, StorageError
+from runner.util.files import read_object, write_whole
+from runner.util.opening import is_utf8
+
+LABELS_FILE: Final = "labels.json"
+LOCK_FILE: Final = "labels.lock"
+KEEP: Final = "keep"
+"""The tag of a run that is not to be removed."""
+MAX_LABELS_BYTES: Final = 1 << 20
+MAX_NOTE: Final = 10_000
+MAX_TAGS: Final = 100
+LOCK_SECONDS: Final = 30.0
+
+_TAG: Final = re.compile(r"\w[\w.=+/@-]{0,63}")
+TAG_EXPECTED: Final = "1 to 64 letters, digits or any of _ . - = + / @, the first a letter, digit or _"
+RUN_NAME_PATTERN: Final = r"^[A-Za-z0-9_][A-Za-z0-9_.+/-]{0,99}$"
+"""Names of runs; a configuration's name, from which folders are named, has no `+` and no `/`."""
+RUN_NAME_EXPECTED: Final = (
+    "1 to 100 letters, digits, '_', '.', '-', '+' or '/', not starting with one of the last four"
+)
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What people say of a run."""
+
+    name: str = ""
+    """What it is called now; empty if as in the beginning."""
+    tags: tuple[str, ...] = ()
+    """In alphabetical order, each once."""
+    note: str = ""
+
+
+def read_labels(folder: Path) -> Labels:
+    """Return what is said of the run in a folder; what cannot be understood counts as not said."""
+    try:
+        found = read_object(folder / LABELS_FILE, MAX_LABELS_BYTES)
+    except (OSError, ValueError):
+        return Labels()
+    return labels_from(found)
+
+
+def are_readable(folder: Path) -> bool:
+    """Return whether it can be known what is said of the run in a folder: a damaged file may say `keep`."""
+    try:
+        return isinstance(read_object(folder / LABELS_FILE, MAX_LABELS_BYTES).get("tags", []), list)
+    except FileNotFoundError:
+        return True
+    except (OSError, ValueError):
+        return False
+
+
+def labels_from(found: Mapping[str, Any]) -> Labels:
+    """Return what is said by a JSON object; what cannot be understood counts as not said."""
+    name, tags, note = found.get("name"), found.get("tags"), found.get("note")
+    sound = [tag for tag in tags if is_tag(tag)] if isinstance(tags, list) else []
+    return Labels(
+        name if isinstance(name, str) and name.isprintable() and len(name) <= 100 else "",
+        tuple(sorted(set(sound))[:MAX_TAGS]),
+        note[:MAX_NOTE] if isinstance(note, str) else "",
+    )
+
+
+def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
+    """Change what is said of the run in a folder, and return it; other processes wait meanwhile.
+
+    Args:
+        folder: the run's.
+        change: gets what is said, and returns what is to be said.
+
+    Raises:
+        RunnerError: there are too many tags, or the note is too long.
+        StorageError: the folder cannot be written.
+    """
+    from filelock import FileLock, Timeout
+
+    try:
+        with FileLock(folder / LOCK_FILE, timeout=LOCK_SECONDS):
+            before = read_labels(folder)
+            after = change(before)
+            _check(after)
+            if after != before:
+                write_whole(folder / LABELS_FILE, as_json(after))
+            return after
+    except Timeout as error:
+        raise StorageError(
+            f"{folder / LOCK_FILE}: another process has held it for {LOCK_SECONDS:.0f} s; try again."
+        ) from error
+    except OSError as error:
+        raise StorageError(f"{folder / LABELS_FILE}: cannot be written ({error.strerror}).") from error
+
+
+def is_tag(text: Any) -> bool:
+    """Return whether this can be a tag."""
+    return isinstance(text, str) and _TAG.fullmatch(text) is not None
+
+
+def _check(labels: Labels) -> None:
+    for tag in labels.tags:
+        if not is_tag(tag):
+            raise RunnerError(f"tag: found {tag!r}, expected {TAG_EXPECTED}.")
+    if len(labels.tags) > MAX_TAGS:
+        raise RunnerError(f"tag: found {len(labels.tags)} tags, expected at most {MAX_TAGS}.")
+    if not is_utf8(labels.note):
+        raise RunnerError(f"note: found {labels.note[:100]!r}, expected text in UTF-8.")
+    if len(labels.note) > MAX_NOTE:
+        raise RunnerError(f"note: found {len(labels.note):,} characters, expected at most {MAX_NOTE:,}.")
+
+
+def as_json(labels: Labels) -> dict[str, Any]:
+    """Return labels as their file has them; what is not said is left out."""
+    told = {"name": labels.name, "tags": list(labels.tags), "note": labels.note}
+    return {key: value for key, value in told.items() if value}

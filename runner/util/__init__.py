@@ -1,0 +1,1 @@
+"""Small functions that know nothing of runs: files, numbers in words, hashes."""

@@ -1,0 +1,77 @@
+"""The recordings kept for ever are read, verified and time-travelled as on the day they were made."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from runner.execution.verify import verify
+from runner.recording import open as open_recording
+from runner.recording import schema
+from runner.replay.history import history_of
+from tests.data.make import LOOPS, NAMES, TOGETHER, expectations, loop_expectations
+
+DATA = Path(__file__).parents[2] / "data"
+EXPECTED = json.loads((DATA / "digests.json").read_text())
+
+
+@pytest.fixture(params=NAMES)
+def name(request):
+    return request.param
+
+
+def test_what_they_hold(name):
+    assert expectations(DATA / f"{name}.mcap") == EXPECTED[name]
+    assert (DATA / f"{name}.mcap").stat().st_size < 150_000
+
+
+@pytest.mark.parametrize("rerun", [False, True], ids=["recorded environment", "installed environment"])
+def test_they_are_what_their_jobs_give(name, rerun):
+    found = verify(DATA / f"{name}.mcap", rerun=rerun)
+    assert found.finding == ""
+    assert found.content_digest == EXPECTED[name]["content_digest"]
+    assert not any(key.startswith("environment.") for key in found.provenance)
+
+
+def test_they_have_every_kind_of_message(name):
+    assert set(EXPECTED[name]["messages"]) == {topic.name for topic in schema.TOPICS}
+
+
+def test_each_state_has_its_history(name):
+    with open_recording(DATA / f"{name}.mcap") as recording:
+        steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
+        state = int(np.bincount(steps["state"]).argmax())
+        history = history_of(recording, state, len(steps))
+        assert history.visits[0].sum() == (steps["state"] == state).sum()
+        assert history.changed_step.max() < len(steps)
+
+
+@pytest.mark.parametrize("name", [*LOOPS, *TOGETHER])
+def test_what_kept_loops_hold(name):
+    path = DATA / f"{name}.mcap"
+    assert loop_expectations(path) == EXPECTED[name]
+    found = verify(path)
+    assert found.finding == ""
+    assert found.content_digest == EXPECTED[name]["content_digest"]
+    assert path.stat().st_size < 50_000
+
+
+def test_what_happened_side_by_side_is_told_apart():
+    with open_recording(DATA / "vector.mcap") as recording:
+        assert recording.environments == 3
+        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        assert len(steps) == 80 * 3
+        assert (steps["t"] == schema.NEVER).any()
+    with open_recording(DATA / "game.mcap") as recording:
+        played = list(recording.transitions("train"))
+        assert [int(one["acted"]) for one in played[:3]] == [0b111, 0b110, 0b100]
+        assert [int(one["agents_terminated"]) for one in played[:3]] == [0b001, 0b010, 0b100]
+
+
+def test_kept_loops_have_every_kind_of_message_but_frames():
+    kept = {topic for name in (*LOOPS, *TOGETHER) for topic in EXPECTED[name]["messages"]}
+    every = {topic.name for name in schema.LOOP_TOPICS for topic in schema.KINDS[name]}
+    assert kept == every - {"/train/frame", "/eval/frame"}

@@ -1,0 +1,533 @@
+"""What is recorded from a loop is listed, plotted, compared, checked and packed like every other run."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pandas
+import pytest
+from click.testing import CliRunner
+from starlette.testclient import TestClient
+
+import runner
+from runner.analysis import frames
+from runner.analysis.readings import read_series
+from runner.cli import cli
+from runner.export.contents import shortcomings
+from runner.recording import schema
+from runner.recording.reader import open_recording
+from runner.recording.run_file import Summary
+from runner.service.app import create_app
+from runner.service.settings import Settings
+from tests.runner.loops.making import Rooms, make, play
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory):
+    """Return a recordings folder with loops of each kind, and one like another but for its seed."""
+    made = tmp_path_factory.mktemp("loops-told")
+    for name, env_id, seed in (
+        ("lake", "FrozenLake-v1", 0),
+        ("again", "FrozenLake-v1", 0),
+        ("other", "FrozenLake-v1", 1),
+        ("pole", "CartPole-v1", 0),
+        ("rooms", "RoomsText", 0),
+    ):
+        with runner.record(make(env_id), made, name=name, seed=seed, config={"lr": 0.5}) as env:
+            for k, entry in enumerate(play(env, 400, seed)):
+                if entry[0] == "step":
+                    env.log("loss", 1 / (k + 1))
+            with env.phase("eval"):
+                list(play(env, 60, seed))
+            env.log("note", "done")
+    return made
+
+
+def dualtaxi(folder: Path, *words: str) -> Any:
+    """Run a command; nothing it says is a traceback."""
+    done = CliRunner().invoke(cli, [*words, "--recordings", str(folder)])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done
+
+
+def test_ls_and_show_tell_of_loops(folder):
+    listed = json.loads(dualtaxi(folder, "ls", "--json").stdout)
+    assert {run["name"] for run in listed} == {"lake", "again", "other", "pole", "rooms"}
+    told = json.loads(dualtaxi(folder, "show", "pole", "--json").stdout)
+    assert (told["train_steps"], told["eval_steps"]) == (400, 60)
+    assert told["config"]["made_by"] == "runner.record"
+    assert dualtaxi(folder, "show", "rooms").exit_code == 0
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_ls_and_show_have_the_returns_of_a_loop_and_what_it_logged(folder, name):
+    with open_recording(runner.find_run(name, folder).recording) as recording:
+        trials = recording.episodes("eval", 0, None)
+        episodes = recording.episodes("train", 0, None)[-100:]
+    row = next(run for run in json.loads(dualtaxi(folder, "ls", "--json").stdout) if run["name"] == name)
+    assert row["mean_return"] == pytest.approx(trials["returns"].sum(axis=1).mean())
+    assert row["mean_length"] == pytest.approx(trials["length"].mean())
+    assert row["logged"].keys() == {"loss"}
+    assert (row["success_percent"] is None) == (name != "lake")
+    listed = dualtaxi(folder, "ls", "--columns", "name,mean_return,logged", name).stdout
+    assert f"{row['mean_return']:,.1f}" in listed
+    assert f"loss {row['logged']['loss']:.4g}" in listed
+
+    shown = json.loads(dualtaxi(folder, "show", name, "--json").stdout)
+    assert [record["trials"] for record in shown["eval"]] == [len(trials)]
+    assert shown["eval"][0]["mean_length"] == pytest.approx(trials["length"].mean())
+    assert shown["loop"]["logged"] == row["logged"]
+    recent = shown["loop"]["recent_training"]
+    assert recent["episodes"] == len(episodes)
+    assert recent["mean_return"] == pytest.approx(episodes["returns"].sum(axis=1).mean())
+    text = dualtaxi(folder, "show", name).stdout
+    assert "Evaluations" in text
+    assert f"mean return {recent['mean_return']:,.1f}" in text
+    assert "logged loss" in text
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_what_a_loop_says_of_itself_at_its_end_is_what_its_recording_holds(folder, name):
+    run = runner.find_run(name, folder)
+    with open_recording(run.recording) as recording:
+        counted = frames.loop_summary(recording)
+        assert counted["last_evaluation"] == pytest.approx(recording.result["last_evaluation"])
+        assert counted["recent_training"] == pytest.approx(recording.result["recent_training"])
+        recording.result = Summary()  # as in recordings made before, which say nothing of logged values
+        assert frames.loop_summary(recording)["logged"] == counted["logged"]
+
+
+def test_a_report_does_not_say_that_a_loop_learns(folder, tmp_path):
+    dualtaxi(folder, "report", "lake", "-o", str(tmp_path / "report.html"))
+    page = (tmp_path / "report.html").read_text()
+    assert "by trial and error" not in page
+    assert "A loop over <b>FrozenLake-v1</b>" in page
+    assert "No evaluation was recorded" not in page
+    assert '<th scope="col">trials</th>' in page
+    assert "<code>dualtaxi view</code>" in page
+
+
+def test_pages_of_a_loop_show_its_evaluations_and_link_to_no_replay(folder, tmp_path):
+    settings = Settings(recordings=(folder,), tokens=tmp_path / "tokens.json")
+    with TestClient(create_app(settings), base_url="http://localhost") as client:
+
+        def page(address):
+            answer = client.get(address, headers={"Accept": "text/html"})
+            assert answer.status_code == 200
+            return answer.text
+
+        for name in ("lake", "pole"):
+            evaluations = page(f"/runs/{name}/evaluations")
+            assert "No evaluation was recorded" not in evaluations
+            assert "/replay/" not in evaluations + page(f"/runs/{name}/episodes")
+            overview = page(f"/runs/{name}")
+            assert "Mean return in the last evaluation" in overview
+            assert "Logged last: loss" in overview
+            assert "<dd>–</dd>" not in overview
+        compared = page("/compare?run=lake&run=pole")
+        assert "Mean return in the last evaluation" in compared
+        answer = client.get("/api/v1/runs/pole/evaluations").json()
+        assert answer["total"] == len(answer["records"]) == 1
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_plot_and_report_draw_loops(folder, name, tmp_path):
+    plotted = dualtaxi(folder, "plot", name, "-o", str(tmp_path / "plot.svg"))
+    assert plotted.exit_code == 0
+    drawn = (tmp_path / "plot.svg").read_text()
+    assert "Logged: loss" in drawn
+    assert "Return of training episodes" in drawn
+    assert "Return of evaluation trials" in drawn
+    assert dualtaxi(folder, "report", name, "-o", str(tmp_path / "report.html")).exit_code == 0
+    page = (tmp_path / "report.html").read_text()
+    assert "from a loop" in page
+    assert "no steps were recorded" not in page
+    assert "No evaluation was recorded" not in page
+
+
+def test_diff_says_where_loops_part(folder):
+    same = dualtaxi(folder, "diff", "lake", "again")
+    assert same.exit_code == 0
+    assert "the same, to the last byte" in same.stdout
+    differing = json.loads(dualtaxi(folder, "diff", "lake", "other", "--json").stdout)
+    parting = differing["parting"]
+    with (
+        open_recording(runner.find_run("lake", folder).recording) as a,
+        open_recording(runner.find_run("other", folder).recording) as b,
+    ):
+        left, right = (next(recording.blocks(schema.TRAIN_STEP)) for recording in (a, b))
+    names = [name for name in left.dtype.names if not name.startswith("tag_")]
+    first = next(k for k in range(len(left)) if left[k][names].tolist() != right[k][names].tolist())
+    assert parting["step"] == first
+    assert parting["field"] in ("state", "action", "next_state")
+    foreign = dualtaxi(folder, "diff", "pole", "rooms")
+    assert foreign.exit_code == 1
+    assert "other spaces" in foreign.stdout
+
+
+def test_loops_that_have_their_seed_among_their_settings_are_one_group(tmp_path):
+    for seed in (1, 2):
+        for rate in (0.1, 0.2):
+            args = {"seed": seed, "lr": rate}
+            with runner.record(make("CartPole-v1"), tmp_path, name="pole", seed=seed, config=args) as env:
+                list(play(env, 50, seed))
+    told = json.loads(dualtaxi(tmp_path, "compare", "pole", "--json").stdout)
+    assert {label: len(ids) for label, ids in told["groups"].items()} == {
+        "pole, config.lr=0.1": 2,
+        "pole, config.lr=0.2": 2,
+    }
+    dualtaxi(tmp_path, "plot", "pole", "-o", str(tmp_path / "plot.svg"))
+    assert (tmp_path / "plot.svg").read_text().count("2 runs: ") == 2
+
+
+def told_of_two(folder: Path, tested: int = 0, logged: float = 0.0) -> str:
+    """Record the loops `one` and `two`, of which two was tested and logged so; return their diff."""
+    for name, seed, value in (("one", 0, 0.0), ("two", tested, logged)):
+        with runner.record(make("CartPole-v1"), folder, name=name) as env:
+            list(play(env, 50, 0))
+            with env.phase("eval"):
+                list(play(env, 50, seed))
+            env.log("loss", value)
+    told = dualtaxi(folder, "diff", "one", "two")
+    assert told.exit_code == 1
+    return str(told.stdout)
+
+
+def test_diff_says_where_evaluations_of_loops_part(tmp_path):
+    told = told_of_two(tmp_path, tested=1)
+    assert "Training took the same steps, evaluation did not." in told
+    assert "They part in the reset before evaluation step 0" in told
+    parted = json.loads(dualtaxi(tmp_path, "diff", "one", "two", "--json").stdout)
+    assert (parted["parting"], parted["loop_evaluation"]["step"]) == (None, 0)
+    page = tmp_path / "diff.html"
+    dualtaxi(tmp_path, "diff", "one", "two", "--html", str(page))
+    assert "They part in the reset before evaluation step 0" in page.read_text()
+
+
+def test_diff_says_what_differs_between_loops_of_the_same_steps(tmp_path):
+    told = told_of_two(tmp_path, logged=1.0)
+    assert "all steps are the same; what differs is in /scalar." in told
+
+
+class Pictures(gymnasium.Env[Any, Any]):
+    """Observes many numbers, of which one is what it was made with."""
+
+    observation_space = gymnasium.spaces.Dict({"picture": gymnasium.spaces.Box(0, 255, (9, 9), np.uint8)})
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return {"picture": np.zeros((9, 9), np.uint8)}, {}
+
+    def step(self, action: Any) -> Any:
+        picture = np.zeros((9, 9), np.uint8)
+        picture[3, 4] = self.number
+        return {"picture": picture}, 0.0, True, False, {}
+
+
+class Starts(gymnasium.Env[Any, Any]):
+    """Begins one of its episodes where it is told, and otherwise is always the same."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, start: float) -> None:
+        self.start, self.episode = start, -1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.episode, self.t = self.episode + 1, 0
+        return np.full(2, self.start if self.episode == 2 else 0, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        return np.ones(2, np.float32), 0.0, self.t == 3, False, {}
+
+
+def test_diff_names_the_reset_in_which_loops_part(tmp_path):
+    for start, actions in ((0.25, 0), (0.75, 0), (0.5, 1)):
+        with runner.record(Starts(start), tmp_path, name=f"at{start:g}") as env:
+            for episode in range(4):
+                env.reset()
+                for _ in range(3):
+                    env.step(actions if episode == 2 else 0)
+    for other in ("0.75", "0.5"):  # the actions of the last differ too, but after the reset
+        told = dualtaxi(tmp_path, "diff", "at0.25", f"at{other}").stdout
+        assert "They part in the reset before training step 6, of episode 2: observation is [0.25, " in told
+        assert f" in A, [{other}, " in told
+    parted = json.loads(dualtaxi(tmp_path, "diff", "at0.25", "at0.5", "--json").stdout)["parting"]
+    assert (parted["step"], parted["episode"], parted["field"]) == (6, 2, "reset.observation")
+
+
+def test_diff_of_pictures_tells_the_number_that_differs(tmp_path):
+    for number in (7, 8):
+        with runner.record(Pictures(number), tmp_path, name=f"of{number}") as env:
+            env.reset()
+            env.step(1)
+    parting = json.loads(dualtaxi(tmp_path, "diff", "of7", "of8", "--json").stdout)["parting"]
+    assert (parting["field"], parting["a"], parting["b"]) == ("next_observation.picture[3, 4]", 7, 8)
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_verify_checks_what_can_be_checked(folder, name):
+    told = dualtaxi(folder, "verify", name)
+    assert told.exit_code == 0
+    assert "which alone can do it again" in told.output
+
+
+def test_verify_finds_a_digest_that_is_not_its_messages(folder, tmp_path):
+    from runner.execution.verify import verify
+    from runner.recording.rewriting import rewrite
+
+    def other(name: str, entries: dict[str, str]) -> dict[str, str]:
+        if name != "result":
+            return entries
+        result = json.loads(entries["json"])
+        return {"json": json.dumps(result | {"content_digest": "0" * 64}, sort_keys=True)}
+
+    altered = tmp_path / "recording.mcap"
+    rewrite(runner.find_run("pole", folder).recording, altered, other)
+    assert "content_digest: found 000" in verify(altered).finding
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("evaluate", "pole"),
+        ("qtable", "lake"),
+        ("play", "pole"),
+        ("play", "rooms"),
+        ("export", "gif", "pole", "-o", "x.gif"),
+    ],
+    ids=" ".join,
+)
+def test_what_a_loop_has_not_is_refused_in_a_sentence(folder, words):
+    done = dualtaxi(folder, *words)
+    assert done.exit_code == 2
+    assert "loop" in done.output
+
+
+def test_the_grid_of_a_loop_becomes_a_film(folder, tmp_path):
+    done = dualtaxi(folder, "export", "gif", "lake", "--episode", "2", "-o", str(tmp_path / "film.gif"))
+    assert done.exit_code == 0, done.output
+    with open_recording(runner.find_run("lake", folder).recording) as recording:
+        steps = len(recording.episode_steps("train", 2))
+    assert f"training episode 2, {steps + 1} frames" in done.stdout
+
+
+def test_an_evaluation_of_a_loop_is_played(folder):
+    with open_recording(runner.find_run("lake", folder).recording) as recording:
+        trained = recording.count(schema.TRAIN_EPISODE)
+        second = recording.episode_steps("eval", 1)["state"].tolist()
+    done = dualtaxi(folder, "play", "lake", "--eval", f"{trained}:1", "--json")
+    assert done.exit_code == 0, done.output
+    assert [json.loads(line)["state"] for line in done.stdout.splitlines()] == second
+    assert f"it has 1, the nearest after {trained}" in dualtaxi(folder, "play", "lake", "--eval", "1").output
+
+
+def test_the_grid_of_a_loop_is_played(folder):
+    done = dualtaxi(folder, "play", "lake", "--episode", "2")
+    assert done.exit_code == 0
+    assert "player" in done.stdout
+
+
+def test_a_loop_is_packed_and_unpacked_to_the_same_bytes(folder, tmp_path):
+    assert dualtaxi(folder, "pack", "rooms", "-o", str(tmp_path / "rooms.pack")).exit_code == 0
+    done = CliRunner().invoke(
+        cli, ["unpack", str(tmp_path / "rooms.pack"), "--recordings", str(tmp_path / "there")]
+    )
+    assert done.exit_code == 0, done.output
+    there = runner.find_run("rooms", tmp_path / "there")
+    assert there.summary["content_digest"] == runner.find_run("rooms", folder).summary["content_digest"]
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_a_loop_is_archived_looked_at_and_restored(folder, name, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    there = Path(shutil.copytree(folder, tmp_path / "loops"))
+    digest = runner.find_run(name, there).summary["content_digest"]
+    told = json.loads(dualtaxi(there, "archive", name, "--remove", "--json").stdout)
+    assert told["content_digest"] == digest
+    assert told["removed"]
+    assert dualtaxi(there, "plot", name, "-o", str(tmp_path / "plot.svg")).exit_code == 0
+    original = runner.find_run(name, folder).recording
+    assert dualtaxi(there, "diff", name, str(original)).exit_code == 0
+    assert dualtaxi(there, "restore", name).exit_code == 0
+    assert runner.find_run(name, there).summary["content_digest"] == digest
+    assert dualtaxi(there, "verify", name).exit_code == 0
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_a_loops_steps_are_exported_as_tables(folder, form, name, tmp_path):
+    done = dualtaxi(folder, "export", form, name, "-o", str(tmp_path / "tables"))
+    assert done.exit_code == 0, done.output
+    read = pandas.read_csv if form == "csv" else pandas.read_parquet
+    steps, resets = (read(tmp_path / "tables" / f"{table}.{form}") for table in ("steps", "resets"))
+    with open_recording(runner.find_run(name, folder).recording) as recording:
+        seen = [step for phase in ("train", "eval") for step in recording.transitions(phase)]
+        count = recording.count(recording.topic("/train/reset"))
+    steps = steps.sort_values("position")
+    assert steps["t"].tolist() == [step["t"] for step in seen]
+    assert steps["reward"].tolist() == [step["rewards"][0] for step in seen]
+    assert len(resets.query("phase == 'train'")) == count
+    if name == "pole":
+        numbers = steps[[f"next_observation_{i}" for i in range(4)]].to_numpy(np.float32)
+        np.testing.assert_array_equal(numbers, [step["next_observation"] for step in seen])
+    if name == "rooms":
+        missions = [step["next_observation"]["mission"] for step in seen]
+        assert steps["next_observation_mission"].fillna("").tolist() == missions
+
+
+def test_csv_says_what_it_leaves_out(tmp_path):
+    class Camera(Rooms):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8)
+
+    with runner.record(Camera(), tmp_path / "loops", name="camera") as rec:
+        list(play(rec, 20))
+    done = dualtaxi(tmp_path / "loops", "export", "csv", "camera", "-o", str(tmp_path / "tables"))
+    assert done.exit_code == 0
+    assert "Left out, as CSV cannot hold their bytes: next_observation, observation" in done.output
+
+
+def test_a_killed_loop_is_told_mended_and_compared(folder, tmp_path):
+    whole = runner.find_run("pole", folder)
+    cut = tmp_path / "k" / "recording.mcap"
+    cut.parent.mkdir()
+    cut.write_bytes(whole.recording.read_bytes()[:-2000])
+    for words in (("ls",), ("show", str(cut)), ("verify", str(cut))):
+        dualtaxi(tmp_path, *words)
+    mended = dualtaxi(tmp_path, "repair", str(cut))
+    assert "resets" in mended.output
+    assert dualtaxi(tmp_path, "show", str(cut)).exit_code == 0
+    assert dualtaxi(tmp_path, "diff", str(cut), str(whole.recording)).exit_code in (0, 1)
+
+
+def test_an_interrupted_loop_is_not_resumed(tmp_path):
+    env = runner.record(make("FrozenLake-v1"), tmp_path, name="cut")
+    list(play(env, 50))
+    env._loop.close("interrupted")
+    before = env.run.recording.read_bytes()
+    done = dualtaxi(tmp_path, "resume", "cut")
+    assert done.exit_code == 2
+    assert "which alone can do it again" in done.output
+    assert env.run.recording.read_bytes() == before
+
+
+def test_a_loop_that_took_no_step_is_told_nothing_that_it_cannot_do(tmp_path):
+    with runner.record(make("FrozenLake-v1"), tmp_path, name="none") as env:
+        env.reset(seed=0)
+        env._loop.close("failed")
+    for words in (("rerecord", "none"), ("export", "gif", "none", "-o", str(tmp_path / "x.gif"))):
+        done = dualtaxi(tmp_path, *words)
+        assert done.exit_code == 2
+        assert "loop" in done.output
+        assert "dualtaxi re" not in done.output
+
+
+@pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
+def test_rerun_gets_what_a_loop_recorded(folder, name, tmp_path):
+    from rerun.chunk import RrdReader
+
+    exported = dualtaxi(folder, "export", "rerun", name, "-o", str(tmp_path / "loop.rrd"))
+    assert exported.exit_code == 0, exported.output
+    assert "400 of 400 training steps" in exported.output
+    store = RrdReader(str(tmp_path / "loop.rrd")).store()
+    paths = {str(column.entity_path) for column in store.schema().component_columns()}
+    assert {"/train/return", "/eval/return", "/train/reward", "/logged/loss", "/log"} <= paths
+    assert ("/train/grid/things" in paths) == (name == "lake")
+    assert ("/train/observation" in paths) == (name == "pole")
+    if name == "pole":
+        chunks = store.stream().filter(content="/train/observation").to_chunks()
+        (static,) = [chunk.to_record_batch() for chunk in chunks if chunk.is_static]
+        colours = static.column("SeriesLines:colors")[0].as_py()
+        assert len(set(colours)) == len(colours) == 4, "no two lines look alike"
+        assert static.column("SeriesLines:aggregation_policy")[0].as_py() == [5], "lowest and highest"
+
+
+def test_rerun_gets_a_loop_of_a_single_step_and_episode(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path, name="single") as env:
+        env.reset(seed=0)
+        env.step(0)
+    words = [sys.executable, "-m", "runner", "export", "rerun", "single", "-o", str(tmp_path / "single.rrd")]
+    words += ["--recordings", str(tmp_path)]
+    exported = subprocess.run(words, check=False, capture_output=True, text=True)
+    assert exported.returncode == 0, exported.stderr
+    assert "1 of 1 training steps" in exported.stderr
+
+
+@pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan"), 1e308])
+def test_values_that_are_not_finite_are_left_out_of_curves_and_counted(value, tmp_path):
+    """One infinite reward used to end `plot` and `report` in a traceback."""
+    env = gymnasium.wrappers.TransformReward(make("FrozenLake-v1"), lambda reward: value or reward)
+    with runner.record(env, tmp_path, name="bad") as recorded:
+        list(play(recorded, 40, 0))
+        recorded.log("loss", value)
+        value = 0.0
+        list(play(recorded, 200, 1))
+        recorded.log("loss", 0.25)
+    said = "“Return of training episodes”, 1 value of “Logged: loss”."
+    for command, file in (("plot", "plot.svg"), ("report", "report.html")):
+        done = dualtaxi(tmp_path, command, "bad", "-o", str(tmp_path / file))
+        assert done.exit_code == 0
+        assert said in done.stderr
+        assert "Return of training episodes" in (tmp_path / file).read_text()
+    with open_recording(runner.find_run("bad", tmp_path).recording) as recording:
+        series = read_series(recording)
+    drawn = [
+        reading
+        for _, readings in series.training
+        for lines in readings.values()
+        for reading in lines.values()
+    ]
+    assert np.isfinite(drawn).all()
+    assert 0.25 in drawn
+    assert series.not_finite["training.mean_return"] >= 1
+
+
+def test_a_new_name_is_in_every_picture_report_and_export(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "runs")
+    dualtaxi(tmp_path / "runs", "rename", "lake", "mountain")
+    run = runner.find_run("mountain", tmp_path / "runs")
+    with open_recording(run.recording) as recording:
+        assert recording.name == read_series(recording).name == "mountain"
+    for words in (("plot", "mountain", "-o", "plot.svg"), ("report", "mountain", "-o", "report.html")):
+        made = tmp_path / words[-1]
+        assert dualtaxi(tmp_path / "runs", *words[:-1], str(made)).exit_code == 0
+        assert "mountain" in made.read_text()
+        assert "lake, seed" not in made.read_text()
+    told = json.loads(dualtaxi(tmp_path / "runs", "diff", "mountain", "other", "--json").stdout)
+    assert (told["a"]["name"], told["b"]["name"]) == ("mountain", "other")
+
+
+def test_a_loop_that_runs_is_told_as_running(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path / "runs", name="now") as env:
+        list(play(env, 300, 0))
+        env.commit() if hasattr(env, "commit") else None
+        run = runner.find_run("now", str(tmp_path / "runs"))
+        assert run.status == "running"
+        if run.recording.exists():
+            with open_recording(run.recording) as recording:
+                assert recording.status == "running"
+                assert "is still running" in shortcomings(recording)[0]
+    with open_recording(run.recording) as recording:
+        assert recording.status == "finished"
+
+
+def test_a_run_is_found_by_text_and_in_the_usual_folder(folder, monkeypatch):
+    found = runner.find_run("lake", str(folder))
+    monkeypatch.setenv("DUALTAXI_RECORDINGS", str(folder))
+    assert runner.find_run("lake") == found
+    assert {run.run_id for run in runner.list_runs()} == {run.run_id for run in runner.list_runs(folder)}
+    assert found.run_id in repr(found)
+    assert len(repr(found)) < 300

@@ -1,0 +1,193 @@
+"""Values are recorded exactly, or the loop is warned or stopped; an info that cannot be recorded is named."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+
+import runner
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.integrity import check_integrity
+from runner.recording.reader import open_recording
+from tests.runner.loops.making import make
+
+
+class Sensor(gymnasium.Env[Any, Any]):
+    """An environment whose observations and infos the test sets."""
+
+    observation_space: spaces.Space[Any] = spaces.Box(-1, 1, (2,), np.float32)
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, observation: Any = (0.0, 0.0)) -> None:
+        self.observation, self.info = observation, {}
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return self.observation, 0.0, False, False, self.info
+
+
+def steps_of(run: Any) -> Any:
+    with open_recording(run.recording) as recording:
+        return np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+
+
+def test_an_observation_that_is_rounded_late_is_warned_of_once(tmp_path):
+    env = Sensor(np.zeros(2, np.float32))
+    with runner.record(env, tmp_path) as rec:
+        rec.reset()
+        for _ in range(5):
+            rec.step(0)
+        env.observation = np.array([0.5, 0.25])
+        rec.step(0)
+        env.observation = np.array([0.1, 0.2])
+        with pytest.warns(RuntimeWarning, match="observation comes as float64") as warned:
+            list(map(rec.step, [0, 0]))
+    assert len(warned) == 1
+    assert warned[0].filename == __file__
+
+
+@pytest.mark.parametrize("observation", [0.5, np.float32(0.5), np.zeros((1, 2), np.float32), [1, 2, 3]])
+def test_an_observation_of_another_shape_is_refused(tmp_path, observation):
+    env = Sensor(np.zeros(2, np.float32))
+    with runner.record(env, tmp_path) as rec:
+        rec.reset()
+        rec.step(0)
+        env.observation = observation
+        with pytest.raises(RecordingError, match=r"found observation of shape .*, expected \(2,\)"):
+            rec.step(0)
+
+
+def pendulum_actions(n: int) -> list[Any]:
+    return list(np.random.default_rng(0).uniform(-2, 2, (n, 1)))
+
+
+@pytest.mark.parametrize("frames", [0, 10])
+def test_float64_actions_of_a_float32_space_are_recorded_exactly(tmp_path, frames):
+    env = gymnasium.make("Pendulum-v1")
+    actions = pendulum_actions(300)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with runner.record(env, tmp_path, config={"frames": frames}) as rec:
+            rec.reset(seed=1)
+            with rec.phase("eval"):
+                rec.reset(seed=2)
+            rec.log("before", 1.0)
+            for action in actions:
+                rec.step(action)
+    assert np.array_equal(steps_of(rec.run)["action"], np.array(actions))
+    check_integrity(rec.run.recording)
+
+
+def test_float32_actions_are_recorded_as_before(tmp_path):
+    with runner.record(gymnasium.make("Pendulum-v1"), tmp_path) as rec:
+        rec.reset(seed=1)
+        rec.step(np.array([0.1], np.float32))
+    assert steps_of(rec.run)["action"].dtype == np.float32
+
+
+def test_float64_actions_of_a_vector_are_recorded_exactly(tmp_path):
+    envs = SyncVectorEnv([lambda: gymnasium.make("Pendulum-v1")] * 3)
+    actions = np.random.default_rng(0).uniform(-2, 2, (20, 3, 1))
+    with runner.record_vector(envs, tmp_path) as rec:
+        rec.reset(seed=1)
+        for action in actions:
+            rec.step(action)
+    assert np.array_equal(steps_of(rec.run)["action"].reshape(actions.shape), actions)
+    check_integrity(rec.run.recording)
+
+
+def test_a_recording_that_took_no_step_is_whole(tmp_path):
+    with runner.record(gymnasium.make("Pendulum-v1"), tmp_path) as rec:
+        rec.reset(seed=1)
+    check_integrity(rec.run.recording)
+    assert rec.run.summary["messages"] == {"/train/reset": 1}
+
+
+def infos(run: Any) -> list[Any]:
+    with open_recording(run.recording) as recording:
+        return [json.loads(one["json"])["info"] for one in recording.decoded(schema.TRAIN_INFO)]
+
+
+def test_all_fields_of_info_are_recorded_by_a_star(tmp_path):
+    env = Sensor(np.zeros(2, np.float32))
+    env.info = {"a": 1, "b": [np.float32(0.5)]}
+    with runner.record(env, tmp_path, info=["*"]) as rec:
+        rec.reset()
+        rec.step(0)
+    assert infos(rec.run) == [{"a": 1, "b": [0.5]}]
+
+
+def endless() -> Any:
+    value: dict[str, Any] = {}
+    value["self"] = [value, value]
+    return value
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        ("x" * 80_000_000, "takes more than"),
+        (np.zeros(10_000_000), "more than 4,000,000 values"),
+        (endless(), "contains itself"),
+        (10**5000, "integer string conversion"),
+    ],
+    ids=["text", "array", "cyclic", "integer"],
+)
+def test_an_info_that_cannot_be_recorded_is_named_and_the_rest_is_kept(tmp_path, value, reason):
+    env = Sensor(np.zeros(2, np.float32))
+    env.info = {"large": value, "small": 1}
+    with runner.record(env, tmp_path, info=["*"]) as rec:
+        rec.reset()
+        with pytest.warns(
+            RuntimeWarning, match=rf"info\['large'\] is not recorded where .*{reason}"
+        ) as warned:
+            list(map(rec.step, [0, 0]))
+    assert len(warned) == 1
+    check_integrity(rec.run.recording)
+    assert [info["small"] for info in infos(rec.run)] == [1, 1]
+    assert reason in infos(rec.run)[0]["large"]
+
+
+def test_reset_is_given_only_what_the_loop_gives(tmp_path):
+    class Old(Sensor):
+        def reset(self, seed=None):  # type: ignore[no-untyped-def,override]
+            return np.zeros(2, np.float32), {}
+
+    with runner.record(Old(np.zeros(2, np.float32)), tmp_path) as rec:
+        rec.reset(seed=3)
+        rec.reset()
+
+
+def test_a_log_of_zeros_is_encoded_as_protobuf_does(tmp_path):
+    values = [0.0, -0.0, 1.5, float("nan"), -2.0]
+    with runner.record(make("FrozenLake-v1"), tmp_path) as rec:
+        rec.reset(seed=1)
+        for value in values:
+            rec.log("x", value)
+        rec.step(0)
+        rec.log("x", 3)
+    with open_recording(rec.run.recording) as recording:
+        found = list(recording.decoded(schema.SCALAR_TOPIC))
+    assert np.array_equal([one["value"] for one in found], [*values, 3.0], equal_nan=True)
+    assert [one["step"] for one in found] == [0, 0, 0, 0, 0, 1]
+
+
+def test_a_scalar_is_encoded_as_protobuf_does():
+    from runner.recording.messages import encode, scalar_encoder
+
+    quick = scalar_encoder("loss/π", "eval")
+    for value in (0.0, -0.0, 1e-300, -5.0):
+        for step in (0, 1, 2**40):
+            for episode in (0, 7):
+                fields = {"name": "loss/π", "value": value, "phase": "eval", "step": step, "episode": episode}
+                assert quick(value, step, episode) == encode(schema.SCALAR, fields)

@@ -1,0 +1,160 @@
+"""The files of loops: read by others' readers, mended when damaged, refused when they are made up."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun_cli
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+import runner
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.integrity import check_integrity
+from runner.recording.reader import open_recording
+from runner.recording.repair import repair
+from runner.recording.rewriting import rewrite
+from tests.runner.loops.making import make, play
+
+KINDS = {"FrozenLake-v1": "step", "CartPole-v1": "transition", "Rooms": "transition", "RoomsText": "variable"}
+
+
+@pytest.fixture(scope="session", params=KINDS)
+def whole(request, tmp_path_factory):
+    """Return the name of an environment and a recording of a loop over it that has every topic."""
+    folder = tmp_path_factory.mktemp("files")
+    env = make(request.param)
+    options = {"frames_every": 50} if request.param.startswith("Rooms") else {}
+    with runner.record(env, folder, info=["prob", "luck", "first"], chunk_steps=256, **options) as rec:
+        list(play(rec, 1000))
+        rec.log("loss", 0.5)
+        rec.log("note", "text")
+        rec.snapshot("q", np.eye(3))
+        with rec.phase("eval"):
+            list(play(rec, 300))
+    return request.param, rec.run.recording
+
+
+def test_the_official_reader_reads_every_message(whole):
+    name, path = whole
+    counts: Counter[str] = Counter()
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        first = None
+        for message in reader.iter_decoded_messages():
+            counts[message.channel.topic] += 1
+            if message.channel.topic == "/train/step" and first is None:
+                first = message.decoded_message
+    with open_recording(path) as recording:
+        assert recording.kind == KINDS[name]
+        assert dict(counts) == recording.result["messages"]
+        one = next(recording.transitions("train"))
+    assert first.step == 0
+    assert list(first.rewards) == one["rewards"].tolist()
+    if KINDS[name] != "step":
+        assert set(counts) <= {topic.name for topic in schema.KINDS["transition"]}
+
+
+def test_rerun_finds_nothing_wrong(whole):
+    program = Path(rerun_cli.__file__).parent / "rerun"
+    done = subprocess.run([program, "mcap", "check", whole[1]], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_hole_is_told_and_the_rest_is_kept(whole, tmp_path):
+    name, path = whole
+    damaged = tmp_path / "recording.mcap"
+    data = bytearray(path.read_bytes())
+    with open_recording(path) as recording:
+        topic = recording.topic("/train/step")
+        before = recording.count(topic)
+        entry = recording._chunks(topic).entry(1 if KINDS[name] != "variable" else 0)
+    at = entry.offset + entry.length - 40
+    data[at : at + 8] = b"\xff" * 8
+    damaged.write_bytes(data)
+    done = repair(damaged)
+    check_integrity(damaged)
+    assert not done.lossless
+    with open_recording(damaged) as recording:
+        kept = [int(step["step"]) for step in recording.transitions("train")]
+        assert before - len(kept) > 0 or KINDS[name] == "variable"
+        if KINDS[name] != "variable":
+            ((start, stop),) = recording.lost["/train/step"]
+            assert kept == [k for k in range(before) if not start <= k < stop]
+        assert recording.count(recording.topic("/eval/step")) == 300
+
+
+@pytest.fixture(scope="session")
+def pole(tmp_path_factory):
+    """Return a recording of arrays."""
+    with runner.record(make("CartPole-v1"), tmp_path_factory.mktemp("pole")) as rec:
+        list(play(rec, 300))
+    return rec.run.recording
+
+
+def altered(path: Path, tmp_path: Path, **said: str) -> Path:
+    """Return a copy whose run says something else of itself."""
+    made = tmp_path / "made-up.mcap"
+
+    def change(name: str, entries: dict[str, str]) -> dict[str, str]:
+        return entries | said if name == "run" else entries
+
+    rewrite(path, made, change)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ({"kind": "other"}, "kind"),
+        ({"kind": "job"}, "not written by dualtaxi"),
+        ({"environments": "0"}, "environments"),
+        ({"environments": "many"}, "environments"),
+        ({"spaces": "[]"}, "space"),
+        ({"spaces": "{}"}, "space"),
+        ({"spaces": json.dumps({"observation": {"type": "Box"}, "action": {"type": "Text"}})}, "space"),
+        (
+            {
+                "spaces": json.dumps(
+                    {
+                        "observation": {"type": "Box", "dtype": "|O8", "shape": [2]},
+                        "action": {"type": "Discrete", "dtype": "<i8", "shape": []},
+                    }
+                )
+            },
+            "O8",
+        ),
+        (
+            {
+                "spaces": json.dumps(
+                    {
+                        "observation": {"type": "Box", "dtype": "<f8", "shape": [10**9, 10**9]},
+                        "action": {"type": "Discrete", "dtype": "<i8", "shape": []},
+                    }
+                )
+            },
+            "shape",
+        ),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "-",
+)
+def test_what_a_file_makes_up_is_refused(pole, tmp_path, said, told):
+    with (
+        pytest.raises(RecordingError, match=told),
+        open_recording(altered(pole, tmp_path, **said)) as recording,
+    ):
+        for _ in recording.transitions("train"):
+            pass
+
+
+def test_a_description_nested_without_end_is_refused(pole, tmp_path):
+    deep = '{"type":"Tuple","spaces":[' * 40 + '{"type":"Text"}' + "]}" * 40
+    made = altered(pole, tmp_path, spaces=f'{{"observation": {deep}, "action": {{}}}}')
+    with pytest.raises(RecordingError, match="describes no space"), open_recording(made) as recording:
+        _ = recording.dtypes

@@ -1,0 +1,305 @@
+"""Vector environments, each way of resetting by itself; games of several agents."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import runner
+from dualtaxi.parallel import DualTaxiParallelEnv
+from runner.errors import EnvironmentNotUsable
+from runner.recording import schema
+from runner.recording.integrity import check_integrity
+from runner.recording.reader import Recording, open_recording
+from tests.runner.loops.making import Leaving, drive, make, parallel, play
+
+N = 3
+NAMES = ("CartPole-v1", "FrozenLake-v1", "Rooms")
+
+
+def vector(name: str, mode: AutoresetMode) -> SyncVectorEnv:
+    return SyncVectorEnv([lambda: make(name)] * N, autoreset_mode=mode)
+
+
+def alike(left: Any, right: Any) -> bool:
+    if isinstance(left, dict):
+        return all(alike(left[key], right[key]) for key in left)
+    if isinstance(left, tuple):
+        return all(map(alike, left, right))
+    return bool(np.array_equal(left, right))
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_vector_loop_is_recorded_and_undisturbed(tmp_path, name, mode):
+    with runner.record_vector(vector(name, mode), tmp_path, chunk_steps=256) as envs:
+        seen = drive(envs, 300)
+    assert all(map(alike, seen, drive(vector(name, mode), 300)))
+    check_integrity(envs.run.recording)
+    with open_recording(envs.run.recording) as recording:
+        ended = recording.episodes("train")
+        assert recording.environments == N
+        assert len(ended) > 10
+        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+        resets = np.concatenate(list(recording.blocks(recording.topic("/train/reset"))))
+        assert len(steps) == 300 * N
+        for number, episode in enumerate(ended):
+            check_episode(recording, number, episode)
+    assert steps["step"].tolist() == list(range(len(steps)))
+    assert resets["seed"][:N].tolist() == [7, 8, 9]
+    only_resets = int((steps["t"] == schema.NEVER).sum())
+    assert (only_resets > 0) == (mode == AutoresetMode.NEXT_STEP)
+    over = int((steps["terminated"] | steps["truncated"]).sum())
+    assert len(ended) == over
+    assert N + over - N <= len(resets) <= N + over
+    check_follows(steps, resets)
+
+
+def check_episode(recording: Recording, number: int, episode: Any) -> None:
+    """The steps of an episode are those of one environment, whole, and add up."""
+    own = recording.episode_steps("train", number)
+    assert own["t"].tolist() == list(range(int(episode["length"])))
+    assert own["rewards"].sum() == pytest.approx(float(episode["returns"][0]))
+    assert len(set((own["step"] % N).tolist())) == 1
+    assert len(set(own["episode"].tolist())) == 1
+    assert bool(own["terminated"][-1]) == bool(episode["terminated"])
+
+
+def check_follows(steps: Any, resets: Any) -> None:
+    """Each environment's first observation is its reset's; of states, each step goes on from the last."""
+    if "state" not in steps.dtype.names:
+        return
+    first = {(int(r["environment"]), int(r["episode"])): int(r["observation"]) for r in resets}
+    for i in range(N):
+        own = steps[i::N]
+        own = own[own["t"] != schema.NEVER]
+        begins = own["t"] == 0
+        assert [first[i, int(e)] for e in own["episode"][begins]] == own["state"][begins].tolist()
+        inside = ~begins[1:]
+        assert own["state"][1:][inside].tolist() == own["next_state"][:-1][inside].tolist()
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_the_last_observation_of_an_episode_is_its_own(tmp_path, mode):
+    """CartPole ends where the pole or the cart is too far off, not where it begins anew."""
+    with runner.record_vector(vector("CartPole-v1", mode), tmp_path) as envs:
+        drive(envs, 300)
+    with open_recording(envs.run.recording) as recording:
+        steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
+    last = steps["next_observation"][steps["terminated"]]
+    assert len(last) > 20
+    assert ((np.abs(last[:, 2]) > 0.2094) | (np.abs(last[:, 0]) > 2.4)).all()
+
+
+def test_what_a_vector_cannot_record_is_refused(tmp_path):
+    with pytest.raises(EnvironmentNotUsable, match="Text space"):
+        runner.record_vector(vector("RoomsText", AutoresetMode.NEXT_STEP), tmp_path)
+    envs = vector("CartPole-v1", AutoresetMode.NEXT_STEP)
+    envs.metadata = {}
+    with pytest.raises(EnvironmentNotUsable, match="AutoresetMode"):
+        runner.record_vector(envs, tmp_path)
+
+
+def test_a_parallel_game_is_recorded_and_undisturbed(tmp_path):
+    with runner.record_parallel(DualTaxiParallelEnv(max_steps=40), tmp_path) as game:
+        seen = parallel(game, 4)
+    alone = parallel(DualTaxiParallelEnv(max_steps=40), 4)
+    assert [entry[0] for entry in seen] == [entry[0] for entry in alone]
+    check_integrity(game.run.recording)
+    played = [entry for entry in seen if entry[0] != "reset"]
+    with open_recording(game.run.recording) as recording:
+        steps = list(recording.transitions("train"))
+        ended = recording.episodes("train")
+        first = list(recording.resets("train"))
+        assert recording.run["agents"] == '["taxi_1", "taxi_2"]'
+    assert len(steps) == len(played)
+    for one, (actions, observations, rewards, _, _) in zip(steps, played, strict=True):
+        for i, agent in enumerate(("taxi_1", "taxi_2")):
+            assert one["action"][agent] == actions[agent]
+            assert one["next_observation"][agent] == observations[agent]
+            assert one["rewards"][i] == rewards[agent]
+        assert one["acted"] == 3
+    assert ended["length"].tolist() == [40] * 4
+    assert ended["truncated"].all()
+    assert [int(one["seed"]) for one in first] == [0, 1, 2, 3]
+
+
+def test_agents_that_leave_are_told(tmp_path):
+    with runner.record_parallel(Leaving(), tmp_path, info=["left"]) as game:
+        parallel(game, 2)
+    with open_recording(game.run.recording) as recording:
+        steps = list(recording.transitions("train"))
+        ended = recording.episodes("train")
+        infos = list(recording.decoded(schema.TRAIN_INFO))
+    assert [int(one["acted"]) for one in steps[:3]] == [0b111, 0b110, 0b100]
+    assert [int(one["agents_terminated"]) for one in steps[:3]] == [0b001, 0b010, 0b100]
+    assert [bool(one["terminated"]) for one in steps[:3]] == [False, False, True]
+    assert steps[1]["next_observation"]["a"].tolist() == [0, 0]
+    assert steps[1]["next_observation"]["b"].tolist() == [2, 2]
+    assert ended["returns"].tolist() == [[1, 2, 3]] * 2
+    assert infos[1]["json"] == '{"info": {"left": {"b": "b", "c": "b"}}}'
+
+
+def test_agents_without_names_are_refused_before_there_is_a_run(tmp_path):
+    game = Leaving()
+    game.possible_agents = [("a", 1), ("b", 2)]
+    with pytest.raises(EnvironmentNotUsable, match="expected a name or a number"):
+        runner.record_parallel(game, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_loop_is_recorded_though_its_folder_was_removed(tmp_path, monkeypatch):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with runner.record(make("FrozenLake-v1"), tmp_path / "runs") as env:
+        list(play(env, 20))
+    with open_recording(env.run.recording) as recording:
+        assert recording.provenance["directory"] == ""
+    monkeypatch.chdir(tmp_path)
+
+
+def test_a_vector_of_one_is_as_the_environment_alone(tmp_path):
+    with runner.record(make("FrozenLake-v1"), tmp_path) as env:
+        list(play(env, 200))
+    mode = AutoresetMode.SAME_STEP
+    one = SyncVectorEnv([lambda: make("FrozenLake-v1")], autoreset_mode=mode)
+    with runner.record_vector(one, tmp_path) as envs:
+        actions = make("FrozenLake-v1").action_space
+        actions.seed(5)
+        envs.reset(seed=5)
+        for _ in range(200):
+            envs.step(np.array([actions.sample()]))
+    digests = [run.summary["topic_digests"]["/train/step"] for run in (env.run, envs.run)]
+    assert digests[0] == digests[1]
+
+
+def test_rooms_of_every_kind_of_space_come_back_from_a_vector(tmp_path):
+    mode = AutoresetMode.NEXT_STEP
+    with runner.record_vector(vector("Rooms", mode), tmp_path) as envs:
+        envs.action_space.seed(0)
+        seen = [envs.reset(seed=1)[0]]
+        seen += [envs.step(envs.action_space.sample())[0] for _ in range(5)]
+    with open_recording(envs.run.recording) as recording:
+        steps = next(recording.blocks(recording.topic("/train/step")))["next_observation"]
+    for k, observation in enumerate(seen[1:]):
+        rows = steps[k * N : (k + 1) * N]
+        assert np.array_equal(rows["position"], observation["position"])
+        assert np.array_equal(rows["doors"], observation["doors"])
+        assert np.array_equal(rows["room"]["0"], observation["room"][0])
+        assert np.array_equal(rows["room"]["1"], observation["room"][1])
+
+
+def test_an_export_to_rerun_says_that_it_shows_the_first_environment(tmp_path):
+    from runner.export.rerun.selection import Request, select
+
+    with runner.record_vector(SyncVectorEnv([lambda: make("CartPole-v1")] * 3), tmp_path) as rec:
+        rec.reset(seed=0)
+        for _ in range(5):
+            rec.step(rec.action_space.sample())
+    with open_recording(rec.run.recording) as recording:
+        assert select(recording, Request()).chosen == [
+            "of 3 environments the first, in 15 of 15 training steps"
+        ]
+
+
+def test_an_export_to_rerun_says_that_texts_are_not_drawn(tmp_path):
+    from runner.export.rerun.selection import Request, select
+
+    with runner.record(make("RoomsText"), tmp_path) as rec:
+        list(play(rec, 5))
+    with open_recording(rec.run.recording) as recording:
+        assert "they are not drawn" in select(recording, Request()).warnings[0]
+
+
+class Tide(gymnasium.Env[Any, Any]):
+    """Episodes, rewards and observations that follow from the seed of the first reset by whole numbers."""
+
+    def __init__(self, is_discrete: bool) -> None:
+        self.observation_space: Any = spaces.Box(-9, 9, (2,), np.float32)
+        self.action_space: Any = spaces.Box(-9, 9, (1,), np.float32)
+        if is_discrete:
+            self.observation_space, self.action_space = (
+                spaces.Discrete(9, start=2),
+                spaces.Discrete(3, start=1),
+            )
+        self._is_discrete = is_discrete
+        self._k = 0
+
+    def _observation(self) -> Any:
+        self._k = (self._k * 75 + 74) % 65537
+        return 2 + self._k % 9 if self._is_discrete else np.array([self._k % 9, -(self._k % 7)], np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self._k += 0 if seed is None else seed
+        return self._observation(), {}
+
+    def step(self, action: Any) -> Any:
+        observation = self._observation()
+        return observation, self._k / 10 - 3000, self._k % 11 == 0, self._k % 13 == 0, {}
+
+
+def tide(folder: Any, is_discrete: bool, mode: AutoresetMode) -> Any:
+    """Return the run of a loop with two phases, resets of some environments, resets of all, logged values."""
+    envs = SyncVectorEnv([lambda: Tide(is_discrete)] * N, autoreset_mode=mode)
+    action = np.array([1, 2, 3]) if is_discrete else np.array([[0.5], [-1], [2]], np.float32)
+    with runner.record_vector(envs, folder, chunk_steps=256) as rec:
+
+        def step(k: int) -> None:
+            _, _, terminated, truncated, _ = rec.step(action)
+            over = terminated | truncated
+            if mode == AutoresetMode.DISABLED and over.any():
+                rec.reset(options={"reset_mask": over if k % 3 else np.ones(N, np.bool_)})
+
+        rec.reset(seed=7)
+        for k in range(400):
+            step(k)
+            if k % 5 == 0:
+                rec.log("k", k)
+            if k % 100 == 50:
+                with rec.phase("eval"):
+                    rec.reset(seed=k)
+                    for i in range(30):
+                        step(i)
+                rec.reset()
+    return rec.run
+
+
+TIDES = {
+    (True, AutoresetMode.NEXT_STEP): "7d1212c6b4beb05409c57d86fc187cb74c08a52ae97aad3486699367c518a535",
+    (True, AutoresetMode.SAME_STEP): "bd62f823f5c74c8a25f457876209f32e5177d1afc086662585805549eebf7b5e",
+    (True, AutoresetMode.DISABLED): "32bcc1d51885b8e685e430665920c6c9eabbffa6f4c7cc24e1b081e6d17c3898",
+    (False, AutoresetMode.NEXT_STEP): "76a3990be866c24b7082ba31f151868c2aff7d45cc46be6fe3bb6bd665a28641",
+    (False, AutoresetMode.SAME_STEP): "3f0fc9f5ea657a96a7502bb9e238cc9826734cffa16289009f7a3f190b1a4cf8",
+    (False, AutoresetMode.DISABLED): "14ddde05557dd75f9bd67ab2d0960a51e84bb87d354e4b4f147821f7d5a4c852",
+}
+"""Content digests by whether spaces are discrete, and how environments reset themselves."""
+
+
+@pytest.mark.parametrize(("is_discrete", "mode"), TIDES)
+def test_a_vector_loop_has_the_content_that_it_always_had(tmp_path, is_discrete, mode):
+    run = tide(tmp_path, is_discrete, mode)
+    assert run.summary["content_digest"] == TIDES[is_discrete, mode]
+    check_integrity(run.recording)
+
+
+def test_values_logged_between_steps_are_placed_among_them(tmp_path):
+    envs = SyncVectorEnv([lambda: Tide(True)] * N)
+    ended, expected = 0, []
+    with runner.record_vector(envs, tmp_path) as rec:
+        rec.reset(seed=3)
+        for k in range(50):
+            _, _, terminated, truncated, _ = rec.step(np.ones(N, np.int64))
+            ended += int((terminated | truncated).sum())
+            rec.log("k", float(k))
+            expected.append(((k + 1) * N, ended))
+    with open_recording(rec.run.recording) as recording:
+        logged = list(recording.decoded(schema.SCALAR_TOPIC))
+    assert ended > 5
+    assert [(one["step"], one["episode"]) for one in logged] == expected

@@ -1,0 +1,246 @@
+"""Mistakes with the wrappers: a sentence that says what was found, and no run that is left behind."""
+
+from __future__ import annotations
+
+import errno
+import os
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+
+import runner
+from runner.config import from_mapping
+from runner.errors import ConfigError, RunnerError, StorageError
+from runner.recording.reader import open_recording
+from runner.recording.writer import RecordingFile
+from runner.runs.run import list_runs
+from tests.runner.loops.making import Rooms, make
+
+
+def pole() -> gymnasium.Env[Any, Any]:
+    return make("CartPole-v1")
+
+
+def poles() -> SyncVectorEnv:
+    return SyncVectorEnv([pole] * 2)
+
+
+def texts() -> SyncVectorEnv:
+    return SyncVectorEnv([lambda: Rooms(with_text=True)] * 2)
+
+
+def game() -> Any:
+    from dualtaxi.parallel import DualTaxiParallelEnv
+
+    return DualTaxiParallelEnv()
+
+
+class Named(Rooms):
+    """A part whose name cannot be printed."""
+
+    def __init__(self) -> None:
+        super().__init__(with_text=True)
+        self.observation_space = spaces.Dict({"a\nb": spaces.Text(3)})
+
+
+@pytest.mark.parametrize(
+    ("begin", "told"),
+    [
+        (lambda there: runner.record("CartPole-v1", there), "found str, expected a Gymnasium environment"),
+        (lambda there: runner.record(poles(), there), "record_vector is for vector environments"),
+        (lambda there: runner.record(game(), there), "record_parallel for PettingZoo's"),
+        (lambda there: runner.record_vector(pole(), there), "expected a vector environment"),
+        (lambda there: runner.record_parallel(pole(), there), "expected a PettingZoo ParallelEnv"),
+        (lambda there: runner.record(pole(), there, phase="test"), "found 'test', expected one of train"),
+        (lambda there: runner.record(pole(), there, name=3), "name: found 3, expected text"),
+        (lambda there: runner.record(pole(), into=pole(), phase="eval"), "found TimeLimit, expected what"),
+        (lambda there: runner.record(pole(), there, into=pole()), "found more arguments than phase"),
+        (lambda there: runner.record_vector(texts(), there), "found a Text space"),
+        (lambda there: runner.record(Named(), there), r"found a part called 'a\\nb'"),
+    ],
+)
+def test_what_cannot_be_recorded_is_said_and_leaves_no_run(begin, told, tmp_path):
+    with pytest.raises(RunnerError, match=told):
+        begin(tmp_path / "loops")
+    assert not (tmp_path / "loops").exists()
+
+
+@pytest.mark.parametrize(("part", "left"), [("_append", []), ("add_metadata", ["failed"])])
+def test_a_recording_that_cannot_be_begun_leaves_no_run_that_seems_to_run(part, left, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(RecordingFile, part, full)
+    with pytest.raises(StorageError, match="No space left on device"):
+        runner.record(pole(), tmp_path)
+    assert [run.status for run in list_runs(tmp_path)] == left
+
+
+@pytest.mark.parametrize(
+    ("do", "told"),
+    [
+        (lambda rec: rec.log("a", "\ud800"), "valid Unicode"),
+        (lambda rec: rec.log("\ud800", 1), "valid Unicode"),
+        (lambda rec: rec.log("a", 10**400), "a number that a float64 holds"),
+        (lambda rec: rec.snapshot("a", [[1], [1, 2]]), "no array of numbers for 'a'"),
+        (lambda rec: rec.snapshot("\ud800", [1.0]), "expected an array of numbers and a name"),
+    ],
+)
+def test_what_cannot_be_logged_is_said_and_the_loop_goes_on(do, told, tmp_path):
+    with runner.record(pole(), tmp_path) as rec:
+        rec.reset(seed=1)
+        with pytest.raises(RunnerError, match=told):
+            do(rec)
+        rec.step(0)
+        rec.log("seed", np.float32(0.5))
+    assert rec.run.summary["messages"]["/scalar"] == rec.run.summary["train_steps"] == 1
+
+
+class Paid(gymnasium.Env[Any, Any]):
+    """Rewards, observations and actions as people's own environments have them."""
+
+    observation_space = spaces.Box(0, 255, (2,), np.uint8)
+    action_space = spaces.Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, reward: Any, observation: Any = (1, 2)) -> None:
+        self.reward, self.observation = reward, observation
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(2, np.uint8), {}
+
+    def step(self, action: Any) -> Any:
+        return self.observation, self.reward, False, False, {}
+
+
+@pytest.mark.parametrize("reward", [1, 1.0, np.float32(1), np.array(1.0), np.array([1.0]), np.array([[1]])])
+def test_a_reward_may_stand_in_an_array_of_one(reward, tmp_path):
+    with runner.record(Paid(reward), tmp_path) as rec:
+        rec.reset()
+        rec.step(np.zeros(2, np.float32))
+    with open_recording(rec.run.recording) as recording:
+        assert next(recording.transitions("train"))["rewards"] == 1
+
+
+@pytest.mark.parametrize(
+    ("env", "told"),
+    [
+        (lambda: Paid(None), "found the reward None, expected a number"),
+        (lambda: Paid(np.ones(2)), "found the reward"),
+        (lambda: Paid(1.0, [300, 1]), "found an observation that is not of"),
+    ],
+)
+def test_what_an_environment_gives_wrongly_is_said(env, told, tmp_path):
+    rec = runner.record(env(), tmp_path)
+    rec.reset()
+    with pytest.raises(RunnerError, match=told):
+        rec.step(np.zeros(2, np.float32))
+    rec.close()
+
+
+def test_an_action_that_is_rounded_later_is_warned_of_once(tmp_path):
+    env = Paid(1.0)
+    with runner.record(env, tmp_path) as rec:
+        rec.reset()
+        rec.step(np.zeros(2, np.float32))
+        rec.step(np.array([0.5, 0.25]))
+        with pytest.warns(RuntimeWarning, match="action comes as float64") as warned:
+            rec.step(np.array([0.1, 0.2]))
+        rec.step(np.array([0.3, 0.7]))
+    assert len(warned) == 1
+    assert warned[0].filename == __file__
+
+
+def test_a_seed_of_numpy_is_a_number(tmp_path):
+    runner.record(pole(), tmp_path, seed=np.int64(7), name="seven").close()
+    assert runner.find_run("seven", tmp_path).facts["seed"] == 7
+
+
+def test_a_forked_process_leaves_the_recording_alone(tmp_path):
+    """What a child closes, or lets go, is its parent's."""
+    with runner.record(pole(), tmp_path) as rec:
+        rec.reset(seed=1)
+        rec.step(0)
+        child = os.fork()
+        if not child:
+            rec.close()
+            os._exit(0)
+        os.waitpid(child, 0)
+        rec.step(1)
+    assert rec.run.summary["train_steps"] == 2
+    with open_recording(rec.run.recording) as recording:
+        assert len(list(recording.transitions("train"))) == 2
+
+
+def test_a_second_environment_that_renders_nothing_is_refused_before_the_loop_goes_on(tmp_path):
+    blind = Rooms()
+    blind.render_mode = None
+    with (
+        runner.record(Rooms(), tmp_path, frames_every=4) as rec,
+        pytest.raises(RunnerError, match="frames_every: found an environment with render_mode=None"),
+    ):
+        runner.record(blind, into=rec, phase="eval")
+
+
+@pytest.mark.parametrize(
+    "picture", [None, np.ones((4, 4, 3)), np.zeros((4, 4), np.uint8)], ids=["nothing", "floats", "flat"]
+)
+def test_what_render_returns_is_a_picture_or_refused(tmp_path, monkeypatch, picture):
+    monkeypatch.setattr(Rooms, "render", lambda _: picture)
+    with (
+        runner.record(Rooms(), tmp_path, frames_every=4) as rec,
+        pytest.raises(RunnerError, match=r"expected uint8 of \[height, width, 3\]"),
+    ):
+        rec.reset(seed=0)
+
+
+@pytest.mark.parametrize("value", [1.5, np.float32(1.5), np.array(1.5), np.array([[1.5]])], ids=repr)
+def test_a_lone_number_is_logged_however_it_comes(tmp_path, value):
+    with runner.record(pole(), tmp_path) as rec:
+        rec.log("loss", value)
+    with open_recording(rec.run.recording) as recording:
+        (scalar,) = recording.decoded(recording.topic("/scalar"))
+    assert scalar["value"] == 1.5
+
+
+@pytest.mark.parametrize("kind", ["itself", "surrogate"])
+def test_settings_that_json_cannot_hold_are_refused_before_there_is_a_run(tmp_path, kind):
+    settings: dict[str, Any] = {"text": "\ud800"} if kind == "surrogate" else {}
+    if kind == "itself":
+        settings["itself"] = settings
+    with pytest.raises(RunnerError, match="config: found what JSON cannot hold"):
+        runner.record(pole(), tmp_path, config=settings)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "packing",
+    [
+        *({"level": level} for level in (-8, -7, 0, 1, 19, 20, None, "x")),
+        *({"compression": name, "level": 3} for name in ("lz4", "none", "zstd")),
+        *({"compression": name} for name in ("lz4", "none", "brotli")),
+        *({"chunk_steps": steps} for steps in (255, 256, 65_536, 65_537)),
+        *({"index": index} for index in ("message", "chunk", "none")),
+    ],
+    ids=str,
+)
+def test_packing_has_the_bounds_that_a_configuration_has(packing, tmp_path):
+    def outcome(work):
+        try:
+            return work()
+        except ConfigError as error:
+            return str(error).rpartition("recording.")[2].splitlines()[0]
+
+    def record():
+        with runner.record(make("CartPole-v1"), tmp_path, **packing) as env:
+            env.reset(seed=0)
+        with open_recording(env.run.recording) as recording:
+            return recording.config["recording"]
+
+    config = {"episodes": 1, "recording": packing}
+    expected = outcome(lambda: from_mapping(config).to_mapping()["recording"])
+    assert outcome(record) == expected

@@ -1,0 +1,415 @@
+"""Any loop over a Gymnasium environment: undisturbed, and recorded to the last value."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+
+import runner
+from runner.errors import ConfigError, EnvironmentNotUsable, RecordingError, RunnerError
+from runner.recording import schema
+from runner.recording.integrity import check_integrity
+from runner.recording.reader import open_recording
+from runner.runs.resolve import find_run
+from runner.runs.run import list_runs
+from tests.runner.loops.making import NAMES, Rooms, make, play, recorded
+
+STEPS = 700
+
+
+def same(left: Any, right: Any) -> bool:
+    """Return whether two values of a space are the same."""
+    if isinstance(left, dict):
+        return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
+    if isinstance(left, tuple):
+        return len(left) == len(right) and all(map(same, left, right))
+    return type(left) is type(right) and bool(np.array_equal(left, right))
+
+
+@pytest.fixture(scope="session", params=NAMES)
+def loop(request, tmp_path_factory):
+    """Return (environment, recording, what the loop saw)."""
+    name = request.param
+    return name, *recorded(tmp_path_factory.mktemp("loops"), name, STEPS, chunk_steps=256)
+
+
+def test_a_loop_sees_what_it_sees_without_the_recording(loop):
+    name, _, seen = loop
+    alone = list(play(make(name), STEPS))
+    assert len(seen) == len(alone)
+    assert all(same(left, right) for left, right in zip(seen, alone, strict=True))
+
+
+def test_every_byte_of_the_recording_is_what_it_should_be(loop):
+    check_integrity(loop[1])
+
+
+def flat(value: Any) -> list[Any]:
+    """Return the leaves of a value, of the loop's or of the recording's."""
+    if isinstance(value, dict):
+        return [leaf for part in value.values() for leaf in flat(part)]
+    if isinstance(value, np.void):
+        return [leaf for name in value.dtype.names for leaf in flat(value[name])]
+    if isinstance(value, tuple):
+        return [leaf for part in value for leaf in flat(part)]
+    return [value]
+
+
+def agree(found: Any, expected: Any) -> bool:
+    left, right = flat(found), flat(expected)
+    return len(left) == len(right) and all(map(np.array_equal, left, right))
+
+
+def test_steps_hold_what_the_loop_saw(loop):
+    _, path, seen = loop
+    steps = [entry for entry in seen if entry[0] == "step"]
+    with open_recording(path) as recording:
+        found = list(recording.transitions("train"))
+        after = "next_state" if recording.kind == "step" else "next_observation"
+    assert len(found) == len(steps) == STEPS
+    for one, (_, action, observation, reward, terminated, truncated, _) in zip(found, steps, strict=True):
+        assert agree(one["action"], action)
+        assert agree(one[after], observation)
+        assert (one["rewards"].tolist(), bool(one["terminated"])) == ([reward], terminated)
+        assert bool(one["truncated"]) == truncated
+
+
+def test_resets_hold_seed_and_observation(loop):
+    _, path, seen = loop
+    resets = [entry for entry in seen if entry[0] == "reset"]
+    with open_recording(path) as recording:
+        found = list(recording.resets("train"))
+    assert len(found) == len(resets) >= 1
+    assert [bool(one["seeded"]) for one in found] == [True] + [False] * (len(resets) - 1)
+    assert found[0]["seed"] == 5
+    assert all(agree(one["observation"], entry[2]) for one, entry in zip(found, resets, strict=True))
+
+
+def test_steps_and_episodes_are_numbered_as_they_come(loop):
+    _, path, seen = loop
+    episodes, t, lengths, returns, total = [], [], [], [], 0.0
+    for entry in seen:
+        if entry[0] == "reset":
+            length = 0
+            continue
+        episodes.append(len(lengths))
+        t.append(length)
+        length += 1
+        total += entry[3]
+        if entry[4] or entry[5]:
+            lengths.append(length)
+            returns.append(total)
+            total = 0.0
+    with open_recording(path) as recording:
+        found = list(recording.transitions("train"))
+        ended = recording.episodes("train")
+        first = list(recording.resets("train"))
+    assert [int(one["step"]) for one in found] == list(range(STEPS))
+    assert [int(one["episode"]) for one in found] == episodes
+    assert [int(one["t"]) for one in found] == t
+    assert ended["length"].tolist() == lengths
+    assert ended["returns"][:, 0].tolist() == returns
+    assert [int(one["episode"]) for one in first] == list(range(len(first)))
+    assert all(int(one["step"]) == episodes.index(int(one["episode"])) for one in first[:-1])
+
+
+def test_times_go_on_with_the_steps(loop):
+    with open_recording(loop[1]) as recording:
+        times = [int(one["log_time"]) for one in recording.transitions("train")]
+    assert times == [schema.STEP_NANOSECONDS * (k + 1) for k in range(STEPS)]
+
+
+def test_a_tabular_environment_is_carried_along_and_its_events_are_counted(tmp_path):
+    path, seen = recorded(tmp_path, "CliffWalking-v1", 400)
+    falls = sum(entry[3] == -100 for entry in seen if entry[0] == "step")
+    with open_recording(path) as recording:
+        assert recording.mdp.states == 48
+        state, action = 36, 1
+        ends = recording.episodes("train")
+        steps = next(recording.blocks(schema.TRAIN_STEP))
+        assert (recording.mdp.next_state[state, action] == 36).any()
+    assert steps["state"][1:].tolist() == [
+        int(b) if not over else int(s)
+        for b, over, s in zip(
+            steps["next_state"][:-1],
+            (steps["terminated"] | steps["truncated"])[:-1],
+            steps["state"][1:],
+            strict=True,
+        )
+    ]
+    assert falls > 0
+    assert int(ends["penalties"].sum()) <= falls
+
+
+def test_scalars_texts_and_arrays_are_kept_with_their_place(tmp_path):
+    q = np.arange(6, dtype=np.float32).reshape(2, 3)
+    with runner.record(make("FrozenLake-v1"), tmp_path) as env:
+        for k, entry in enumerate(play(env, 50)):
+            if entry[0] == "step":
+                env.log("loss", 1 / (k + 1))
+        env.log("note", "half way")
+        env.snapshot("q", q)
+    with open_recording(env.run.recording) as recording:
+        scalars = list(recording.decoded(schema.SCALAR_TOPIC))
+        (text,) = recording.decoded(schema.LOG_TOPIC)
+        (array,) = recording.arrays()
+    assert [one["step"] for one in scalars] == list(range(1, 51))
+    assert {one["name"] for one in scalars} == {"loss"}
+    assert (text["name"], text["message"]) == ("note", "half way")
+    assert (array.name, array.step, array.values.dtype) == ("q", 50, np.float32)
+    assert np.array_equal(array.values, q)
+
+
+def test_phases_have_steps_and_episodes_of_their_own(tmp_path):
+    with runner.record(make("FrozenLake-v1"), tmp_path) as env:
+        for _ in range(3):
+            list(play(env, 40))
+            with env.phase("eval"):
+                list(play(env, 30))
+    with open_recording(env.run.recording) as recording:
+        trained, evaluated = (
+            np.concatenate(list(recording.blocks(topic))) for topic in (schema.TRAIN_STEP, schema.EVAL_STEP)
+        )
+        assert recording.result["train_steps"] == 120
+        assert recording.result["eval_steps"] == 90
+    times = np.sort(np.concatenate([trained["log_time"], evaluated["log_time"]]))
+    assert times.tolist() == [schema.STEP_NANOSECONDS * (k + 1) for k in range(210)]
+    assert (trained["log_time"][40] - trained["log_time"][39]) == 31 * schema.STEP_NANOSECONDS
+
+
+def test_a_second_environment_is_recorded_into_the_same_run(tmp_path):
+    with runner.record(make("FrozenLake-v1"), tmp_path) as env:
+        beside = runner.record(make("FrozenLake-v1"), into=env, phase="eval")
+        for _ in zip(play(env, 40), play(beside, 40), strict=False):
+            pass
+        beside.close()
+        list(play(env, 40))  # the recording is the first environment's to close
+    with open_recording(env.run.recording) as recording:
+        assert recording.count(schema.EVAL_STEP) > 20
+        assert recording.count(schema.TRAIN_STEP) > 60
+    with pytest.raises(ConfigError, match="other spaces"):
+        runner.record(make("Taxi-v4"), into=env, phase="eval")
+
+
+def test_chosen_fields_of_info_are_kept_where_they_come(tmp_path):
+    options = {"level": 3}
+    with runner.record(Rooms(), tmp_path, info=["luck", "first", "never"]) as env:
+        env.reset(seed=1, options=options)
+        for _ in range(6):
+            env.step(env.action_space.sample())
+    with open_recording(env.run.recording) as recording:
+        infos = list(recording.decoded(schema.TRAIN_INFO))
+    said = [(one["step"], one["reset"], json.loads(one["json"])) for one in infos]
+    assert said[0] == (0, True, {"info": {"first": True}, "reset": {"options": options}})
+    assert said[1:] == [(step, False, {"info": {"luck": 0.5}}) for step in (0, 2, 4)]
+
+
+def test_an_episode_that_is_reset_halfway_is_an_episode(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path) as env:
+        for length in (3, 5):
+            env.reset()
+            for _ in range(length):
+                env.step(0)
+        env.reset()
+        env.reset()
+    with open_recording(env.run.recording) as recording:
+        ended = recording.episodes("train")
+        assert ended["length"].tolist() == [3, 5]
+        assert not (ended["terminated"] | ended["truncated"]).any()
+        assert [int(one["episode"]) for one in recording.resets("train")] == [0, 1, 2, 2]
+
+
+def test_an_error_in_the_loop_leaves_a_whole_recording_that_says_so(tmp_path):
+    def broken() -> None:
+        with runner.record(make("CartPole-v1"), tmp_path) as env:
+            env.reset(seed=0)
+            env.step(0)
+            raise ZeroDivisionError("by nothing")
+
+    with pytest.raises(ZeroDivisionError):
+        broken()
+    (run,) = list_runs(tmp_path)
+    check_integrity(run.recording)
+    assert (run.status, run.summary["error"]) == ("failed", "ZeroDivisionError: by nothing")
+    assert run.summary["train_steps"] == 1
+
+
+@pytest.mark.parametrize(("code", "status"), [(None, "interrupted"), (0, "interrupted"), (3, "failed")])
+def test_a_loop_that_leaves_its_process_failed_only_if_it_says_so(tmp_path, code, status):
+    def leave() -> None:
+        with runner.record(make("CartPole-v1"), tmp_path) as env:
+            env.reset(seed=0)
+            sys.exit(code)
+
+    with pytest.raises(SystemExit):
+        leave()
+    (run,) = list_runs(tmp_path)
+    assert run.status == status
+
+
+KILLED = """
+import os, signal, sys, time, gymnasium, runner
+env = runner.record(gymnasium.make("CartPole-v1"), sys.argv[1], chunk_steps=256)
+env.reset(seed=0)
+for k in range(3000):
+    if any(env.step(k % 2)[2:4]):
+        env.reset()
+    env.log("k", k)
+time.sleep(1.6)  # the loop does something else: what it did before is put on disk meanwhile
+env.step(0)
+{end}
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "status"),
+    [
+        ("os.kill(os.getpid(), signal.SIGKILL)", "interrupted"),
+        ("sys.exit(0)", "interrupted"),
+        ("env.close()", "finished"),
+    ],
+)
+def test_a_killed_loop_leaves_what_it_did(tmp_path, end, status):
+    script = textwrap.dedent(KILLED.format(end=end))
+    subprocess.run([sys.executable, "-c", script, str(tmp_path)], timeout=60, check=False)
+    (run,) = list_runs(tmp_path)
+    assert run.status == status
+    killed = "KILL" in end
+    with open_recording(run.recording) as recording:
+        steps = list(recording.transitions("train"))
+        assert len(steps) == (3000 if killed else 3001)
+        assert [int(one["step"]) for one in steps] == list(range(len(steps)))
+        assert sum(1 for _ in recording.decoded(schema.SCALAR_TOPIC)) == 3000
+        assert recording.finished != killed
+    if killed:
+        from runner.recording.repair import repair
+
+        assert repair(run.recording).lossless
+    check_integrity(run.recording)
+
+
+def test_what_cannot_be_recorded_is_refused_with_what_can(tmp_path):
+    class Odd(Rooms):
+        def __init__(self) -> None:
+            super().__init__()
+            self.action_space = gymnasium.spaces.Box(-1, 1, (2,), np.longdouble)
+
+    with pytest.raises(EnvironmentNotUsable, match=r"the action space: found Box.*at most 64 bits"):
+        runner.record(Odd(), tmp_path)
+    with pytest.raises(ConfigError, match="frames_every: found an environment"):
+        runner.record(make("CartPole-v1"), tmp_path, frames_every=3)
+    with pytest.raises(ConfigError, match="info: found 'lives'"):
+        runner.record(make("CartPole-v1"), tmp_path, info="lives")
+    with pytest.raises(ConfigError, match="argument 'frame_every'"):
+        runner.record(make("CartPole-v1"), tmp_path, frame_every=3)
+    assert list_runs(tmp_path) == []
+
+
+def test_values_outside_of_their_space_are_told(tmp_path):
+    class Liar(gymnasium.Env[Any, Any]):
+        observation_space = gymnasium.spaces.Box(0, 1, (3,), np.float32)
+        action_space = gymnasium.spaces.Discrete(2)
+        answer: Any = np.zeros(4, np.float32)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+            return self.answer, {}
+
+    env = runner.record(Liar(), tmp_path)
+    with pytest.raises(RecordingError, match=r"shape \(4,\), expected \(3,\)"):
+        env.reset()
+    env.unwrapped.answer = np.full(3, 0.1)
+    with pytest.warns(RuntimeWarning, match="comes as float64 and is recorded, rounded, as the float32"):
+        env.reset()
+    env.close()
+
+
+def test_steps_need_a_reset_that_was_seen(tmp_path):
+    env = make("FrozenLake-v1")
+    env.reset()
+    with runner.record(env, tmp_path) as recorded_env, pytest.raises(ResetNeeded):
+        recorded_env.step(0)
+
+
+def test_nothing_is_recorded_after_the_end(tmp_path):
+    env = runner.record(make("FrozenLake-v1"), tmp_path)
+    env.close()
+    env.close()
+    with pytest.raises(RunnerError, match="is closed"):
+        env.reset()
+    with pytest.raises(RunnerError, match="is closed"):
+        env.log("x", 1)
+
+
+def test_frames_are_exact_and_carry_their_moment(tmp_path):
+    from io import BytesIO
+
+    from PIL import Image
+
+    plain, expected, steps, since = Rooms(), [], 0, 0
+    for entry in play(plain, 40):
+        since = 4 if entry[0] == "reset" else since - 1
+        steps += entry[0] == "step"
+        if entry[0] == "reset" or since == 0 or entry[4] or entry[5]:
+            since = 4
+            expected.append((steps, plain.render()))
+    with runner.record(Rooms(), tmp_path, frames_every=4) as rec:
+        list(play(rec, 40))
+    with open_recording(rec.run.recording) as recording:
+        found = list(recording.decoded(schema.TRAIN_FRAME))
+    assert len(expected) > 12
+    for one, (moment, pixels) in zip(found, expected, strict=True):
+        assert one["log_time"] == moment * schema.STEP_NANOSECONDS
+        assert np.array_equal(np.asarray(Image.open(BytesIO(one["data"]))), pixels)
+
+
+def test_a_run_says_what_it_was_recorded_from(tmp_path):
+    env = make("FrozenLake-v1")
+    with runner.record(env, tmp_path, name="mine", seed=4, config={"lr": 0.1, "net": [8, 8]}) as rec:
+        list(play(rec, 5))
+    run = find_run("mine", tmp_path)
+    config = run.facts["config"]
+    assert config["made_by"] == "runner.record"
+    assert config["config"] == {"lr": 0.1, "net": [8, 8]}
+    assert config["env"]["id"] == "FrozenLake-v1"
+    assert (run.seed, run.status) == (4, "finished")
+    with open_recording(run.recording) as recording:
+        assert recording.config == config
+        assert recording.spaces["action"] == {
+            "type": "Discrete",
+            "dtype": "<i8",
+            "shape": [],
+            "n": 4,
+            "start": 0,
+        }
+
+
+def test_two_loops_alike_have_the_same_digest(tmp_path):
+    runs = []
+    for chunk_steps in (256, 1024):
+        with runner.record(make("CartPole-v1"), tmp_path, chunk_steps=chunk_steps) as env:
+            list(play(env, 1500))
+        runs.append(env.run)
+    assert runs[0].summary["content_digest"] == runs[1].summary["content_digest"]
+
+
+def test_forked_children_and_pids_do_not_matter(tmp_path):
+    """A child that exits does not end its parent's recording."""
+    with runner.record(make("FrozenLake-v1"), tmp_path) as env:
+        list(play(env, 20))
+        child = os.fork() if hasattr(os, "fork") else None
+        if child == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if child:
+            os.waitpid(child, 0)
+        list(play(env, 20))
+    check_integrity(env.run.recording)

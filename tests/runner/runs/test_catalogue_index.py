@@ -1,0 +1,443 @@
+"""The index: right at once, whatever changes; never the only copy; no trouble with parallel use."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+import runner
+from runner.config import from_mapping
+from runner.errors import RunNotFound
+from runner.runs.catalogue import folders
+from runner.runs.catalogue import usage as usage_of
+from runner.runs.catalogue.database import index_path, opened
+from runner.runs.catalogue.filters import Filter, parse
+from runner.runs.catalogue.folders import Depth, Folders
+from runner.runs.catalogue.index import look
+from runner.runs.catalogue.lookup import find_run
+from runner.runs.labels import LABELS_FILE, Labels, change_labels, read_labels
+from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
+from runner.util.cache import EXPORTS, RESTORED
+
+CONFIG = from_mapping({"name": "some", "episodes": 5})
+ALL = Filter(None)
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "recordings"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """The folder of a finished run."""
+    made = tmp_path_factory.mktemp("one")
+    (made / "tiny.yaml").write_text("name: tiny\nepisodes: 4\nevaluation: {every: 2, trials: 2}\nseed: 1\n")
+    return runner.run(made / "tiny.yaml", recordings=made / "recordings").folder
+
+
+def rows(*folders, text=""):
+    told = []
+    found = look(folders, lambda index: index.select(parse(text)), told.append)
+    return found, told
+
+
+def ids(folder, text=""):
+    return [row["id"] for row in rows(folder, text=text)[0]]
+
+
+def aged(folder):
+    """Make everything in a folder look as if it had last changed an hour ago, and read it so."""
+    for path in folder.rglob("*"):
+        os.utime(path, (time.time() - 3600,) * 2)
+    ids(folder)
+
+
+def test_it_says_what_the_folder_says(folder, recorded):
+    shutil.copytree(recorded, folder / recorded.name)
+    (row,) = rows(folder)[0]
+    (run,) = list_runs(folder)
+    summary = run.summary
+    assert (row["id"], row["name"], row["seed"], row["status"]) == (run.run_id, "tiny", 1, "finished")
+    assert (row["digest"], row["episodes"]) == (summary["content_digest"], 4)
+    assert row["success_percent"] == summary["last_evaluation"]["success_percent"]
+    assert row["steps"] == summary["train_steps"] + summary["eval_steps"]
+    assert row["bytes"] == run.recording.stat().st_size
+    assert (row["mode"], row["environment"]) == ("cooperative", "dualtaxi:DualTaxi-v1")
+    assert row["host"] == os.uname().nodename
+    assert json.loads(row["settings"])["evaluation.every"] == 2
+
+
+def test_what_changes_is_seen_at_once(folder):
+    runs = [create_run(folder, CONFIG, seed) for seed in range(3)]
+    aged(folder)
+    assert len(ids(folder)) == 3
+    runs[0].update(status="finished", summary={"episodes": 5})
+    change_labels(runs[1].folder, lambda _: Labels("patient", ("keep",), "why"))
+    shutil.rmtree(runs[2].folder)
+    more = create_run(folder, CONFIG, 9)
+    (more.folder / RECORDING_FILE).write_bytes(b"123")
+    found = {row["id"]: row for row in rows(folder)[0]}
+    assert set(found) == {runs[0].run_id, runs[1].run_id, more.run_id}
+    assert (found[runs[0].run_id]["status"], found[runs[0].run_id]["episodes"]) == ("finished", 5)
+    assert (found[runs[1].run_id]["name"], found[runs[1].run_id]["tags"]) == ("patient", "keep")
+    assert found[more.run_id]["bytes"] == 3
+    assert ids(folder, "tag:keep note:why") == [runs[1].run_id]
+
+
+def test_only_what_changed_is_read(folder):
+    for seed in range(5):
+        create_run(folder, CONFIG, seed).update(status="finished")
+    aged(folder)
+    changed = list_runs(folder)[2].update(status="failed")
+    with contextlib.closing(opened(pytest.fail)) as database:
+        (difference,) = Folders(database, [str(folder)]).differences()
+    assert difference.changed == [changed.run_id]
+    assert ids(folder, "status:failed") == [changed.run_id]
+
+
+def test_a_change_within_the_same_moment_is_not_missed(folder):
+    run = create_run(folder, CONFIG, 1).update(status="finished")
+    ids(folder)
+    text = (run.folder / RUN_FILE).read_text()
+    before = (run.folder / RUN_FILE).stat()
+    (run.folder / RUN_FILE).write_text(text.replace('"finished"', '"failed"  '))
+    os.utime(run.folder / RUN_FILE, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert rows(folder)[0][0]["status"] == "failed"
+
+
+def test_a_run_whose_process_dies_is_interrupted_without_a_word(folder):
+    waiting = "import sys; from pathlib import Path; from runner.runs.run import create_run; \
+from runner.config import from_mapping; create_run(Path(sys.argv[1]), \
+from_mapping({'name': 'some', 'episodes': 5}), 1); print(flush=True); sys.stdin.read()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", waiting, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    process.stdout.readline()
+    aged(folder)
+    assert [row["status"] for row in rows(folder)[0]] == ["running"]
+    process.communicate(b"")
+    assert ids(folder, "status:running") == []
+    assert len(ids(folder, "status:interrupted")) == 1
+
+
+def test_a_run_is_found_in_the_recording_alone_and_keeps_its_labels(folder, recorded):
+    place = folder / recorded.name
+    shutil.copytree(recorded, place)
+    change_labels(place, lambda _: Labels(tags=("mine",)))
+    whole = rows(folder)[0][0]
+    (place / RUN_FILE).unlink()
+    alone = rows(folder)[0][0]
+    differing = {key for key in whole if whole[key] != alone[key]}
+    assert differing <= {"fingerprint", "mark", "settled", "seconds", "settings"}
+    assert json.loads(whole["settings"]) == json.loads(alone["settings"])
+
+
+@pytest.mark.parametrize(
+    "damage", ["deleted", "text", "truncated", "zeros inside", "foreign", "another version"]
+)
+def test_a_lost_or_damaged_index_is_made_anew(folder, damage):
+    made = [create_run(folder, CONFIG, seed).run_id for seed in range(40)]
+    ids(folder)
+    path = index_path()
+    match damage:
+        case "deleted":
+            path.unlink()
+        case "text":
+            path.write_text("no database" * 1000)
+        case "truncated":
+            path.write_bytes(path.read_bytes()[:5000])
+        case "zeros inside":
+            path.write_bytes(path.read_bytes()[:4096] + bytes(path.stat().st_size - 4096))
+        case "foreign":
+            path.unlink()
+            with sqlite3.connect(path) as other:
+                other.execute("CREATE TABLE runs (a)")
+        case "another version":
+            with sqlite3.connect(path) as other:
+                other.execute("PRAGMA user_version = 99")
+    found, told = rows(folder)
+    assert {row["id"] for row in found} == set(made)
+    assert (not told) == (damage == "deleted")
+    assert rows(folder)[1] == []
+
+
+def test_without_a_place_for_the_index_the_folders_are_read(folder, tmp_path, monkeypatch):
+    run = create_run(folder, CONFIG, 1)
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    found, told = rows(folder)
+    assert [row["id"] for row in found] == [run.run_id]
+    assert "cannot be used" in told[0]
+
+
+def test_the_index_is_never_needed(folder):
+    runs = [create_run(folder, CONFIG, seed) for seed in range(3)]
+    change_labels(runs[1].folder, lambda _: Labels("patient", ("keep",), "why"))
+    before = rows(folder)[0]
+    index_path().unlink()
+    assert rows(folder)[0] == before
+    assert look([folder], lambda index: index.select(ALL), anew=True) == before
+
+
+def test_several_folders_and_the_same_content_in_them(folder, recorded, tmp_path):
+    shutil.copytree(recorded, folder / "first")
+    shutil.copytree(recorded, tmp_path / "elsewhere" / "second")
+    both = [folder, tmp_path / "elsewhere"]
+    assert len(rows(*both)[0]) == 2
+    assert len(rows(folder)[0]) == 1
+    (original,) = look(both, lambda index: index.originals()).values()
+    assert original[2] == rows(folder)[0][0]["id"]
+    assert look([folder], lambda index: index.originals()) == {}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{}",
+        b"[" * 100_000,
+        b'{"run_id": "../a", "name": "a", "seed": 1, "status": "x", "created": "2026-01-01"}',
+        b" " * (9 << 20),
+    ],
+)
+def test_what_is_no_run_is_left_out(folder, content):
+    run = create_run(folder, CONFIG, 1)
+    (folder / "hostile").mkdir()
+    (folder / "hostile" / RUN_FILE).write_bytes(content)
+    assert ids(folder) == [run.run_id]
+    assert [each.run_id for each in list_runs(folder)] == [run.run_id]
+    assert look([folder], lambda index: len(index.problems())) == 1
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b'{"run_id": "a", "name": "a", "seed": -1, "status": "x", "created": "2026-01-01"}',
+        b'{"run_id": "a", "name": "a", "seed": 1, "status": "x", "created": "0001-01-01T00:00:00+14:00"}',
+        b'{"run_id": "a"}',
+    ],
+)
+def test_a_run_of_which_little_is_known_is_listed_as_damaged(folder, content):
+    (folder / "a").mkdir(parents=True)
+    (folder / "a" / RUN_FILE).write_bytes(content)
+    assert [(row["id"], row["status"]) for row in rows(folder)[0]] == [("a", "damaged")]
+    assert look([folder], lambda index: len(index.problems())) == 1
+
+
+def test_odd_values_do_no_harm(folder):
+    odd = {
+        "run_id": "odd",
+        "name": "\x1b[31mred\ud800\x00" + "n" * 100_000,
+        "seed": 2**64 - 1,
+        "status": "\x07",
+        "created": "2026-01-01T00:00:00.123456+01:00",
+        "recording": "../../etc/passwd",
+        "config": {
+            "name": 3,
+            "episodes": 10**400,
+            "deep": {"a": [{"b": float("inf")}]},
+            "k\ud800'\"": 1,
+            "env": [],
+        },
+        "summary": {
+            "episodes": "many",
+            "train_steps": True,
+            "last_evaluation": {"success_percent": float("nan")},
+        },
+    }
+    (folder / "odd").mkdir(parents=True)
+    (folder / "odd" / RUN_FILE).write_text(json.dumps(odd))
+    (row,) = rows(folder)[0]
+    assert (row["id"], row["seed"], row["episodes"], row["success_percent"]) == ("odd", 2**64 - 1, None, None)
+    assert len(row["name"]) <= 4000
+    assert list_runs(folder)[0].recording.parent == folder / "odd"
+    assert ids(folder, "seed:18446744073709551615") == ["odd"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[]",
+        '{"tags": "keep", "name": 3, "note": []}',
+        '{"tags": [1, "a b", "\\u001b"], "name": "a\\nb"}',
+        " " * (2 << 20),
+    ],
+)
+def test_hostile_labels_say_nothing(folder, content):
+    run = create_run(folder, CONFIG, 1)
+    (run.folder / LABELS_FILE).write_text(content)
+    assert read_labels(run.folder) == Labels()
+    assert ids(folder, "name:some NOT tag:*") == [run.run_id]
+
+
+def test_a_pipe_in_place_of_a_file_keeps_nobody_waiting(folder):
+    (folder / "pipe").mkdir(parents=True)
+    os.mkfifo(folder / "pipe" / RUN_FILE)
+    assert ids(folder) == []
+
+
+def test_runs_may_vanish_and_come_while_listing(folder):
+    stop = threading.Event()
+
+    def churn():
+        while not stop.is_set():
+            run = create_run(folder, CONFIG, 1)
+            shutil.rmtree(run.folder)
+
+    stays = create_run(folder, CONFIG, 2)
+    thread = threading.Thread(target=churn)
+    thread.start()
+    try:
+        for _ in range(30):
+            assert stays.run_id in ids(folder)
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_a_run_is_found_by_the_names_that_find_it_in_the_folder(folder):
+    runs = [create_run(folder, CONFIG, seed) for seed in range(3)]
+    change_labels(runs[1].folder, lambda _: Labels(name="patient"))
+    newest = max(runs, key=lambda run: (run.created, run.run_id))
+    assert find_run("patient", folder).run_id == runs[1].run_id
+    assert find_run("@latest", folder).run_id == newest.run_id
+    assert find_run(runs[0].run_id, folder) == find_run(runs[0].run_id[:7], folder) == runs[0]
+    for name, told in (
+        ("", "empty name"),
+        ("some", "answers to 2 runs"),
+        ("ptient", "Did you mean 'patient'"),
+    ):
+        with pytest.raises(RunNotFound, match=told):
+            find_run(name, folder)
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from runner.runs.catalogue.index import look
+from runner.runs.catalogue.filters import parse
+from types import SimpleNamespace
+from runner.runs.labels import Labels, change_labels
+from runner.runs.run import create_run
+config = SimpleNamespace(name="some", to_mapping=lambda: {"name": "some", "episodes": 5})
+folder, number = Path(sys.argv[1]), int(sys.argv[2])
+sys.stdin.readline()
+for turn in range(3):
+    run = create_run(folder, config, number)
+    change_labels(folder / "shared", lambda was: Labels(was.name, (*was.tags, f"p{number}.{turn}"), was.note))
+    run.update(status="finished", summary={"episodes": 5})
+    found = look([folder], lambda index: index.select(parse(f"id:{run.run_id} status:finished")), sys.exit)
+    assert [row["id"] for row in found] == [run.run_id]
+"""
+
+
+def test_twenty_processes_write_at_once(folder):
+    shared = create_run(folder, CONFIG, 0)
+    shared.folder.rename(folder / "shared")
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", WRITER, str(folder), str(number)],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        for number in range(20)
+    ]
+    for process in processes:
+        process.stdin.write(b"\n")
+        process.stdin.flush()
+    errors = [process.communicate(timeout=120)[1].decode() for process in processes]
+    assert errors == [""] * 20
+    assert len(ids(folder)) == 61
+    assert len(read_labels(folder / "shared").tags) == 60
+    with sqlite3.connect(index_path()) as database:
+        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    assert [path.name for path in Path(index_path()).parent.glob("*.tmp")] == []
+
+
+def renamed(run, name):
+    change_labels(run.folder, lambda _: Labels(name=name))
+
+
+def test_a_name_given_or_taken_away_just_now_is_known(folder):
+    runs = [create_run(folder, CONFIG, seed).update(status="finished") for seed in range(3)]
+    aged(folder)
+    renamed(runs[1], "patient")
+    assert find_run("patient", folder).run_id == runs[1].run_id
+    aged(folder)
+    renamed(runs[2], "patient")
+    with pytest.raises(RunNotFound, match="answers to 2 runs"):
+        find_run("patient", folder)
+    aged(folder)
+    renamed(runs[1], "other")
+    renamed(runs[2], "another")
+    with pytest.raises(RunNotFound, match="no run 'patient'"):
+        find_run("patient", folder)
+    newest = create_run(folder, CONFIG, 9)
+    assert find_run("@latest", folder).run_id == newest.run_id
+    assert find_run(newest.run_id[:7], folder).run_id == newest.run_id
+
+
+def test_making_the_index_anew_never_empties_it(folder, monkeypatch):
+    runs = [create_run(folder, CONFIG, seed) for seed in range(4)]
+    ids(folder)
+    seen = []
+    row_of = folders.row_of
+
+    def looking_on(run, size):
+        with contextlib.closing(sqlite3.connect(index_path())) as other:
+            seen.extend(other.execute("SELECT COUNT(*) FROM runs").fetchone())
+        return row_of(run, size)
+
+    monkeypatch.setattr(folders, "row_of", looking_on)
+    assert len(look([folder], lambda index: index.select(ALL), anew=True)) == 4
+    assert seen == [len(runs)] * 4
+
+
+def test_what_a_folder_uses_is_kept_until_something_in_it_changes(folder, monkeypatch):
+    run = create_run(folder, CONFIG, 1).update(status="finished")
+    run.recording.write_bytes(bytes(1000))
+    aged(folder)
+
+    def used():
+        (usage,) = usage_of.usages(look([folder], lambda index: index.select(ALL)))
+        return usage.contents.recording, usage.contents.left_over
+
+    assert used() == (1000, 0)
+    with monkeypatch.context() as patched:
+        patched.setattr(usage_of, "contents_of", pytest.fail)
+        assert used() == (1000, 0)
+    (run.folder / "recording.damaged-1.mcap").write_bytes(bytes(50))
+    for depth in (Depth.FILES, Depth.FOLDERS):
+        look([folder], lambda _: None, depth=depth)
+    assert used() == (1000, 50)
+    run.recording.write_bytes(bytes(2000))
+    assert used() == (2000, 50)
+
+
+def test_cached_files_count_for_the_run_whose_they_are(folder, tmp_path):
+    exports, restored = (tmp_path / "cache" / "dualtaxi" / part for part in (EXPORTS, RESTORED))
+    exports.mkdir(parents=True)
+    restored.mkdir()
+    (exports / "a-b-0123456789ab.rrd").write_bytes(bytes(1))
+    (exports / "a+b-0123456789ab.rrd").write_bytes(bytes(10))
+    (restored / "a-b-0123456789abcdef.mcap").write_bytes(bytes(100))
+    (restored / "a.c-0123456789abcdef.mcap").write_bytes(bytes(1000))
+    assert usage_of.cached(EXPORTS) == {"a-b": 1, "a": 10}
+    assert usage_of.cached(RESTORED) == {"a-b": 100, "a.c": 1000}
