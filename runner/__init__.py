@@ -13,7 +13,10 @@ The names below are imported when they are first used, so that `import runner` i
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
+
+from runner.util.version import __version__
 
 if TYPE_CHECKING:
     import runner.analysis.frames as frames  # noqa: PLR0402
@@ -26,13 +29,12 @@ if TYPE_CHECKING:
     from runner.runs.resolve import find_run
     from runner.runs.run import Run, list_runs
 
-__version__ = "0.1.0"
-
 __all__ = [
     "ExperimentConfig",
     "Recording",
     "Run",
     "RunnerError",
+    "__version__",
     "find_run",
     "frames",
     "list_runs",
@@ -71,3 +73,9 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+if "IPython" in sys.modules:  # a notebook or an IPython shell: show runs as reports
+    from runner.export.notebook import register_formatters
+
+    register_formatters()

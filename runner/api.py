@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runner.config import ConfigError, ExperimentConfig, RunTable, from_mapping, load
 from runner.config.job import Job, jobs_of
+from runner.config.names import checked_name
 from runner.runs.run import Run, create_run, recordings_folder, unless_empty
 
 if TYPE_CHECKING:  # both are imported late: a run is to stand on disk before NumPy and Numba are loaded
@@ -160,36 +161,6 @@ def abreast(
             yield from (run for each in under_way if (run := each.result()))
         finally:
             left.set()
-
-
-def checked_name(name: str | None) -> str | None:
-    """Return the name of a run if it can be one.
-
-    Raises:
-        ConfigError: it cannot.
-    """
-    import re
-
-    from runner.config.model import NAME_EXPECTED, NAME_PATTERN
-
-    if name is not None and not re.fullmatch(NAME_PATTERN, name):
-        raise ConfigError(f"name: found {name!r}, expected {NAME_EXPECTED}")
-    return name
-
-
-def checked_run_name(name: str | None) -> str | None:
-    """Return the name of a recorded loop, or a run's new name, if it can be one: as of `ALE/Pong-v5__ppo+1`.
-
-    Raises:
-        ConfigError: it cannot.
-    """
-    import re
-
-    from runner.runs.labels import RUN_NAME_EXPECTED, RUN_NAME_PATTERN
-
-    if name is not None and not re.fullmatch(RUN_NAME_PATTERN, name):
-        raise ConfigError(f"name: found {name!r}, expected {RUN_NAME_EXPECTED}")
-    return name
 
 
 class Interrupt:

@@ -1,8 +1,10 @@
-"""Imports go one way: a part of the runner knows those on the lines above its own, and no others."""
+"""Imports go one way, between the packages of the runner and between its modules, without exceptions."""
 
 from __future__ import annotations
 
 import ast
+import functools
+import graphlib
 import re
 import sys
 from collections.abc import Iterator
@@ -12,32 +14,25 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ORDER = """
-    amounts errors files
-    hashing cache compiled documents extras run_file
-    config owner labels
-    job toy_text scene estimate
-    mdp
-    environments words learning planning recording observer
-    provenance runs
-    finding locking
-    catalogue
-    frames packing
-    description
+    errors util
+    config
+    environments
+    learning planning
+    recording
+    runs
     replay
-    analysis
     archive
-    origin
-    execution export
-    verify
-    resume
-    again notebook sweep
-    api
+    analysis
+    execution
+    drawing
+    export
+    sweep
+    client
+    loops
     service
-    wrappers
+    api
     cli
 """
-SHOWN_BY = {("runs", "notebook"), ("frames", "archive")}
-"""A run shows itself in a notebook, and its frames come out of an archive, by parts imported when asked."""
 RANK = {part: rank for rank, line in enumerate(ORDER.split("\n")) for part in line.split()}
 FILES = {
     "runner": sorted((ROOT / "runner").rglob("*.py")),
@@ -76,17 +71,43 @@ def test_the_page_on_the_architecture_quotes_the_order():
     assert order in " ".join(page.split())
 
 
+def module_of(file: Path) -> str:
+    """Return the dotted name of a file of the runner."""
+    parts = file.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@functools.cache
+def module_imports() -> dict[str, set[str]]:
+    """Return the modules of the runner that each of its modules imports, also late or for types alone."""
+    modules = {module_of(file): file for file in FILES["runner"]}
+    imports: dict[str, set[str]] = {}
+    for module, file in modules.items():
+        found = set()
+        for names in imported(file):
+            dotted = ".".join(names)
+            found.add(dotted if dotted in modules else dotted.rpartition(".")[0])
+        imports[module] = (found & set(modules)) - {module}
+    return imports
+
+
 @pytest.mark.parametrize("part", RANK)
-def test_a_part_knows_only_what_comes_before_it(part):
-    known = {
-        names[1]
-        for file in FILES["runner"]
-        if part_of(file) == part
-        for names in imported(file)
-        if names[0] == "runner" and len(names) > 1
+def test_a_part_imports_only_what_comes_before_it(part):
+    wrong = {
+        (module, other)
+        for module, others in module_imports().items()
+        if module.split(".")[1:2] == [part]
+        for other in others
+        if other == "runner" or RANK[other.split(".")[1]] > RANK[part]
     }
-    later = {other for other in known & set(RANK) if RANK[other] >= RANK[part]}
-    assert later - {other for by, other in SHOWN_BY if by == part} <= {part}
+    assert wrong == set()
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    try:
+        tuple(graphlib.TopologicalSorter(module_imports()).static_order())
+    except graphlib.CycleError as error:
+        pytest.fail(" imports ".join(error.args[1]))
 
 
 def test_the_environment_and_the_runner_do_not_know_each_other():

@@ -14,7 +14,7 @@ from nbclient import NotebookClient
 
 import runner
 from runner.errors import MissingExtra
-from runner.export.notebook import facts_html, plot, report, rerun_view
+from runner.export.notebook import facts_html, plot, report, rerun_view, run_html
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))
 
@@ -27,7 +27,7 @@ def run(tmp_path_factory):
 
 
 def test_a_run_shows_its_report_in_a_frame_of_its_own(run):
-    shown = run._repr_html_()
+    shown = run_html(run)
     (page,) = re.findall(r'srcdoc="([^"]*)"', shown)
     assert run.run_id in shown
     assert "<h2" in html.unescape(page)
@@ -38,12 +38,12 @@ def test_a_run_shows_its_report_in_a_frame_of_its_own(run):
 def test_without_packages_or_recording_it_shows_its_facts(run, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "matplotlib", None)
-        shown = run._repr_html_()
+        shown = run_html(run)
     assert "[plots]" in shown
     assert run.run_id in shown
     assert "<iframe" not in shown
     gone = runner.Run(Path("/nowhere"), run.facts | {"name": "<b>"})
-    assert gone._repr_html_() == facts_html(gone)
+    assert run_html(gone) == facts_html(gone)
     assert "<b>" not in facts_html(gone)
 
 

@@ -17,8 +17,8 @@ from typing import Any, Final
 
 import click
 
-from runner import __version__
 from runner.errors import ConfigError, Located, RunnerError, StorageError, nearest
+from runner.util.version import __version__
 
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Do": {

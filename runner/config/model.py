@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
+from runner.config.names import NAME_EXPECTED, NAME_PATTERN
 from runner.config.schedules import Probability, StepSize
 from runner.config.sections import (
     Environment,
@@ -46,8 +47,6 @@ LEARNERS: dict[Mode, tuple[Tables, Rewards]] = {
 EXPLORATION: dict[Tables, Exploration] = {"joint": "shared", "per_agent": "independent"}
 """The exploration of a file that does not name one: separate learners explore independently of each other."""
 
-NAME_PATTERN = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$"
-NAME_EXPECTED = "1 to 100 letters, digits, '_', '.' or '-', not starting with '.' or '-'"
 Name = Annotated[str, Field(pattern=NAME_PATTERN, json_schema_extra={"patternErrorMessage": NAME_EXPECTED})]
 
 

@@ -37,6 +37,15 @@ class Shown:
         return self.html
 
 
+def register_formatters() -> None:
+    """Have the running IPython shell display each `Run` as its report; do nothing outside of a shell."""
+    from IPython import get_ipython
+
+    shell = get_ipython()
+    if shell is not None:
+        shell.display_formatter.formatters["text/html"].for_type(Run, run_html)
+
+
 def run_html(run: Run) -> str:
     """Return how a run shows itself: its report in a frame, or its facts where packages are missing."""
     if not run.recording.is_file():

@@ -29,11 +29,6 @@ LOCK_SECONDS: Final = 30.0
 
 _TAG: Final = re.compile(r"\w[\w.=+/@-]{0,63}")
 TAG_EXPECTED: Final = "1 to 64 letters, digits or any of _ . - = + / @, the first a letter, digit or _"
-RUN_NAME_PATTERN: Final = r"^[A-Za-z0-9_][A-Za-z0-9_.+/-]{0,99}$"
-"""Names of runs; a configuration's name, from which folders are named, has no `+` and no `/`."""
-RUN_NAME_EXPECTED: Final = (
-    "1 to 100 letters, digits, '_', '.', '-', '+' or '/', not starting with one of the last four"
-)
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from runner import __version__
 from runner.util.opening import as_utf8
+from runner.util.version import __version__
 
 PACKAGES = ("numpy", "numba", "llvmlite", "gymnasium", "mcap", "protobuf", "zstandard", "blake3", "pydantic")
 

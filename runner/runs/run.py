@@ -173,12 +173,6 @@ class Run:
         """Where else its recording is kept; false if nowhere."""
         return self.file.archive
 
-    def _repr_html_(self) -> str:
-        """Return how the run shows itself in a notebook."""
-        from runner.export.notebook import run_html
-
-        return run_html(self)
-
     def beat(self) -> None:
         """Say that the owner lives."""
         with contextlib.suppress(OSError):

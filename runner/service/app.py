@@ -12,7 +12,6 @@ import anyio
 import anyio.to_thread
 from fastapi import APIRouter, FastAPI
 
-from runner import __version__
 from runner.errors import RunnerError
 from runner.service import health, login, pages
 from runner.service.api import comparing, files, jobs, reading, replay, runs, uploads
@@ -30,6 +29,8 @@ from runner.service.security import Tokens
 from runner.service.sessions import Sessions
 from runner.service.settings import Settings
 from runner.sweep.names import sweeps_in
+from runner.sweep.state import sweeps_in
+from runner.util.version import __version__
 
 API: Final = "/api/v1"
 THREADS: Final = 8

@@ -28,7 +28,7 @@ def command(run_name: str, name: str | None, original: bool, recordings: Path | 
       dualtaxi rename @latest patient
       dualtaxi rename patient --original
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.api import checked_run_name
+    from runner.config.names import checked_run_name
     from runner.runs.run import relabel
 
     if original == (name is not None):

@@ -94,7 +94,8 @@ def command(
       dualtaxi run quick --set 'seeds={count: 100}' --set recording.steps=none --at-once 2
       dualtaxi run cooperative --live --live-every 100
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.api import checked_name, experiment_of, jobs_in
+    from runner.api import experiment_of, jobs_in
+    from runner.config.names import checked_name
     from runner.runs.run import recordings_folder
 
     experiment = experiment_of(config, overrides, seed)

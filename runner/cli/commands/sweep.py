@@ -115,7 +115,8 @@ def start(
       dualtaxi sweep start hyperparameters --workers 2
       dualtaxi sweep start hyperparameters --resume
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.api import checked_name, interruptible
+    from runner.api import interruptible
+    from runner.config.names import checked_name
     from runner.runs.run import recordings_folder
     from runner.sweep import state
     from runner.sweep.loading import load_sweep

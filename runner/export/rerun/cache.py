@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from runner import __version__
 from runner.errors import StorageError
 from runner.export.rerun.selection import Request, Selection, select
 from runner.export.rerun.writing import Source, export
@@ -15,6 +14,7 @@ from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.util.cache import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR
 from runner.util.cache import cache_folder as users_cache
+from runner.util.version import __version__
 
 KEPT: Final = 20
 """Exports in the cache; the ones that were not looked at for longest are removed."""

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from runner.analysis.summary import described
-from runner.api import checked_run_name
+from runner.config.names import checked_run_name
 from runner.runs.catalogue.columns import PROGRAMS, columns_of, with_originals
 from runner.runs.catalogue.columns import as_json as row_as_json
 from runner.runs.catalogue.filters import parse
