@@ -23,7 +23,7 @@ from blake3 import blake3
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
 from benchmarks.serving import Service, serving
-from runner.client.http import Client
+from runner.client.client import Client
 from runner.client.upload_source import Parcel
 from runner.execution.verify import verify
 from runner.runs.resolve import find_run

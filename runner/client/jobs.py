@@ -7,14 +7,16 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from runner.client.backoff import FIRST_PAUSE, ServerAway
 from runner.errors import RunnerError
-from runner.service.jobs.queue import OVER
 
 if TYPE_CHECKING:
-    from runner.client.http import Client
+    from runner.client.connection import Connection
+
+OVER: Final = ("finished", "failed", "cancelled")
+"""The states of a job in which nothing more happens unless somebody asks for it."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class Happened:
     """What to come back to; empty for progress."""
 
 
-def watch(client: Client, number: int) -> Iterator[Happened]:
+def watch(client: Connection, number: int) -> Iterator[Happened]:
     """Yield what happens to a job until it is over, whatever the connection does meanwhile.
 
     Args:
@@ -84,7 +86,7 @@ def watch(client: Client, number: int) -> Iterator[Happened]:
                 for happened in events_in(answer.iter_lines()):
                     place = happened.place or place
                     yield happened
-            if client.job(number).is_over:
+            if JobThere.of(client.ask("GET", f"/jobs/{number}").json()).is_over:
                 return
             time.sleep(FIRST_PAUSE)
         except ServerAway as error:

@@ -19,7 +19,8 @@ from typing import Final
 
 from runner.client.address import found_token
 from runner.client.backoff import ServerAway
-from runner.client.http import Client, Report
+from runner.client.client import Client
+from runner.client.connection import Report
 from runner.client.upload_source import Sent
 from runner.errors import RunnerError
 from runner.runs.locking import locked

@@ -12,7 +12,7 @@ from blake3 import blake3
 from filelock import FileLock, Timeout
 
 from runner.client.backoff import ServerAway, ServerError
-from runner.client.http import Client, Report
+from runner.client.connection import Connection, Report
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.packing.admission import Admitted, admit
 from runner.runs.labels import labels_from
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FOLDER: Final = ".pulling"
 
 
-def pull(client: Client, name: str, recordings: Path, report: Report = lambda *_: None) -> Admitted:
+def pull(client: Connection, name: str, recordings: Path, report: Report = lambda *_: None) -> Admitted:
     """Bring a run from a server into a folder of runs, with its labels.
 
     Args:
@@ -64,7 +64,7 @@ def pull(client: Client, name: str, recordings: Path, report: Report = lambda *_
         raise StorageError(f"{recordings}: cannot be written ({error.strerror}).") from error
 
 
-def _facts(client: Client, name: str) -> dict[str, Any]:
+def _facts(client: Connection, name: str) -> dict[str, Any]:
     """Return what the server says of a run that is over.
 
     Raises:
@@ -97,7 +97,7 @@ def _tag_and_size(answer: httpx2.Response) -> tuple[str, int]:
         raise ServerError(f"{answer.url}: found no length and ETag; is it a dualtaxi server?") from error
 
 
-def _fetch(client: Client, place: str, tag: str, size: int, part: Path, report: Report) -> None:
+def _fetch(client: Connection, place: str, tag: str, size: int, part: Path, report: Report) -> None:
     """Bring a file, from where it was cut off the last time.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Names of runs and experiments. A module of its own, because commands check a name before pydantic is loaded."""
+"""Names of runs and experiments, apart from the model so that a name is checked before pydantic loads."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def command(
     from runner.cli.progress import bytes_line
     from runner.cli.working import tell_received
     from runner.client.address import found_token
-    from runner.client.http import Client
+    from runner.client.client import Client
     from runner.runs.run import recordings_folder
 
     with (

@@ -25,7 +25,7 @@ from runner.errors import RunnerError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from runner.client.http import Report
+    from runner.client.connection import Report
     from runner.client.upload_source import Sent
     from runner.runs.run import Run
 
@@ -91,7 +91,7 @@ def _runs(
     names: tuple[str, ...], server: str, token: str | None, recordings: Path | None
 ) -> Iterator[tuple[str, Push]]:
     """Yield what is to be pushed, and what pushes it."""
-    from runner.client.http import Client
+    from runner.client.client import Client
     from runner.client.upload_source import Parcel
     from runner.packing.packing import SUFFIX
 
@@ -108,7 +108,7 @@ def _runs(
 
 def _outbox(server: str | None, token: str | None) -> Iterator[tuple[str, Push]]:
     """Yield the runs in the outbox, and what pushes each."""
-    from runner.client.http import Client
+    from runner.client.client import Client
     from runner.client.outbox import deliver, outbox_folder, waiting
 
     def push(run: Run, url: str, report: Report) -> tuple[Sent, str, int]:

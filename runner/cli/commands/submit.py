@@ -46,7 +46,7 @@ def command(
       dualtaxi submit hyperparameters --server http://localhost:8000 --watch
     """  # noqa: D301 - Click wants the backspace itself
     from runner.client.address import found_token
-    from runner.client.http import Client
+    from runner.client.client import Client
     from runner.config.shipped import config_path
 
     with Client(required(server), found_token(token, token_file), tell=say) as client:

@@ -22,6 +22,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Literal, Self, get_args
 
+from runner.client.jobs import OVER
 from runner.config.document import write_yaml
 from runner.errors import RunnerError, StorageError
 from runner.service.jobs.folder_lock import hold
@@ -37,8 +38,6 @@ CONFIG_FILE: Final = "config.yaml"
 RUNS_FILE: Final = "runs.json"
 EVENTS_FILE: Final = "events.jsonl"
 _LOCK: Final = f"{FOLDER}/queue.lock"
-OVER: Final = ("finished", "failed", "cancelled")
-"""States in which nothing more happens unless somebody asks for it."""
 MAX_JOB_BYTES: Final = 1 << 20
 MAX_RUNS_BYTES: Final = 8 << 20
 MAX_EVENTS_BYTES: Final = 8 << 20

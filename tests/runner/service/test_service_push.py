@@ -28,7 +28,7 @@ from runner.cli import cli
 from runner.client import http as client_module
 from runner.client.address import checked_url, found_token
 from runner.client.backoff import Patience, ServerAway, ServerError
-from runner.client.http import Client
+from runner.client.client import Client
 from runner.client.outbox import outbox_folder
 from runner.client.upload_source import Parcel, Sent
 from runner.packing.packing import pack

@@ -10,7 +10,7 @@ from served import Served
 from submitted import ENDLESS, ICY
 
 from runner.client.backoff import ServerError
-from runner.client.http import Client
+from runner.client.client import Client
 from runner.client.jobs import Happened, JobThere, events_in
 from runner.errors import RunnerError
 from runner.runs.run import list_runs

@@ -1,6 +1,6 @@
 """A client of the service: pushes runs, and pulls them, whatever the connection does meanwhile.
 
-    from runner.client.http import Client
+    from runner.client.client import Client
 
     with Client("http://localhost:8000") as client:
         client.push(runner.find_run("@latest", Path("recordings")))
@@ -10,21 +10,18 @@ What was sent before a connection broke is not sent again; the same run pushed t
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
-from urllib.parse import urlsplit
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
-from runner.client import jobs as watching
-from runner.client.address import checked_url
-from runner.client.backoff import Patience, ServerAway, ServerError
-from runner.client.jobs import Happened, JobThere
+from runner.client.backoff import ServerAway, ServerError
+from runner.client.connection import READ_BYTES, Connection, Report
+from runner.client.jobs import Happened, JobThere, watch
+from runner.client.pull import pull
 from runner.client.upload_source import Parcel, Sent
 from runner.errors import RunnerError
 from runner.runs.run import Run
-from runner.util.extras import require
 from runner.util.hashing import hash_of
 
 if TYPE_CHECKING:
@@ -32,62 +29,13 @@ if TYPE_CHECKING:
 
     from runner.packing.admission import Admitted
 
-API: Final = "/api/v1"
 PIECE: Final = 32 << 20
-"""So much is sent in one request; a proxy in front of the server must let it pass."""
-_READ: Final = 1 << 20
+"""The bytes of one request at most; a proxy in front of the server must accept them."""
 _WAIT_SECONDS: Final = 20
-_PASSING: Final = (408, 429, 500, 502, 503, 504, 507)
-"""What a server answers that may answer otherwise a little later."""
-
-Report = Callable[[int, int], object]
-"""Told how many bytes of how many are there."""
 
 
-class Client:
-    """A connection to a server; a context manager.
-
-    Args:
-        url: where it is, such as `http://localhost:8000`.
-        token: what lets it in; `found_token()` looks for one where it is usually kept.
-        patience: for so many seconds it is tried again when the server is away.
-        tell: told what is waited for meanwhile.
-
-    Raises:
-        RunnerError: it is no address of a server.
-        MissingExtra: HTTPX is not installed.
-    """
-
-    def __init__(
-        self,
-        url: str,
-        token: str | None = None,
-        patience: float = 60.0,
-        tell: Callable[[str], object] = lambda _: None,
-    ) -> None:
-        self.url = checked_url(url)
-        self._patience, self._tell = patience, tell
-        require("httpx2", extra="service", purpose="speaking to a server")
-        import httpx2
-
-        parts = urlsplit(self.url)
-        origin = f"{parts.scheme}://{parts.netloc}"
-        self._errors = httpx2.TransportError
-        self._http = httpx2.Client(
-            base_url=self.url + API,
-            headers={"Authorization": f"Bearer {token}"} if token else {"Origin": origin},
-            timeout=httpx2.Timeout(30.0, read=60.0),
-        )
-
-    def close(self) -> None:
-        """Close the connection."""
-        self._http.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self.close()
+class Client(Connection):
+    """A connection to a server, with everything that can be asked of it."""
 
     # --- jobs -----------------------------------------------------------------------------------------
 
@@ -109,8 +57,8 @@ class Client:
         return [JobThere.of(job) for job in told["jobs"]]
 
     def watch(self, number: int) -> Iterator[Happened]:
-        """Yield what happens to a job until it is over, as `watching.watch` does; it says what is raised."""
-        return watching.watch(self, number)
+        """Yield what happens to a job until it is over, as `jobs.watch` does; it says what is raised."""
+        return watch(self, number)
 
     def cancel(self, number: int) -> JobThere:
         """Have a job not be done, or stopped; what it has recorded is kept. Errors as of `ask`."""
@@ -120,18 +68,6 @@ class Client:
         """Have a job that failed or was cancelled go on; errors as of `ask`."""
         params = {"accept_changes": accept_changes}
         return JobThere.of(self.ask("POST", f"/jobs/{number}/resume", params=params).json())
-
-    @contextlib.contextmanager
-    def stream(self, path: str, headers: Mapping[str, str]) -> Iterator[httpx2.Response]:
-        """Give an answer that is read as it comes; errors as of `ask`, also while it is read."""
-        try:
-            with self._http.stream("GET", path, headers=dict(headers)) as answer:
-                if not answer.is_success:
-                    answer.read()
-                self._check(answer)
-                yield answer
-        except self._errors as error:
-            raise ServerAway(f"{self.url}: does not answer ({error or type(error).__name__}).") from error
 
     # --- pushing --------------------------------------------------------------------------------------
 
@@ -212,56 +148,8 @@ class Client:
     # --- pulling --------------------------------------------------------------------------------------
 
     def pull(self, name: str, recordings: Path, report: Report = lambda *_: None) -> Admitted:
-        """Bring a run into a folder of runs, as `pulling.pull` does; it says what is raised."""
-        from runner.client.pull import pull
-
+        """Bring a run into a folder of runs, as `pull.pull` does; it says what is raised."""
         return pull(self, name, recordings, report)
-
-    def download(self, path: str, tag: str, offset: int, size: int) -> Iterator[bytes]:
-        """Yield what a file has behind an offset.
-
-        Args:
-            path: where it is.
-            tag: its ETag.
-            offset: where to begin.
-            size: its bytes, all of them.
-
-        Raises:
-            ServerError: it is another file by now, or the server is away.
-        """
-        headers = {"Range": f"bytes={offset}-", "If-Range": tag, "Accept-Encoding": "identity"}
-        with self.stream(path, headers) as answer:
-            begins = f"bytes {offset}-{size - 1}/{size}"
-            if answer.headers.get("content-range") != begins:
-                raise ServerError(f"{self.url}: the recording has become another meanwhile; pull it again.")
-            yield from answer.iter_raw(_READ)
-
-    # --- all ------------------------------------------------------------------------------------------
-
-    def patience(self) -> Patience:
-        """Return what waits while the server is away."""
-        return Patience(self._patience, self._tell)
-
-    def ask(self, method: str, path: str, **request: Any) -> httpx2.Response:
-        """Return the answer to a request, which is no error.
-
-        Raises:
-            ServerError: the server refuses, or is away.
-        """
-        try:
-            answer = self._http.request(method, path, **request)
-        except self._errors as error:
-            raise ServerAway(f"{self.url}: does not answer ({error or type(error).__name__}).") from error
-        self._check(answer)
-        return answer
-
-    def _check(self, answer: httpx2.Response) -> None:
-        if answer.is_success:
-            return
-        kind = ServerAway if answer.status_code in _PASSING else ServerError
-        retry = answer.headers.get("retry-after", "")
-        seconds = float(retry) if retry.isdecimal() else 0.0
-        raise kind(f"{self.url}: {_message(answer)}", answer.status_code, seconds)
 
 
 class _Delivery:
@@ -345,7 +233,7 @@ def _pieces(stream: BinaryIO, size: int, path: Path) -> Iterator[bytes]:
         RunnerError: there are fewer.
     """
     while size:
-        piece = stream.read(min(_READ, size))
+        piece = stream.read(min(READ_BYTES, size))
         if not piece:
             raise RunnerError(f"{path}: became shorter while it was sent; try again.")
         size -= len(piece)
@@ -365,10 +253,3 @@ def _sent(answer: httpx2.Response) -> Sent:
         raise ServerError(
             f"{answer.url}: found another answer than a dualtaxi server gives; is the address right?"
         ) from error
-
-
-def _message(answer: httpx2.Response) -> str:
-    """Return what a server says is wrong."""
-    with contextlib.suppress(ValueError, KeyError, TypeError):
-        return str(answer.json()["error"]["message"])
-    return f"answers {answer.status_code} {answer.reason_phrase}; is it a dualtaxi server?"
