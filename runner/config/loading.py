@@ -18,13 +18,12 @@ from runner.config.file import ExperimentFile, SeedRange
 from runner.config.model import (
     EXPLORATION,
     LEARNERS,
-    NAME_EXPECTED,
-    NAME_PATTERN,
     OWN_SECTIONS,
     ExperimentConfig,
     Rewards,
     Tables,
 )
+from runner.config.names import NAME_EXPECTED, NAME_PATTERN
 from runner.config.overrides import override
 from runner.config.problems import found, problems_in, refuse
 from runner.config.sections import Recording

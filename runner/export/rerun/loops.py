@@ -13,10 +13,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from runner.analysis.evaluations import Evaluation
 from runner.analysis.frames import agents_of
-from runner.errors import RecordingError
-from runner.export.contents import shortcomings
 from runner.export.rerun.classes import vocabulary_of
 from runner.export.rerun.columns import Batch, Sender, scalars
 from runner.export.rerun.events import EventWriter
@@ -25,11 +22,8 @@ from runner.export.rerun.layout import Shown, draw_background, whole_axis
 from runner.export.rerun.lines import phase_colours, series_lines
 from runner.export.rerun.scene import TRAIL_STEPS, marks_of, scene_of
 from runner.export.rerun.selection import (
-    SPREAD_STEPS,
-    Request,
     Selection,
     Span,
-    chosen_spans,
 )
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -40,40 +34,6 @@ BATCH: Final = 8_192
 MOST_LINES: Final = 16
 """Numbers of an observation or action that are drawn as lines."""
 PHASES: Final = ("train", "eval")
-
-
-def select_loop(recording: Recording, request: Request) -> Selection:
-    """Return the steps of a loop that a request means: all, if there are not too many.
-
-    Raises:
-        RecordingError: an episode does not exist, or an evaluation is asked for, of which a loop has none.
-    """
-    if request.evaluations:
-        raise RecordingError(
-            f"{recording.path}: a loop has no numbered evaluations; --all exports all steps."
-        )
-    selection = Selection(warnings=shortcomings(recording))
-    if recording.kind == "variable":
-        selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
-    total = recording.count(schema.TRAIN_STEP)
-    if recording.environments > 1 or recording.kind == "variable" or total <= SPREAD_STEPS:
-        stop = total if request.everything else min(total, SPREAD_STEPS)
-        selection.train = [Span(0, stop, 0)] if stop else []
-    else:
-        selection.train = chosen_spans(recording, request)
-    tested = recording.count(schema.EVAL_STEP)
-    first = 0 if request.everything else max(0, tested - SPREAD_STEPS)
-    if tested:
-        selection.evaluations = [(Evaluation(0, 0, 0, 0), Span(first, tested, 0))]
-    shown = sum(span.stop - span.start for span in selection.train)
-    evaluated = f", {tested - first:,} of {tested:,} of evaluation" if tested else ""
-    whose = f"of {several} environments the first, in " if (several := recording.environments) > 1 else ""
-    selection.chosen.append(f"{whose}{shown:,} of {total:,} training steps{evaluated}")
-    if shown < total or first:
-        selection.left_out.append(
-            f"{total - shown + first:,} steps (--episodes START:STOP chooses; --all: everything)"
-        )
-    return selection
 
 
 class LoopExporter:

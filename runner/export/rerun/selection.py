@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import Evaluation, evaluation_after
+from runner.errors import RecordingError
 from runner.export.contents import has_steps, require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -89,9 +90,7 @@ def select(recording: Recording, request: Request) -> Selection:
         RecordingError: an episode or evaluation does not exist, or steps are asked for and not recorded.
     """
     if recording.kind != "job":
-        from runner.export.rerun.loops import select_loop
-
-        return select_loop(recording, request)
+        return _select_loop(recording, request)
     selection = Selection(warnings=shortcomings(recording))
     if recording.mdp.scene is None or recording.mdp.scene_cells is None:
         selection.warnings.append("The environment has no scene: state and action are shown as series.")
@@ -264,3 +263,37 @@ def _tell(
 
 def _steps(spans: Sequence[Any]) -> str:
     return f"{sum(span.stop - span.start for span in spans):,}"
+
+
+def _select_loop(recording: Recording, request: Request) -> Selection:
+    """Return the steps of a loop that a request means: all, if there are not too many.
+
+    Raises:
+        RecordingError: an episode does not exist, or an evaluation is asked for, of which a loop has none.
+    """
+    if request.evaluations:
+        raise RecordingError(
+            f"{recording.path}: a loop has no numbered evaluations; --all exports all steps."
+        )
+    selection = Selection(warnings=shortcomings(recording))
+    if recording.kind == "variable":
+        selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
+    total = recording.count(schema.TRAIN_STEP)
+    if recording.environments > 1 or recording.kind == "variable" or total <= SPREAD_STEPS:
+        stop = total if request.everything else min(total, SPREAD_STEPS)
+        selection.train = [Span(0, stop, 0)] if stop else []
+    else:
+        selection.train = chosen_spans(recording, request)
+    tested = recording.count(schema.EVAL_STEP)
+    first = 0 if request.everything else max(0, tested - SPREAD_STEPS)
+    if tested:
+        selection.evaluations = [(Evaluation(0, 0, 0, 0), Span(first, tested, 0))]
+    shown = sum(span.stop - span.start for span in selection.train)
+    evaluated = f", {tested - first:,} of {tested:,} of evaluation" if tested else ""
+    whose = f"of {several} environments the first, in " if (several := recording.environments) > 1 else ""
+    selection.chosen.append(f"{whose}{shown:,} of {total:,} training steps{evaluated}")
+    if shown < total or first:
+        selection.left_out.append(
+            f"{total - shown + first:,} steps (--episodes START:STOP chooses; --all: everything)"
+        )
+    return selection
