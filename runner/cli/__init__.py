@@ -64,8 +64,10 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "restore": ("runner.cli.commands.restore", "Bring the recording of an archived run back."),
     },
     "Hand on": {
-        "pack": ("runner.cli.commands.pack", "Put a run into one file, to hand to a colleague."),
-        "unpack": ("runner.cli.commands.unpack", "Take a run out of the file that `pack` wrote."),
+        "import": (
+            "runner.cli.commands.import_",
+            "Import a recording from elsewhere into the folder of runs.",
+        ),
         "push": ("runner.cli.commands.push", "Send runs to a server."),
         "pull": ("runner.cli.commands.pull", "Bring a run from a server."),
         "submit": ("runner.cli.commands.submit", "Have an experiment or a sweep done by a server."),

@@ -104,6 +104,19 @@ def counting(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 @contextlib.contextmanager
+def waiting(label: str) -> Iterator[None]:
+    """Show a spinner with a label and the time elapsed, where there is a terminal."""
+    with _line(
+        lambda rich: [
+            rich.SpinnerColumn(),
+            rich.TextColumn(label, markup=False),
+            rich.TimeElapsedColumn(),
+        ]
+    ):
+        yield
+
+
+@contextlib.contextmanager
 def _line(
     columns: Callable[[Any], list[Any]], total: float | None = None, **fields: Any
 ) -> Iterator[Callable[..., None] | None]:

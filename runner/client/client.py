@@ -27,7 +27,7 @@ from runner.util.hashing import hash_of
 if TYPE_CHECKING:
     import httpx2
 
-    from runner.packing.admission import Admitted
+    from runner.runs.importing import Imported
 
 PIECE: Final = 32 << 20
 """The bytes of one request at most; a proxy in front of the server must accept them."""
@@ -147,7 +147,7 @@ class Client(Connection):
 
     # --- pulling --------------------------------------------------------------------------------------
 
-    def pull(self, name: str, recordings: Path, report: Report = lambda *_: None) -> Admitted:
+    def pull(self, name: str, recordings: Path, report: Report = lambda *_: None) -> Imported:
         """Bring a run into a folder of runs, as `pull.pull` does; it says what is raised."""
         return pull(self, name, recordings, report)
 

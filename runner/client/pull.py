@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 from runner.client.backoff import ServerAway, ServerError
 from runner.client.connection import Connection, Report
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.packing.admission import Admitted, admit
+from runner.runs.importing import Imported, import_recording
 from runner.runs.labels import labels_from
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 FOLDER: Final = ".pulling"
 
 
-def pull(client: Connection, name: str, recordings: Path, report: Report = lambda *_: None) -> Admitted:
+def pull(client: Connection, name: str, recordings: Path, report: Report = lambda *_: None) -> Imported:
     """Bring a run from a server into a folder of runs, with its labels.
 
     Args:
@@ -47,12 +47,12 @@ def pull(client: Connection, name: str, recordings: Path, report: Report = lambd
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(part.with_suffix(".lock"), timeout=0):
             _fetch(client, place, tag, size, part, report)
-            admitted = admit(part, _said(facts), labels_from(facts), recordings)
+            imported = import_recording(part, recordings, _said(facts), labels_from(facts))
             part.unlink()
         part.with_suffix(".lock").unlink(missing_ok=True)
         with contextlib.suppress(OSError):  # another pull is under way, or was cut off
             folder.rmdir()
-        return admitted
+        return imported
     except Timeout as error:
         raise RunnerError(f"run {facts['run_id']} is being pulled by another process; let it.") from error
     except RecordingError as error:

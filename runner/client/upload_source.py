@@ -34,6 +34,8 @@ class Parcel:
                 f"run {run.run_id} is {run.status}; only one that is over and here can be pushed."
             )
         summary, labels = run.summary, run.labels
+        if run.stands_alone:  # an exported recording carries its own record of the run
+            return cls(run.recording, run.name, run.run_id, summary.get("content_digest"))
         told = {"name": run.file.name, "status": run.status, "proof": run.file.proof}
         told |= {key: summary.get(key) for key in ("seconds", "error")}
         return cls(

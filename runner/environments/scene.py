@@ -1,8 +1,7 @@
 """What a scene must be, so that whoever draws it, or says it in words, need not look again.
 
 An environment, or the recording of one, brings the scene along as plain data (see
-`runner.environments.mdp`); either
-may be anyone's.
+`runner.environments.mdp`); either may be anyone's.
 """
 
 from __future__ import annotations

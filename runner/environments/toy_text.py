@@ -1,9 +1,9 @@
 """What Gymnasium's own grid worlds do not say of themselves: scene, events, success; as data.
 
 Taxi-v4, FrozenLake-v1 and CliffWalking-v1 offer a transition table and no more. A `GridWorld` here adds
-to it what an environment of this project offers by itself (see `runner.environments.loading`): which cells there
-are, what stands where in each state, and which outcomes are events. It is worked out from the environment
-that was made, so that maps, rewards and slipperiness given as arguments are followed.
+to it what an environment of this project offers by itself (see `runner.environments.loading`): which
+cells there are, what stands where in each state, and which outcomes are events. It is worked out from
+the environment that was made, so that maps, rewards and slipperiness given as arguments are followed.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -33,17 +33,25 @@ from runner.recording.writer import RecordingFile
 from runner.util.opening import open_regular
 
 Times = NDArray[np.uint64]
-Change = Callable[[str, dict[str, str]], dict[str, str]]
-"""Takes the name and the entries of a metadata record, and gives the entries it shall have."""
+Change = Callable[[str, dict[str, str]], dict[str, str] | None]
+"""Takes the name and entries of a metadata record; returns its new entries, or None to leave it out."""
 
 _CHUNK_TIMES: Final = struct.Struct("<QQ")
 
 
-def rewrite(path: Path, fresh: Path, change: Change) -> None:
+def rewrite(
+    path: Path, fresh: Path, change: Change, more: Mapping[str, Mapping[str, str]] | None = None
+) -> None:
     """Write a recording into a new file with its metadata changed.
 
     Of a recording that was cut off, everything up to its last whole chunk is written; the new file has
     an index and a summary, and no result either.
+
+    Args:
+        path: the recording.
+        fresh: the new file.
+        change: what becomes of each metadata record.
+        more: metadata records to add, by name.
 
     Raises:
         RecordingError: the recording is damaged, not merely cut off.
@@ -56,18 +64,21 @@ def rewrite(path: Path, fresh: Path, change: Change) -> None:
         for opcode, offset, body in _whole_records(path):
             if opcode == Opcode.METADATA:
                 name, entries = metadata_of(body)
-                if name == "result":
-                    result = change(name, entries)
-                    continue
                 if name == "config":
                     indexed = asks_for_indexes(entries)
-                file.add_metadata(name, change(name, entries))
+                changed = change(name, entries)
+                if name == "result":
+                    result = changed
+                elif changed is not None:
+                    file.add_metadata(name, changed)
             elif opcode == Opcode.ATTACHMENT:
                 file.add_attachment(*attachment_of(body, offset))
             elif opcode == Opcode.CHUNK:
                 part, records = read_chunk(body, offset)
                 _, times, offsets = places(records, f"{path}: chunk at {offset}")
                 file.add_chunk(TOPIC_OF[part.channel], copied_chunk(part, body, times, offsets, indexed))
+        for name, added in (more or {}).items():
+            file.add_metadata(name, added)
         file.finish("" if result is None else "result", result)
 
 

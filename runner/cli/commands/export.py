@@ -11,6 +11,7 @@ from runner.errors import nearest
 
 FORMS: Final[dict[str, tuple[str, str]]] = {
     "rerun": ("runner.cli.commands.export_rerun", "For the Rerun viewer: every view of chosen episodes."),
+    "mcap": ("runner.cli.commands.export_mcap", "One file with everything, for `dualtaxi import`."),
     "parquet": ("runner.cli.commands.export_tables:parquet", "Steps, episodes and measures as Parquet."),
     "csv": ("runner.cli.commands.export_tables:csv", "Steps, episodes and measures as CSV."),
     "minari": ("runner.cli.commands.export_minari", "A Minari dataset, for offline learning."),

@@ -54,7 +54,7 @@ def command(
 ) -> None:
     """Send runs to a server, which lists them when it has verified every byte.
 
-    RUN may also be a file that `dualtaxi pack` wrote. What was sent before a connection broke is not sent
+    RUN may also be the path of a recording. What was sent before a connection broke is not sent
     again, and a run that the server has already is left as it is. With --outbox, the runs that
     `runner.record(env, "http://...")` could not send are sent now.
 
@@ -93,11 +93,9 @@ def _runs(
     """Yield what is to be pushed, and what pushes it."""
     from runner.client.client import Client
     from runner.client.upload_source import Parcel
-    from runner.packing.packing import SUFFIX
 
     def push(name: str, report: Report) -> tuple[Sent, str, int]:
-        packed = name.endswith(SUFFIX)
-        parcel = Parcel(Path(name), Path(name).stem) if packed else Parcel.of(find_recorded(name, recordings))
+        parcel = Parcel.of(find_recorded(name, recordings))
         sent = client.push(parcel, report)
         return sent, parcel.name, parcel.path.stat().st_size
 

@@ -106,7 +106,7 @@ def list_uploads(
 def begin(
     uploads: UploadsOf, owner: OwnerOf, announced: Announcement, request: Request, response: Response
 ) -> UploadAnswer:
-    """Announce a recording or a packed run, as far as is known: all of it may be unknown yet."""
+    """Announce a recording, as far as is known: all of it may be unknown yet."""
     upload, new = uploads.begin(owner, announced)
     if not new or upload.state == "stored":
         response.status_code = HTTPStatus.OK

@@ -93,7 +93,7 @@ class ToldLabels(BaseModel):
 
 
 class Completion(BaseModel):
-    """What was sent, once it is all there; `run` and `labels` belong to a recording without a pack."""
+    """What was sent, once it is all there; an exported recording has its own `run` and `labels`."""
 
     model_config = _FIRM
 

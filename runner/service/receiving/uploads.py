@@ -1,4 +1,4 @@
-"""Uploads: recordings and packed runs on their way into a folder of runs; what may be done with one when.
+"""Uploads: recordings on their way into a folder of runs; what may be done with one when.
 
 An upload is received, piece by piece and in order; then verified, by a process of its own; and then stored,
 which is one renaming, or refused.

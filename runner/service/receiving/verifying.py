@@ -19,13 +19,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from filelock import FileLock
-from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RunnerError, StorageError
 from runner.runs.labels import labels_from
 from runner.service.receiving.model import BODY_FILE, Completion, read_upload
 from runner.service.settings import without_folders
-from runner.util.files import sync
 from runner.util.hashing import hash_of
 
 PATIENCE_SECONDS: Final = 120.0
@@ -133,24 +131,17 @@ def judge(folder: Path, recordings: Path) -> Verdict:
 
 
 def _taken(body: Path, completion: Completion, recordings: Path) -> Verdict:
-    """Take a recording or a packed run into the folder of runs.
+    """Import a recording into the folder of runs.
 
     Raises:
-        RunnerError: it is neither, is damaged, or another run has its id.
+        RunnerError: it is damaged, or another run has its id.
     """
-    from runner.packing.admission import admit
-    from runner.packing.unpacking import unpack
+    from runner.runs.importing import import_recording
 
-    with body.open("rb") as stream:
-        bare = stream.read(len(MCAP0_MAGIC)) == MCAP0_MAGIC
-    if bare:
-        labels = labels_from(completion.labels.model_dump())
-        admitted = admit(body, _said(completion), labels, recordings)
-        return Verdict(admitted.run.run_id, admitted.already)
-    unpacked = unpack(body, recordings)
-    sync(unpacked.run.folder)
-    sync(recordings)
-    return Verdict(unpacked.run.run_id, unpacked.already)
+    details = _said(completion) if completion.run.model_fields_set else None
+    labels = labels_from(completion.labels.model_dump()) if completion.labels.model_fields_set else None
+    imported = import_recording(body, recordings, details, labels)
+    return Verdict(imported.run.run_id, imported.already)
 
 
 def _said(completion: Completion) -> dict[str, Any]:

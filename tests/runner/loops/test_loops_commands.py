@@ -1,4 +1,4 @@
-"""What is recorded from a loop is listed, plotted, compared, checked and packed like every other run."""
+"""What is recorded from a loop is listed, plotted, compared, checked and exported like every other run."""
 
 from __future__ import annotations
 
@@ -339,11 +339,10 @@ def test_the_grid_of_a_loop_is_played(folder):
     assert "player" in done.stdout
 
 
-def test_a_loop_is_packed_and_unpacked_to_the_same_bytes(folder, tmp_path):
-    assert dualtaxi(folder, "pack", "rooms", "-o", str(tmp_path / "rooms.pack")).exit_code == 0
-    done = CliRunner().invoke(
-        cli, ["unpack", str(tmp_path / "rooms.pack"), "--recordings", str(tmp_path / "there")]
-    )
+def test_a_loop_is_exported_and_imported_with_the_same_content(folder, tmp_path):
+    file = str(tmp_path / "rooms.mcap")
+    assert dualtaxi(folder, "export", "mcap", "rooms", "-o", file).exit_code == 0
+    done = CliRunner().invoke(cli, ["import", file, "--recordings", str(tmp_path / "there")])
     assert done.exit_code == 0, done.output
     there = runner.find_run("rooms", tmp_path / "there")
     assert there.summary["content_digest"] == runner.find_run("rooms", folder).summary["content_digest"]

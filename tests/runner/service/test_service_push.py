@@ -25,13 +25,13 @@ from served import Served
 
 import runner
 from runner.cli import cli
-from runner.client import http as client_module
+from runner.client import client as client_module
 from runner.client.address import checked_url, found_token
 from runner.client.backoff import Patience, ServerAway, ServerError
 from runner.client.client import Client
 from runner.client.outbox import outbox_folder
 from runner.client.upload_source import Parcel, Sent
-from runner.packing.packing import pack
+from runner.export.mcap import export_mcap
 from runner.runs.labels import change_labels
 from runner.runs.resolve import find_run
 from runner.runs.run import list_runs
@@ -114,9 +114,10 @@ def test_a_run_is_pushed_and_pulled_with_all_that_is_known_of_it(server, run, re
     assert [path.name for path in (tmp_path / "back").iterdir()] == [run.run_id]
 
 
-def test_a_packed_run_is_pushed_as_it_is(server, recordings, tmp_path):
+def test_an_exported_file_is_pushed_like_its_run(server, recordings, tmp_path):
     run = find_run("second", recordings)
-    packed = pack(run, tmp_path / "a.dualtaxi").path
+    change_labels(run.folder, lambda labels: replace(labels, note="seen"))
+    packed = export_mcap(run, tmp_path / "a.mcap").path
     result = dualtaxi("push", packed, "--server", server.url)
     assert (result.exit_code, "stored" in result.stdout) == (0, True)
     assert find_run(run.run_id, server.recordings).recording.read_bytes() == run.recording.read_bytes()

@@ -19,7 +19,7 @@ from runner.config.job import Job
 from runner.errors import RunnerError, RunNotFound, StorageError
 from runner.execution.resume import resume
 from runner.execution.session import run_job
-from runner.packing.packing import pack
+from runner.export.mcap import export_mcap
 from runner.runs.labels import Labels, change_labels
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
@@ -95,11 +95,11 @@ def test_a_recording_becomes_the_run_it_is(uploads, taxis, tmp_path):
     assert not (tmp_path / "runs" / FOLDER / upload.upload_id / "body").exists()
 
 
-def test_a_packed_run_is_taken_with_its_labels(uploads, lake, tmp_path):
+def test_an_exported_recording_is_stored_with_its_labels(uploads, lake, tmp_path):
     shutil.copytree(lake.folder, tmp_path / "mine" / lake.run_id)
     run = find_run(lake.run_id, tmp_path / "mine")
     change_labels(run.folder, lambda labels: replace(labels, tags=("good",), note="seen"))
-    data = pack(run, tmp_path / "a.dualtaxi").path.read_bytes()
+    data = export_mcap(run, tmp_path / "a.mcap").path.read_bytes()
     stored = send(uploads, data)
     assert (stored.state, stored.run_id) == ("stored", lake.run_id)
     assert find_run(lake.run_id, tmp_path / "runs").labels == Labels("", ("good",), "seen")

@@ -1,0 +1,54 @@
+"""`dualtaxi export mcap`: a run as one file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from runner.cli.finding import find_recorded
+from runner.cli.options import json_option, recordings_option, run_argument
+from runner.cli.output import draw, facts, print_json, say, size
+
+
+@click.command("mcap")
+@run_argument
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="The file to write.  [default: NAME-RUN.mcap]",
+)
+@click.option(
+    "--anonymous", is_flag=True, help="Leave out host, user, command line and folder, wherever they stand."
+)
+@click.option("--force", is_flag=True, help="Replace the file if it exists.")
+@recordings_option
+@json_option
+def command(
+    run_name: str, output: Path | None, anonymous: bool, force: bool, recordings: Path | None, as_json: bool
+) -> None:
+    """Write RUN into one MCAP file with its labels, for `dualtaxi import` on another machine.
+
+    Every MCAP reader opens the file. The same run gives the same bytes. An interrupted run can be exported,
+    and stays interrupted.
+
+    \b
+    Examples:
+      dualtaxi export mcap @latest
+      dualtaxi export mcap k3v9m2xq --anonymous -o for_review.mcap
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.progress import waiting
+    from runner.export.mcap import export_mcap
+
+    run = find_recorded(run_name, recordings)
+    path = output or Path(f"{run.file_stem}.mcap")
+    with waiting(f"exporting {run.run_id}"):
+        exported = export_mcap(run, path, anonymous, force)
+    for warning in exported.warnings:
+        say(warning)
+    if as_json:
+        print_json({"path": str(path.absolute()), "bytes": path.stat().st_size, "anonymous": anonymous})
+        return
+    draw(facts({"file": f"{path}  {size(path.stat().st_size)}", "next": f"dualtaxi import {path}"}))

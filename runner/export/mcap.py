@@ -1,0 +1,107 @@
+"""A run as one MCAP file to give away: the recording, with the run's labels in its metadata."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from runner.errors import RunnerError
+from runner.export.places import write_new
+from runner.recording.reader import open_recording
+from runner.recording.rewriting import rewrite
+from runner.runs.importing import EXPORT_RECORD
+from runner.runs.labels import Labels, as_json
+from runner.runs.run import Run
+
+PRIVATE: Final = ("host", "user", "command", "directory")
+"""The entries of provenance that name persons and places."""
+LEFT_OUT: Final = "left out"
+
+
+@dataclass(frozen=True)
+class Exported:
+    """The result of an export."""
+
+    path: Path
+    warnings: tuple[str, ...]
+    """What an anonymous file still tells of persons or places."""
+
+
+def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = False) -> Exported:
+    """Write a run into one MCAP file, which `import_recording` reads; the same run gives the same bytes.
+
+    Args:
+        run: a run that is not running; an interrupted one stays interrupted.
+        target: the file to write.
+        anonymous: leave out host, user, command line and folder, and the text of an error.
+        force: replace an existing file.
+
+    Raises:
+        RunnerError: the run is running or only in an archive, or the file exists.
+        RecordingError: the recording is damaged.
+        StorageError: the file cannot be written.
+    """
+    if run.status == "running":
+        raise RunnerError(f"run {run.run_id} is running; wait until it has finished, or interrupt it.")
+    if run.status == "archived":
+        raise RunnerError(f"run {run.run_id} is only in an archive; `dualtaxi restore` brings it back.")
+    if not target.absolute().parent.is_dir():
+        raise RunnerError(f"{target}: its folder does not exist; choose another place by -o.")
+    record = {"json": json.dumps(_record(run, anonymous), sort_keys=True, ensure_ascii=False)}
+
+    def change(name: str, entries: dict[str, str]) -> dict[str, str] | None:
+        if name == EXPORT_RECORD:
+            return None
+        return _without_names(name, entries) if anonymous else entries
+
+    def write(fresh: Path) -> None:
+        rewrite(run.recording, fresh, change, {EXPORT_RECORD: record})
+
+    write_new(target, force, write)
+    return Exported(target, tuple(_warnings(run)) if anonymous else ())
+
+
+def _record(run: Run, anonymous: bool) -> dict[str, Any]:
+    """Return what an importer cannot know from the recording alone."""
+    summary = {key: run.summary[key] for key in ("seconds", "error", "bytes") if key in run.summary}
+    if anonymous and "error" in summary:
+        summary["error"] = LEFT_OUT
+    record: dict[str, Any] = {"anonymous": anonymous, "status": run.status, "name": run.file.name}
+    record |= {"summary": summary, "labels": as_json(run.labels)}
+    return record | ({"proof": run.file.proof} if run.file.proof else {})
+
+
+def _without_names(name: str, entries: dict[str, str]) -> dict[str, str]:
+    """Return the entries of a metadata record without host, user, command line and folder."""
+    if name in {"provenance", "rerecord"} or name.startswith("resume/"):
+        return {key: text for key, text in entries.items() if key not in PRIVATE}
+    if name == "result" and "json" in entries:
+        result = json.loads(entries["json"])
+        if "error" in result:
+            return entries | {"json": json.dumps(result | {"error": LEFT_OUT}, sort_keys=True)}
+    return entries
+
+
+def _warnings(run: Run) -> Iterator[str]:
+    """Yield what stays in an anonymous file although it may tell of a person or a place."""
+    with open_recording(run.recording) as recording:
+        for key, text in _texts(recording.config, ""):
+            if Path(text).is_absolute():
+                yield f"The configuration names a path, which is part of the job and stays: {key}: {text}"
+    if run.labels != Labels():
+        yield "The labels of the run (name, tags and note) stay as they are."
+
+
+def _texts(value: Any, place: str) -> Iterator[tuple[str, str]]:
+    """Yield the place and text of every text in a configuration."""
+    if isinstance(value, str):
+        yield place, value
+    elif isinstance(value, Mapping):
+        for key, part in value.items():
+            yield from _texts(part, f"{place}.{key}" if place else str(key))
+    elif isinstance(value, list):
+        for k, part in enumerate(value):
+            yield from _texts(part, f"{place}[{k}]")

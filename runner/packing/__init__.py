@@ -1,1 +1,0 @@
-"""A run as a single file, to hand to a colleague: packed, and unpacked with nothing in it believed."""

@@ -1,0 +1,311 @@
+"""Taking a recording from elsewhere into a folder of runs; it is checked completely before it appears there.
+
+An upload to the service, a pulled run and a file written by `dualtaxi export mcap` all come in this way.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from runner.config.names import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN
+from runner.errors import RecordingError, RunnerError, StorageError
+from runner.recording.integrity import is_merely_cut_off
+from runner.recording.reader import Recording, open_recording
+from runner.recording.rewriting import content_of, continues, rewrite
+from runner.recording.run_file import parse_run_file
+from runner.runs.catalogue.lookup import with_id
+from runner.runs.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, change_labels, labels_from
+from runner.runs.locking import locked
+from runner.runs.run import MADE_BY, RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at, runs_in
+from runner.util.files import sync, write_whole
+
+EXPORT_RECORD: Final = "export"
+"""The metadata record of an exported recording: what `run.json` and the labels say, as JSON."""
+UNFINISHED: Final = ("interrupted", "failed")
+"""The statuses of a run that a longer recording of it may replace."""
+MAX_ERROR: Final = 10_000
+"""Characters of an error text that are kept."""
+
+
+class Occupied(RunnerError):
+    """Another run of this id is there already: `run`."""
+
+    def __init__(self, run: Run, recordings: Path) -> None:
+        super().__init__(
+            f"{recordings}: found another run {run.run_id} ({run.title}, {run.status}) "
+            "with other content, and neither continues the other."
+        )
+        self.run = run
+
+
+@dataclass(frozen=True)
+class Imported:
+    """The result of importing a recording."""
+
+    run: Run
+    content_digest: str
+    already: bool
+    """Whether the folder had the run before, with this content or more; nothing was written then."""
+    anonymous: bool = False
+    """Whether the file was exported without the names of persons and places."""
+
+
+def import_recording(
+    recording: Path,
+    recordings: Path,
+    details: Mapping[str, Any] | None = None,
+    labels: Labels | None = None,
+    as_new: bool = False,
+) -> Imported:
+    """Import a recording into a folder of runs; the file stays where it is.
+
+    An interrupted run that is there already is replaced by a recording that continues it, and keeps its
+    labels. When this returns the run is on disk, even if the power fails now.
+
+    Args:
+        recording: the file, which nobody writes to any more. If nothing in it changes and it is on the same
+            disk, it is linked instead of copied.
+        recordings: the folder of runs; created if it is missing.
+        details: what `run.json` says where the run comes from; the file's own record of it by default. What
+            the recording contradicts or cannot know is ignored.
+        labels: name, tags and note of the run; the file's own record of them by default.
+        as_new: give the run a new id, so that it can stand next to another run of its id.
+
+    Raises:
+        RecordingError: the recording is damaged or inconsistent; nothing was written.
+        Occupied: another run of this id is there.
+        RunnerError: another process is working on the run that is there.
+        StorageError: the folder cannot be written, or has too little space.
+    """
+    with open_recording(recording) as opened:
+        exported = _export_record(opened)
+        facts = _checked_facts(opened, exported if details is None else details)
+        finished = opened.finished
+    if not finished and not is_merely_cut_off(recording):
+        raise RecordingError(f"{recording}: is damaged, not merely cut off; `dualtaxi repair` mends it.")
+    if labels is None:
+        found = exported.get("labels")
+        labels = labels_from(found) if isinstance(found, dict) else Labels()
+    digest, anonymous = content_of(recording), exported.get("anonymous") is True
+    run_id = new_run_id(recordings) if as_new else str(facts["run_id"])
+    try:
+        run = None if as_new else _same_run(run_id, digest, recordings)
+    except Occupied as occupied:
+        with _staging_folder(recordings, recording) as folder:
+            _place(recording, folder / RECORDING_FILE, facts, rewritten=bool(exported))
+            run, already = _continue_or_keep(occupied, folder / RECORDING_FILE, facts, labels)
+        return Imported(run, digest, already, anonymous)
+    if run is not None:
+        return Imported(_finish(run, facts), digest, already=True, anonymous=anonymous)
+    with _staging_folder(recordings, recording) as folder:
+        facts["run_id"] = run_id
+        _place(recording, folder / RECORDING_FILE, facts, rewritten=as_new or bool(exported))
+        (folder / RUN_FILE).write_bytes(facts_bytes(facts))
+        if labels != Labels():
+            write_whole(folder / LABELS_FILE, as_json(labels))
+        for path in (*folder.iterdir(), folder):
+            sync(path)
+        folder.rename(recordings / run_id)
+        sync(recordings)
+    return Imported(run_at(recordings / run_id), digest, already=False, anonymous=anonymous)
+
+
+def run_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the contents of `run.json`: the recording's own, and what only its owner can know.
+
+    Name, status, duration, error text and the digest of a recording without steps are taken from `details`
+    where they are of the right type. Only the recording can say that the run finished.
+    """
+    facts = recording.run_facts()
+    summary, given = dict(facts["summary"]), details.get("summary")
+    given = given if isinstance(given, dict) else {}
+    seconds, error = given.get("seconds"), given.get("error")
+    if isinstance(seconds, int | float) and not isinstance(seconds, bool) and 0 <= seconds < 1e12:
+        summary["seconds"] = seconds
+    if isinstance(error, str) and len(error) <= MAX_ERROR:
+        summary["error"] = error
+    if "content_digest" in summary or "bytes" in given:
+        summary["bytes"] = recording.size
+    if isinstance(details.get("name"), str):
+        facts["name"] = details["name"]
+    reached = ("finished",) if facts["status"] == "finished" else ()
+    if details.get("status") in (*UNFINISHED, *reached):
+        facts["status"] = details["status"]
+    proof = details.get("proof")
+    if isinstance(proof, str) and len(proof) == 64 and proof.isalnum():
+        facts["proof"] = proof
+    return facts | {"summary": summary}
+
+
+def facts_bytes(facts: Mapping[str, Any]) -> bytes:
+    """Return the contents of `run.json` as bytes."""
+    return json.dumps(facts, indent=1, ensure_ascii=False).encode() + b"\n"
+
+
+def _export_record(recording: Recording) -> dict[str, Any]:
+    """Return what an exported recording says of its run, empty for any other recording."""
+    if EXPORT_RECORD not in recording.metadata_names:
+        return {}
+    try:
+        found = json.loads(recording.metadata(EXPORT_RECORD)["json"])
+    except (KeyError, ValueError, RecursionError) as error:
+        raise RecordingError(f"{recording.path}: the metadata {EXPORT_RECORD!r} is not JSON.") from error
+    return found if isinstance(found, dict) else {}
+
+
+def _checked_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the contents of `run.json`.
+
+    Raises:
+        RecordingError: the recording says something that no run can be.
+    """
+    try:
+        facts = run_facts(recording, details)
+        problems = parse_run_file(facts).problems
+        made_by = recording.provenance
+    except (ValueError, TypeError, KeyError) as error:
+        raise RecordingError(f"{recording.path}: its description of the run is invalid ({error}).") from error
+    if problems:
+        raise RecordingError(
+            f"{recording.path}: its description of the run is invalid ({'; '.join(problems)})."
+        )
+    named = re.fullmatch(NAME_PATTERN, facts["run_id"]) and re.fullmatch(RUN_NAME_PATTERN, facts["name"])
+    if not named or not 0 <= facts["seed"] < 1 << 64:
+        raise RecordingError(
+            f"{recording.path}: found the run {facts['run_id'][:100]!r} ({facts['name'][:100]!r}, seed "
+            f"{facts['seed']}), expected an id of {NAME_EXPECTED}; a seed of 64 bits."
+        )
+    return facts | {"provenance": {key: made_by[key] for key in MADE_BY if key in made_by}}
+
+
+def _same_run(run_id: str, content_digest: str, recordings: Path) -> Run | None:
+    """Return the run of this id and content in the folder; None if the id is free.
+
+    Raises:
+        Occupied: a run of this id has other content.
+        StorageError: something that is not a run has its name.
+    """
+    taken = with_id(run_id, recordings)
+    found = taken and next(runs_in(Path(taken.root, taken.entry)), None)
+    if found is None:
+        if os.path.lexists(recordings / run_id):
+            raise StorageError(f"{recordings / run_id}: exists and is not a run; move it away.")
+        return None
+    with contextlib.suppress(RecordingError):
+        if content_of(found.recording) == content_digest:
+            return found
+    raise Occupied(found, recordings)
+
+
+def _continue_or_keep(
+    occupied: Occupied, recording: Path, facts: Mapping[str, Any], labels: Labels
+) -> tuple[Run, bool]:
+    """Return the run that is there, and whether it already holds all of the recording.
+
+    If it did not finish and the recording continues it, the recording takes the place of its own. Should this
+    be interrupted, `_finish` completes it when the same recording is imported again.
+
+    Raises:
+        Occupied: neither continues the other.
+        RunnerError: another process is working on the run.
+        StorageError: the folder cannot be written; nothing was lost.
+    """
+    there = occupied.run
+    if there.status in (*UNFINISHED, "finished") and not there.stands_alone:
+        with contextlib.suppress(RecordingError):
+            if continues(there.recording, recording):
+                return there, True
+    if there.status not in UNFINISHED or there.stands_alone:
+        raise occupied
+    with locked(there) as run:
+        if run.status not in UNFINISHED or not continues(recording, run.recording):
+            raise occupied
+        change_labels(run.folder, lambda own: _merged(own, labels))
+        try:
+            sync(recording)
+            recording.replace(run.recording)
+            sync(run.folder)
+            return _with_facts(run, facts), False
+        except OSError as error:
+            raise StorageError(f"{run.folder}: cannot be written ({error.strerror}).") from error
+
+
+def _finish(run: Run, facts: Mapping[str, Any]) -> Run:
+    """Return the run; if its recording is complete but its `run.json` does not say so, update that."""
+    if facts["status"] != "finished" or run.status not in UNFINISHED or run.stands_alone:
+        return run
+    with locked(run) as there:
+        return _with_facts(there, facts) if there.status in UNFINISHED else there
+
+
+def _with_facts(run: Run, facts: Mapping[str, Any]) -> Run:
+    """Replace what `run.json` says of the recording; keep what it says of its folder."""
+    kept = {key: value for key, value in run.facts.items() if key not in ("owner", "proof", "summary")}
+    write_whole(run.folder / RUN_FILE, kept | dict(facts))
+    return run_at(run.folder)
+
+
+def _merged(own: Labels, more: Labels) -> Labels:
+    """Return the labels of both sides; of name and note, the own ones come first."""
+    tags = tuple(sorted({*own.tags, *more.tags})[:MAX_TAGS])
+    return Labels(own.name or more.name, tags, own.note or more.note)
+
+
+def _place(source: Path, target: Path, facts: dict[str, Any], rewritten: bool) -> None:
+    """Put a recording at its place, and its size there into the facts.
+
+    Args:
+        source: the recording.
+        target: its place; on the same disk it is a link, unless it is rewritten.
+        facts: what `run.json` is going to say.
+        rewritten: write it with the id of the facts and without its export record.
+
+    Raises:
+        OSError: the target cannot be written.
+    """
+
+    def change(name: str, entries: dict[str, str]) -> dict[str, str] | None:
+        if name == EXPORT_RECORD:
+            return None
+        return entries | {"run_id": facts["run_id"]} if name == "run" else entries
+
+    if rewritten:
+        rewrite(source, target, change)
+    else:
+        try:
+            os.link(source, target)
+        except OSError:  # another disk, or one without links
+            shutil.copyfile(source, target)
+    if "bytes" in facts["summary"]:
+        facts["summary"]["bytes"] = target.stat().st_size
+
+
+@contextlib.contextmanager
+def _staging_folder(recordings: Path, recording: Path) -> Iterator[Path]:
+    """Give a folder inside a hidden one, on the disk of the recordings; both are removed afterwards."""
+    created = not recordings.exists()
+    hidden = recordings / f".importing-{secrets.token_hex(4)}"
+    try:
+        (hidden / "run").mkdir(parents=True)
+        size, free = recording.stat().st_size, shutil.disk_usage(hidden).free
+        if size > free:
+            raise StorageError(f"{recordings}: found {free:,} bytes free, expected {size:,}; free some disk.")
+        yield hidden / "run"
+    except OSError as error:
+        raise StorageError(
+            f"{recordings}: cannot be written ({error.strerror}); nothing was imported."
+        ) from error
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
+        if created:
+            with contextlib.suppress(OSError):
+                recordings.rmdir()
