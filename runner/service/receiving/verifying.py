@@ -22,7 +22,7 @@ from filelock import FileLock
 
 from runner.errors import RunnerError, StorageError
 from runner.runs.labels import labels_from
-from runner.service.receiving.model import BODY_FILE, Completion, read_upload
+from runner.service.receiving.model import BODY_FILE, Completion, Told, ToldLabels, read_upload
 from runner.service.settings import without_folders
 from runner.util.hashing import hash_of
 
@@ -138,8 +138,8 @@ def _taken(body: Path, completion: Completion, recordings: Path) -> Verdict:
     """
     from runner.runs.importing import import_recording
 
-    details = _said(completion) if completion.run.model_fields_set else None
-    labels = labels_from(completion.labels.model_dump()) if completion.labels.model_fields_set else None
+    details = _said(completion) if completion.run != Told() else None
+    labels = labels_from(completion.labels.model_dump()) if completion.labels != ToldLabels() else None
     imported = import_recording(body, recordings, details, labels)
     return Verdict(imported.run.run_id, imported.already)
 

@@ -1,4 +1,4 @@
-"""A run exported to one MCAP file and imported elsewhere is the same run; names can be left out of the file."""
+"""A run exported to one MCAP file and imported elsewhere is the same run, on request without names."""
 
 from __future__ import annotations
 
