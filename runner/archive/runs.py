@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from runner.archive.manifest import Manifest
-from runner.archive.places import archive_of, restore_to
+from runner.archive.places import archive_of, restore_to, target_of
 from runner.archive.restoring import check
-from runner.archive.targets import Target, no_archive, split_place, target_of, temporary_folder
+from runner.archive.targets import Target, no_archive, split_place, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.integrity import checked_survey, may_be_cut

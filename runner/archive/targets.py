@@ -16,8 +16,7 @@ from typing import Final, Protocol
 
 from runner.archive import layout
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Manifest, read_manifest
-from runner.errors import RecordingError, RunnerError, StorageError
-from runner.util.extras import require
+from runner.errors import RecordingError, StorageError
 from runner.util.files import sync
 from runner.util.opening import open_regular
 
@@ -57,23 +56,6 @@ class Target(Protocol):
             RecordingError: there is no archive of it.
             StorageError: the target cannot be read.
         """
-
-
-def target_of(text: str) -> Target:
-    """Return the target of a path or URL.
-
-    Raises:
-        RunnerError: it is a URL of another kind than `s3://bucket/prefix`.
-        MissingExtra: what is needed to speak to it is not installed.
-    """
-    if text.startswith(S3):
-        require("boto3", extra="archive", purpose="keeping archives in object storage")
-        from runner.archive.s3 import S3Target
-
-        return S3Target(text)
-    if "://" in text:
-        raise RunnerError(f"{text}: found a URL, expected a folder or {S3}BUCKET/PREFIX.")
-    return FolderTarget(Path(text).expanduser().absolute())
 
 
 def split_place(place: str) -> tuple[str, str]:

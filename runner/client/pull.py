@@ -14,8 +14,8 @@ from filelock import FileLock, Timeout
 from runner.client.backoff import ServerAway, ServerError
 from runner.client.connection import Connection, Report
 from runner.errors import RecordingError, RunnerError, StorageError
+from runner.recording.labels import labels_from
 from runner.runs.importing import Imported, import_recording
-from runner.runs.labels import labels_from
 
 if TYPE_CHECKING:
     import httpx2

@@ -37,12 +37,12 @@ from runner.execution.verify import differing_environment, differing_provenance,
 from runner.learning.learner import Held, Learner
 from runner.recording import schema
 from runner.recording.integrity import checked_survey, may_be_cut
+from runner.recording.liveness import owner
 from runner.recording.metadata import NEEDED
 from runner.recording.reader import Recording, open_recording
 from runner.recording.reference import Past
 from runner.recording.scan import Contents
 from runner.recording.writer import RecordingFile, storage_error
-from runner.runs.liveness import owner
 from runner.runs.locking import locked
 from runner.runs.provenance import provenance
 from runner.runs.run import RECORDING_FILE, Run, run_at

@@ -10,10 +10,10 @@ from typing import Any, Final
 
 from runner.errors import RunnerError
 from runner.export.places import write_new
+from runner.recording.labels import Labels, as_json
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
 from runner.runs.importing import EXPORT_RECORD
-from runner.runs.labels import Labels, as_json
 from runner.runs.run import Run
 
 PRIVATE: Final = ("host", "user", "command", "directory")

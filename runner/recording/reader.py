@@ -30,6 +30,8 @@ from runner.recording.blocks import record_dtype
 from runner.recording.chunk_cache import RecordStore
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.index import read_index
+from runner.recording.labels import read_labels
+from runner.recording.liveness import is_owned
 from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
 from runner.recording.metadata import (
     check_facts,
@@ -46,8 +48,6 @@ from runner.recording.scan import MAX_METADATA_BYTES, UNREADABLE, attachment_of,
 from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
 from runner.recording.topic_chunks import TopicChunks, chunks_by_topic
-from runner.runs.labels import read_labels
-from runner.runs.liveness import is_owned
 
 MAX_EPISODE_BYTES: Final = 128 << 20
 """The most that `episode_steps` gives as one array: some 1.5 million steps."""

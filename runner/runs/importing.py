@@ -19,11 +19,11 @@ from typing import Any, Final
 from runner.config.names import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.integrity import is_merely_cut_off
+from runner.recording.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, change_labels, labels_from
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of, continues, rewrite
 from runner.recording.run_file import parse_run_file
 from runner.runs.catalogue.lookup import with_id
-from runner.runs.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, change_labels, labels_from
 from runner.runs.locking import locked
 from runner.runs.run import MADE_BY, RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at, runs_in
 from runner.util.files import sync, write_whole

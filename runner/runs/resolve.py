@@ -9,8 +9,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final, Protocol, TypeVar
 
-from runner.errors import RunNotFound, nearest
 from runner.config.names import RUN_NAME_PATTERN
+from runner.errors import RunNotFound, nearest
 from runner.runs.run import Run, list_runs, recordings_folder, run_at, run_of_id
 
 LATEST: Final = "@latest"

@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
+from runner.recording.labels import Labels, change_labels, read_labels
+from runner.recording.liveness import lives, owner
 from runner.recording.run_file import RUN_ID, ArchiveReference, RunFile, Summary, parse_run_file
-from runner.runs.labels import Labels, change_labels, read_labels
-from runner.runs.liveness import lives, owner
 from runner.util.files import read_object, write_whole
 from runner.util.opening import as_utf8, is_utf8
 

@@ -20,8 +20,8 @@ from runner.environments.mdp import Mdp
 from runner.errors import RecordingError, RunnerError
 from runner.execution.resume import resume
 from runner.execution.session import Progress, run_job
+from runner.recording.labels import Labels, change_labels
 from runner.recording.reader import open_recording
-from runner.runs.labels import Labels, change_labels
 from runner.runs.resolve import find_run
 from runner.runs.run import Run, create_run, list_runs, unless_empty
 from runner.sweep.model import Objective

@@ -13,12 +13,13 @@ import queue
 import signal
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
+from runner.export.rerun.live_pieces import Piece
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -29,20 +30,6 @@ TOGETHER_SECONDS: Final = 0.5
 """What comes within this time is sent together."""
 END_SECONDS: Final = 10.0
 """How long the end of a run may wait for the viewer to take what is left."""
-
-
-class Piece(NamedTuple):
-    """What is shown at once."""
-
-    kind: str
-    """`steps` or `metrics`."""
-    phase: str
-    time: int
-    """Steps of both phases executed, the first of these included; for metrics, all until then."""
-    episode: int
-    """Of training, at that time."""
-    content: Any
-    """Records of steps, or one mapping of metrics."""
 
 
 class LiveView:

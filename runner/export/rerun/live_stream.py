@@ -16,7 +16,7 @@ from runner.export.rerun.columns import Batch, Sender, new_stream
 from runner.export.rerun.events import EventWriter
 from runner.export.rerun.grid import GridWriter
 from runner.export.rerun.layout import Shown, blueprint, draw_background
-from runner.export.rerun.live import Piece
+from runner.export.rerun.live_pieces import Piece
 from runner.export.rerun.metrics import MetricWriter
 from runner.export.rerun.scene import TRAIL_STEPS, marks_of, scene_of
 from runner.recording import schema

@@ -16,9 +16,9 @@ from typing import Any, Final, NamedTuple
 
 from peewee import SqliteDatabase, chunked
 
+from runner.recording.labels import LABELS_FILE
 from runner.runs.catalogue.database import tuples_of, write_rows
 from runner.runs.catalogue.rows import Row, row_of
-from runner.runs.labels import LABELS_FILE
 from runner.runs.run import RECORDING_FILE, RUN_FILE, run_entries, runs_in
 
 _SETTLED_NS: Final = 2 * 10**9

@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import RunnerError, RunNotFound, StorageError
+from runner.recording.labels import KEEP, LABELS_FILE, are_readable
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import Index
 from runner.runs.catalogue.rows import Row
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
-from runner.runs.labels import KEEP, LABELS_FILE, are_readable
 from runner.runs.locking import locked
 from runner.runs.run import Run, runs_in
 from runner.util.humanize import listed

@@ -14,8 +14,8 @@ from typing import Any, Final
 
 from peewee import DatabaseError
 
+from runner.recording.labels import KEEP, LABELS_FILE, LOCK_FILE
 from runner.runs.catalogue.database import keep_usage, opened
-from runner.runs.labels import KEEP, LABELS_FILE, LOCK_FILE
 from runner.runs.locking import RUN_LOCK
 from runner.runs.run import RECORDING_FILE, RUN_FILE
 from runner.util.cache import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder

@@ -11,12 +11,12 @@ from pydantic import BaseModel, Field
 
 from runner.analysis.summary import described
 from runner.config.names import checked_run_name
+from runner.recording.labels import MAX_NOTE, MAX_TAGS
+from runner.recording.labels import Labels as Said
 from runner.runs.catalogue.columns import PROGRAMS, columns_of, with_originals
 from runner.runs.catalogue.columns import as_json as row_as_json
 from runner.runs.catalogue.filters import parse
 from runner.runs.catalogue.index import order_of
-from runner.runs.labels import MAX_NOTE, MAX_TAGS
-from runner.runs.labels import Labels as Said
 from runner.runs.run import Run, relabel
 from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json

@@ -15,8 +15,6 @@ from runner.service.jobs.spec import (
     TELL_SECONDS,
     Heard,
     Order,
-    Outcome,
-    described,
     wait_for_others,
 )
 from runner.util.files import write_whole
@@ -24,25 +22,6 @@ from runner.util.files import write_whole
 if TYPE_CHECKING:
     from runner.config import ExperimentConfig
     from runner.execution.session import Progress
-
-
-def do_config(order: Order, line: Heard) -> Outcome:
-    """Do what is left of a job that is a configuration.
-
-    Raises:
-        RunnerError: a run cannot be done, or not be gone on with.
-    """
-    from runner.config import from_mapping
-    from runner.service.jobs.ray_worker import do_seed_far
-
-    config = from_mapping(described(order))
-    for number, seed in enumerate(config.seeds):
-        if line.stop():
-            return Outcome("interrupted")
-        do = do_seed if order.ray is None else do_seed_far
-        if do(order, line, config, seed, number) != "finished":
-            return Outcome("interrupted")
-    return Outcome("finished")
 
 
 def do_seed(order: Order, line: Heard, config: ExperimentConfig, seed: int, number: int) -> str:

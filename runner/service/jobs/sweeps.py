@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
+from runner.service.jobs.channel import Line
 from runner.service.jobs.spec import (
     OTHERS_SECONDS,
     TELL_SECONDS,
@@ -16,7 +17,6 @@ from runner.service.jobs.spec import (
     described,
     wait_for_others,
 )
-from runner.service.jobs.worker import Line
 
 if TYPE_CHECKING:
     from runner.sweep.local import Workers

@@ -18,8 +18,8 @@ from runner.analysis.frames import agents_of, evaluation_record, evaluation_reco
 from runner.environments.naming import event_in_words
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
+from runner.recording.labels import MAX_NOTE
 from runner.recording.reader import Recording, open_recording
-from runner.runs.labels import MAX_NOTE
 from runner.runs.run import Run
 from runner.service import played
 from runner.service.api.replay import LONG

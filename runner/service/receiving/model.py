@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from runner.errors import MAX_MESSAGE, RunnerError
-from runner.runs.labels import MAX_NOTE, MAX_TAGS
+from runner.recording.labels import MAX_NOTE, MAX_TAGS
 from runner.util.files import read_object
 
 STATE_FILE: Final = "upload.json"

@@ -21,7 +21,7 @@ from typing import Any, Final
 from filelock import FileLock
 
 from runner.errors import RunnerError, StorageError
-from runner.runs.labels import labels_from
+from runner.recording.labels import labels_from
 from runner.service.receiving.model import BODY_FILE, Completion, Told, ToldLabels, read_upload
 from runner.service.settings import without_folders
 from runner.util.hashing import hash_of

@@ -13,7 +13,7 @@ from runner.archive.manifest import Entry, Manifest
 from runner.cli import cli
 from runner.recording import open as open_recording
 from runner.recording import schema
-from runner.runs.liveness import owner as this_process
+from runner.recording.liveness import owner as this_process
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
 from tests.runner.recording.making import TAXIS, experiment, make_run

@@ -13,8 +13,8 @@ from moto.server import ThreadedMotoServer
 
 from runner.archive import layout, s3
 from runner.archive.manifest import Manifest, entries_of, read_manifest
+from runner.archive.places import target_of
 from runner.archive.restoring import check
-from runner.archive.targets import target_of
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.runs.resolve import find_run

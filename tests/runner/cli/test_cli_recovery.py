@@ -16,9 +16,9 @@ from mcap.writer import Writer
 from runner.cli import cli
 from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.liveness import owner
 from runner.recording.scan import survey
 from runner.replay.tables import tables_at
-from runner.runs.liveness import owner
 from runner.runs.run import Run, list_runs
 from tests.runner.altering import altered
 

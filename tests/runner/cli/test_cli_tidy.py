@@ -17,7 +17,7 @@ import pytest
 
 from runner.cli import removing
 from runner.config import from_mapping
-from runner.runs.labels import LABELS_FILE
+from runner.recording.labels import LABELS_FILE
 from runner.runs.locking import locked
 from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
 

@@ -18,6 +18,7 @@ import pytest
 import runner
 from runner.config import from_mapping
 from runner.errors import RunNotFound
+from runner.recording.labels import LABELS_FILE, Labels, change_labels, read_labels
 from runner.runs.catalogue import folders
 from runner.runs.catalogue import usage as usage_of
 from runner.runs.catalogue.database import index_path, opened
@@ -25,7 +26,6 @@ from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.folders import Depth, Folders
 from runner.runs.catalogue.index import look
 from runner.runs.catalogue.lookup import find_run
-from runner.runs.labels import LABELS_FILE, Labels, change_labels, read_labels
 from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
 from runner.util.cache import EXPORTS, RESTORED
 
@@ -334,7 +334,7 @@ from pathlib import Path
 from runner.runs.catalogue.index import look
 from runner.runs.catalogue.filters import parse
 from types import SimpleNamespace
-from runner.runs.labels import Labels, change_labels
+from runner.recording.labels import Labels, change_labels
 from runner.runs.run import create_run
 config = SimpleNamespace(name="some", to_mapping=lambda: {"name": "some", "episodes": 5})
 folder, number = Path(sys.argv[1]), int(sys.argv[2])

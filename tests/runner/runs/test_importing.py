@@ -22,10 +22,10 @@ from runner.cli import cli
 from runner.errors import RecordingError, RunnerError
 from runner.execution.verify import verify
 from runner.export.mcap import export_mcap
+from runner.recording.labels import Labels, change_labels, read_labels
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
 from runner.runs.importing import Occupied, import_recording
-from runner.runs.labels import Labels, change_labels, read_labels
 from runner.runs.resolve import find_run
 from runner.runs.run import list_runs
 from tests.runner.recording.making import LAKE, make_run

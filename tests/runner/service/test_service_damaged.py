@@ -7,13 +7,13 @@ import shutil
 
 import pytest
 from click.testing import CliRunner
+from runner.packing.admission import admit
 
 from runner.cli import cli
 from runner.errors import RecordingError
 from runner.execution.verify import verify
-from runner.packing.admission import admit
 from runner.recording import open as open_recording
-from runner.runs.labels import Labels
+from runner.recording.labels import Labels
 from runner.runs.run import RUN_FILE, list_runs
 from tests.runner.altering import altered
 

@@ -32,7 +32,7 @@ from runner.client.client import Client
 from runner.client.outbox import outbox_folder
 from runner.client.upload_source import Parcel, Sent
 from runner.export.mcap import export_mcap
-from runner.runs.labels import change_labels
+from runner.recording.labels import change_labels
 from runner.runs.resolve import find_run
 from runner.runs.run import list_runs
 from tests.runner.recording.making import TAXIS, make_run, with_id

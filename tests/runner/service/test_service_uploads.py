@@ -20,7 +20,7 @@ from runner.errors import RunnerError, RunNotFound, StorageError
 from runner.execution.resume import resume
 from runner.execution.session import run_job
 from runner.export.mcap import export_mcap
-from runner.runs.labels import Labels, change_labels
+from runner.recording.labels import Labels, change_labels
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
 from runner.service.receiving.folder import FOLDER

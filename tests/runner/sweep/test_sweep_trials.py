@@ -19,7 +19,7 @@ from runner.errors import RunnerError
 from runner.execution import verify
 from runner.execution.rerecord import rerecord
 from runner.execution.session import run_job
-from runner.runs.labels import read_labels
+from runner.recording.labels import read_labels
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
 from runner.sweep import local, state
