@@ -7,13 +7,12 @@ import shutil
 
 import pytest
 from click.testing import CliRunner
-from runner.packing.admission import admit
 
 from runner.cli import cli
 from runner.errors import RecordingError
 from runner.execution.verify import verify
 from runner.recording import open as open_recording
-from runner.recording.labels import Labels
+from runner.runs.importing import import_recording
 from runner.runs.run import RUN_FILE, list_runs
 from tests.runner.altering import altered
 
@@ -138,7 +137,7 @@ def test_a_result_that_cannot_be_is_refused(recordings, tmp_path, key, wrong):
     with open_recording(made) as recording, pytest.raises(RecordingError, match="result"):
         _ = recording.result
     with pytest.raises(RecordingError):
-        admit(made, {}, Labels(), tmp_path / "theirs")
+        import_recording(made, tmp_path / "theirs")
     assert not (tmp_path / "theirs").exists() or not list((tmp_path / "theirs").iterdir())
     if key == "more":  # of JSON that cannot be parsed nothing is known
         assert shown(recordings, "show", made).exit_code == 2
