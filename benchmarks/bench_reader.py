@@ -10,8 +10,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 
 STEP_TOPICS = (schema.TRAIN_STEP, schema.EVAL_STEP)
 FIELDS = tuple(field.name for field in schema.STEP.fields)

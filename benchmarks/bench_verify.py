@@ -11,8 +11,8 @@ from benchmarks.bench_reader import tutorial
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
 from runner.execution.verify import verify
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 
 READ = "import sys; from pathlib import Path; from benchmarks.bench_reader import read_all, read_episode; \

@@ -9,9 +9,9 @@ import pytest
 from runner.config import load
 from runner.config.job import jobs_of
 from runner.execution.session import run_job
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
+from runner.recording.reader import open_recording
 from runner.runs.run import create_run
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))

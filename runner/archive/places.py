@@ -10,13 +10,15 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from runner.archive.targets import S3, FolderTarget, Target, split_place
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.runs.run import RUN_FILE, Run
 from runner.util.cache import CACHE_VARIABLE, RESTORED, cache_folder
 from runner.util.extras import require
+
+if TYPE_CHECKING:
+    from runner.archive.targets import Target
 
 ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
 KEPT: Final = 8
@@ -89,6 +91,8 @@ def archive_of(run: Run) -> Iterator[Path]:
         RecordingError: there is none where it should be.
         StorageError: its place cannot be read.
     """
+    from runner.archive.targets import split_place
+
     place = archive_place(run)
     if place is None:
         raise RecordingError(
@@ -106,6 +110,8 @@ def archive_place(run: Run) -> str | None:
         RecordingError: what is there is no archive.
         StorageError: its place cannot be read.
     """
+    from runner.archive.targets import split_place
+
     for place in _places(run):
         to, run_id = split_place(place)
         if run_id == run.run_id and target_of(to).manifest(run_id) is not None:
@@ -137,6 +143,8 @@ def target_of(text: str) -> Target:
         RunnerError: it is a URL of another kind than `s3://bucket/prefix`.
         MissingExtra: what is needed to speak to it is not installed.
     """
+    from runner.archive.targets import S3, FolderTarget
+
     if text.startswith(S3):
         require("boto3", extra="archive", purpose="keeping archives in object storage")
         from runner.archive.s3 import S3Target

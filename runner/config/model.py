@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from runner.config.names import NAME_EXPECTED, NAME_PATTERN
 from runner.config.schedules import Probability, StepSize
 from runner.config.sections import (
     Environment,
@@ -23,6 +22,7 @@ from runner.config.sections import (
     WolfPhc,
 )
 from runner.config.values import Section, refusal
+from runner.util.names import NAME_EXPECTED, NAME_PATTERN
 
 Mode = Literal["cooperative", "competitive"]
 Algorithm = Literal[

@@ -64,7 +64,7 @@ class Plan:
         return settings
 
     def _check(self) -> None:
-        from runner.config.names import checked_run_name
+        from runner.util.names import checked_run_name
 
         expectations = (
             ("name", "text", self.name is None or isinstance(self.name, str)),

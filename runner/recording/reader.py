@@ -1,6 +1,6 @@
 """The lazy reader of a recording: opens by the index, reads in blocks, keeps nothing.
 
-    with runner.recording.open("recordings/k3v9m2xq/recording.mcap") as recording:
+    with runner.open_recording("recordings/k3v9m2xq/recording.mcap") as recording:
         for block in recording.blocks(TRAIN_STEP):      # NumPy records, some thousands at a time
             print(block["rewards"].mean())
 

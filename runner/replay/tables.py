@@ -1,6 +1,6 @@
 """Q-tables at any step: the nearest snapshot before it, moved forward by the recorded steps.
 
-with runner.recording.open(path) as recording:
+with runner.open_recording(path) as recording:
     tables = tables_at(recording, step=1_000_000)      # one float64 [states, actions] per learner
 
 Every replay of recorded steps goes through `StepReplay.apply`. It checks the steps first, because the

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from runner.config.names import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.integrity import is_merely_cut_off
 from runner.recording.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, change_labels, labels_from
@@ -27,6 +26,7 @@ from runner.runs.catalogue.lookup import with_id
 from runner.runs.locking import locked
 from runner.runs.run import MADE_BY, RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at, runs_in
 from runner.util.files import sync, write_whole
+from runner.util.names import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN
 
 EXPORT_RECORD: Final = "export"
 """The metadata record of an exported recording: what `run.json` and the labels say, as JSON."""

@@ -21,7 +21,7 @@ from runner.config import load
 from runner.config.job import Job
 from runner.execution import session
 from runner.loops import loop
-from runner.recording import open as open_recording
+from runner.recording.reader import open_recording
 from runner.replay.tables import last_step, tables_at
 from runner.runs.run import Run
 from tests.runner.loops.making import Leaving, drive, parallel, play

@@ -9,9 +9,9 @@ from typing import Any
 from runner.config import from_mapping
 from runner.environments.naming import action_names, states_in_words
 from runner.errors import RunnerError
-from runner.recording import Recording, schema
-from runner.recording import open as open_recording
+from runner.recording import schema
 from runner.recording.integrity import check_integrity
+from runner.recording.reader import Recording, open_recording
 from tests.runner.recording.making import LAKE, make_run
 
 TINY: dict[str, Any] = {

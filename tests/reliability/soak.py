@@ -41,8 +41,8 @@ from runner.errors import RecordingError, RunnerError
 from runner.execution.resume import resume
 from runner.execution.session import run_job
 from runner.execution.verify import verify
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.repair import repair
 from runner.runs.resolve import find_run

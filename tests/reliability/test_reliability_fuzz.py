@@ -15,9 +15,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from runner.errors import RecordingError, RunnerError
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.blocks import blank_records
+from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from tests.reliability.hostile import (
     ATTACHMENT,

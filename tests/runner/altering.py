@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from runner.recording import open as open_recording
 from runner.recording.blocks import HEADER, HEADER_BYTES
 from runner.recording.chunks import Packing, encode_chunk
+from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.scan import survey
 from runner.recording.schema import Topic

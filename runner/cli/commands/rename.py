@@ -28,8 +28,8 @@ def command(run_name: str, name: str | None, original: bool, recordings: Path | 
       dualtaxi rename @latest patient
       dualtaxi rename patient --original
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.config.names import checked_run_name
     from runner.runs.run import relabel
+    from runner.util.names import checked_run_name
 
     if original == (name is not None):
         raise click.UsageError("expected a NAME, or --original.")

@@ -95,8 +95,8 @@ def command(
       dualtaxi run cooperative --live --live-every 100
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import experiment_of, jobs_in
-    from runner.config.names import checked_name
     from runner.runs.run import recordings_folder
+    from runner.util.names import checked_name
 
     experiment = experiment_of(config, overrides, seed)
     called, folder = checked_name(name), recordings_folder(recordings)

@@ -116,13 +116,13 @@ def start(
       dualtaxi sweep start hyperparameters --resume
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import interruptible
-    from runner.config.names import checked_name
     from runner.runs.run import recordings_folder
     from runner.sweep import state
     from runner.sweep.loading import load_sweep
     from runner.sweep.plan import plan_of, require_disk, room
     from runner.sweep.search import require_optuna
     from runner.sweep.trials import run_sweep
+    from runner.util.names import checked_name
 
     require_optuna()
     folder = recordings_folder(recordings)

@@ -10,7 +10,6 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
 
 from runner.analysis.summary import described
-from runner.config.names import checked_run_name
 from runner.recording.labels import MAX_NOTE, MAX_TAGS
 from runner.recording.labels import Labels as Said
 from runner.runs.catalogue.columns import PROGRAMS, columns_of, with_originals
@@ -23,6 +22,7 @@ from runner.service.computed import as_json
 from runner.service.dependencies import CatalogueOf, FoundRun, KeptOf, SettingsOf
 from runner.service.errors import Refused
 from runner.service.problems import answers
+from runner.util.names import checked_run_name
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index

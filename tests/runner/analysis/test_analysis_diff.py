@@ -23,8 +23,8 @@ from runner.config import from_mapping
 from runner.config.job import Job
 from runner.environments.naming import states_in_words
 from runner.execution.session import run_job
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 from runner.runs import run as runs
 from tests.runner.altering import altered, without_chunk

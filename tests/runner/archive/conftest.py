@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from runner.archive.writing import write_archive
-from runner.recording import open as open_recording
+from runner.recording.reader import open_recording
 from tests.runner.recording.making import TAXIS, make_run
 
 

@@ -18,9 +18,9 @@ from runner.archive import layout
 from runner.archive.restoring import check, restore
 from runner.errors import RecordingError
 from runner.execution.verify import verify
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
+from runner.recording.reader import open_recording
 from tests.runner.altering import altered
 from tests.runner.archive.whole import archived, contents
 from tests.runner.loops.making import make, play

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from runner.archive.writing import write_archive
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 from tests.runner.recording.making import TAXIS, make_run
 
 PAGE = (Path(__file__).parents[3] / "docs" / "archive.md").read_text(encoding="utf-8")

@@ -21,9 +21,9 @@ from runner.archive.restoring import check, restore
 from runner.archive.runs import archive_run
 from runner.errors import RecordingError, RunnerError
 from runner.execution.verify import verify
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
+from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.runs.run import run_at
 from tests.runner.altering import altered

@@ -11,9 +11,9 @@ from click.testing import CliRunner
 from runner.archive import layout, writing
 from runner.archive.manifest import Entry, Manifest
 from runner.cli import cli
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.liveness import owner as this_process
+from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
 from tests.runner.recording.making import TAXIS, experiment, make_run

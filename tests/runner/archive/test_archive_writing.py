@@ -12,8 +12,8 @@ from runner.archive.batches import Batches
 from runner.archive.manifest import entry_of, read_manifest
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 from tests.runner.altering import altered
 from tests.runner.recording.making import TAXIS, make_run
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from runner.archive.writing import write_archive
-from runner.recording import open as open_recording
+from runner.recording.reader import open_recording
 
 
 def archived(path, folder):

@@ -11,8 +11,8 @@ from runner.execution import rerecord as again
 from runner.execution.rerecord import evaluate, rerecord
 from runner.execution.session import run_job
 from runner.execution.verify import verify
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 from runner.runs.resolve import find_run
 from runner.runs.run import RUN_FILE, create_run, list_runs

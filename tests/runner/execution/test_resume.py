@@ -18,7 +18,7 @@ from runner.execution import verify
 from runner.execution.rerecord import evaluate
 from runner.execution.resume import resume
 from runner.execution.session import run_job
-from runner.recording import open as open_recording
+from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.scan import survey
 from runner.recording.schema import TRAIN_STEP

@@ -14,7 +14,7 @@ from runner.errors import RunnerError
 from runner.execution import verify
 from runner.execution.resume import resume
 from runner.execution.session import run_job
-from runner.recording import open as open_recording
+from runner.recording.reader import open_recording
 from runner.recording.schema import BLOCK_TOPICS, EVAL_STEP, TRAIN_STEP
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs

@@ -17,10 +17,10 @@ from runner.config.job import Job, jobs_of
 from runner.environments.loading import load_mdp
 from runner.errors import EnvironmentNotUsable, RunnerError, RunNotFound
 from runner.execution.session import run_job
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.protobuf import message_class
+from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
 from tests.runner.learning.twin import Twin

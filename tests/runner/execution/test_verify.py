@@ -15,11 +15,11 @@ from runner.errors import RecordingError
 from runner.execution import verify as verifying
 from runner.execution.session import run_job
 from runner.execution.verify import verify
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.chunks import Packing, encode_chunk
 from runner.recording.integrity import places
 from runner.recording.messages import decode, encode
+from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.scan import read_chunk, survey
 from runner.recording.writer import RecordingFile

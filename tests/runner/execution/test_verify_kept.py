@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from runner.execution.verify import verify
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 from runner.replay.history import history_of
 from tests.data.make import LOOPS, NAMES, TOGETHER, expectations, loop_expectations
 

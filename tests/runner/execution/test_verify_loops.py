@@ -12,9 +12,9 @@ from gymnasium.wrappers import Autoreset, TransformReward
 
 import runner
 from runner.execution.verify import verify
-from runner.recording import open as open_recording
 from runner.recording.blocks import message_record
 from runner.recording.digest import ContentHash
+from runner.recording.reader import open_recording
 from tests.runner.altering import altered
 from tests.runner.loops.making import Leaving, drive, make, parallel, play
 

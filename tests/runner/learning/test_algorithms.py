@@ -12,9 +12,9 @@ from runner.execution.rerecord import evaluate
 from runner.execution.resume import resume
 from runner.execution.verify import verify
 from runner.learning.learner import Learner
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts
+from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, held_at, tables_at
 from runner.runs.run import list_runs
 from tests.runner.killing import LONG, kill_when, posix, start

@@ -16,10 +16,10 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from runner.errors import RecordingError, RunnerError
 from runner.execution.verify import verify
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.metadata import environment_said
+from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.rewriting import rewrite
 from tests.runner.recording.making import LAKE, TAXIS, make_run

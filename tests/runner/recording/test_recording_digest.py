@@ -14,9 +14,9 @@ from runner.config.job import Job
 from runner.environments.loading import load_mdp
 from runner.execution.session import Session, recorder_for
 from runner.learning.learner import Learner
-from runner.recording import open as open_recording
 from runner.recording import pipeline, recorder, schema
 from runner.recording.digest import combine
+from runner.recording.reader import open_recording
 from tests.runner.learning.twin import Twin
 from tests.runner.recording.making import LAKE, SAMPLED, TAXIS, experiment, make_run
 

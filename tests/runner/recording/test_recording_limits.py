@@ -16,9 +16,9 @@ import pytest
 from runner.config.job import Job
 from runner.errors import StorageError
 from runner.execution.session import run_job
-from runner.recording import open as open_recording
 from runner.recording import pipeline, schema
 from runner.recording.blocks import record_dtype
+from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run
@@ -27,7 +27,7 @@ from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
 LONG_RUN = """
 import resource, sys
 from pathlib import Path
-from runner.recording import open as open_recording, schema
+from runner.recording.reader import open_recording, schema
 from tests.runner.recording.making import make_run
 
 def peak():

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.protobuf import message_class
+from runner.recording.reader import open_recording
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
 TENTH = 100_000_000

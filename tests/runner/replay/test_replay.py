@@ -14,8 +14,8 @@ from runner.cli import cli
 from runner.errors import RecordingError
 from runner.export.rerun.selection import Request
 from runner.export.rerun.writing import Source, export
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, known_steps, tables_at
 from tests.runner.altering import altered, without_chunk
 from tests.runner.recording.making import TAXIS, make_run

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from runner.errors import RecordingError
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 from runner.replay import checkpoints, tables
 from runner.replay.tables import TableReplay, tables_at
 from runner.runs.catalogue.usage import cached

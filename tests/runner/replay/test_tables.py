@@ -11,9 +11,9 @@ import runner
 from runner.environments.loading import load_mdp
 from runner.errors import RecordingError
 from runner.learning.learner import Learner
-from runner.recording import open as open_recording
 from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts
+from runner.recording.reader import open_recording
 from runner.replay.history import history_of
 from runner.replay.tables import TableReplay, last_step, step_of_episode, tables_at
 from tests.runner.altering import altered, without_chunk

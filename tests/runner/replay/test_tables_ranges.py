@@ -7,8 +7,8 @@ import os
 import numpy as np
 import pytest
 
-from runner.recording import open as open_recording
 from runner.recording import schema
+from runner.recording.reader import open_recording
 from tests.runner.recording.making import TAXIS, make_run
 
 

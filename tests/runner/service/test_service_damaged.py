@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from runner.cli import cli
 from runner.errors import RecordingError
 from runner.execution.verify import verify
-from runner.recording import open as open_recording
+from runner.recording.reader import open_recording
 from runner.runs.importing import import_recording
 from runner.runs.run import RUN_FILE, list_runs
 from tests.runner.altering import altered

@@ -1,4 +1,4 @@
-"""Names of runs and experiments, apart from the model so that a name is checked before pydantic loads."""
+"""What names of runs and experiments may look like."""
 
 from __future__ import annotations
 
