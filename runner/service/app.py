@@ -29,7 +29,6 @@ from runner.service.security import Tokens
 from runner.service.sessions import Sessions
 from runner.service.settings import Settings
 from runner.sweep.names import sweeps_in
-from runner.sweep.state import sweeps_in
 from runner.util.version import __version__
 
 API: Final = "/api/v1"
