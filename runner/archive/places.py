@@ -10,15 +10,11 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from runner.errors import RecordingError, RunnerError, StorageError
+from runner.errors import RecordingError, StorageError
 from runner.runs.run import RUN_FILE, Run
 from runner.util.cache import CACHE_VARIABLE, RESTORED, cache_folder
-from runner.util.extras import require
-
-if TYPE_CHECKING:
-    from runner.archive.targets import Target
 
 ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
 KEPT: Final = 8
@@ -91,7 +87,7 @@ def archive_of(run: Run) -> Iterator[Path]:
         RecordingError: there is none where it should be.
         StorageError: its place cannot be read.
     """
-    from runner.archive.targets import split_place
+    from runner.archive.store import Store, split_place
 
     place = archive_place(run)
     if place is None:
@@ -99,7 +95,7 @@ def archive_of(run: Run) -> Iterator[Path]:
             f"run {run.run_id}: found no archive at {' or '.join(_places(run))}; its recording was put into "
             f"it. Mount or copy it there, or set {ARCHIVE_VARIABLE} to the folder that has it."
         )
-    with target_of(split_place(place)[0]).reading(run.run_id) as folder:
+    with Store(split_place(place)[0]).reading(run.run_id) as folder:
         yield folder
 
 
@@ -110,11 +106,11 @@ def archive_place(run: Run) -> str | None:
         RecordingError: what is there is no archive.
         StorageError: its place cannot be read.
     """
-    from runner.archive.targets import split_place
+    from runner.archive.store import Store, split_place
 
     for place in _places(run):
-        to, run_id = split_place(place)
-        if run_id == run.run_id and target_of(to).manifest(run_id) is not None:
+        location, run_id = split_place(place)
+        if run_id == run.run_id and Store(location).manifest(run_id) is not None:
             return place
     return None
 
@@ -134,22 +130,3 @@ def restore_to(folder: Path, path: Path, digest: Any, report: Report) -> None:
     if manifest.digest != digest:
         path.unlink(missing_ok=True)
         raise RecordingError(f"{folder}: found an archive of digest {manifest.digest}, expected {digest}.")
-
-
-def target_of(text: str) -> Target:
-    """Return the target of a path or URL.
-
-    Raises:
-        RunnerError: it is a URL of another kind than `s3://bucket/prefix`.
-        MissingExtra: what is needed to speak to it is not installed.
-    """
-    from runner.archive.targets import S3, FolderTarget
-
-    if text.startswith(S3):
-        require("boto3", extra="archive", purpose="keeping archives in object storage")
-        from runner.archive.s3 import S3Target
-
-        return S3Target(text)
-    if "://" in text:
-        raise RunnerError(f"{text}: found a URL, expected a folder or {S3}BUCKET/PREFIX.")
-    return FolderTarget(Path(text).expanduser().absolute())

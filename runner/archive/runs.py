@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from runner.archive.manifest import Manifest
-from runner.archive.places import archive_of, restore_to, target_of
+from runner.archive.places import archive_of, restore_to
 from runner.archive.restoring import check
-from runner.archive.targets import Target, no_archive, split_place, temporary_folder
+from runner.archive.store import Store, no_archive, split_place, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.integrity import checked_survey, may_be_cut
@@ -65,25 +65,25 @@ def archive_run(
         raise RunnerError(
             f"{run.recording}: found a recording that stands alone, expected a run in a folder."
         )
-    target = target_of(to)
+    store = Store(to)
     with locked(run, archived=True) as current:
         if current.status == "archived":
             raise RunnerError(f"run {run.run_id} is archived already, in {current.archive.target}.")
-        return _Archiving(current, target, report).do(remove, dry_run)
+        return _Archiving(current, store, report).do(remove, dry_run)
 
 
 class _Archiving:
     """One run on its way into an archive."""
 
-    def __init__(self, run: Run, target: Target, report: Report) -> None:
+    def __init__(self, run: Run, store: Store, report: Report) -> None:
         self._run = run
-        self._target = target
+        self._store = store
         self._report = report
 
     def do(self, remove: bool, dry_run: bool) -> Archived:
         """Write the archive, unless it is there; note it in the run; perhaps remove the recording."""
-        run, target = self._run, self._target
-        existing = target.manifest(run.run_id)
+        run, store = self._run, self._store
+        existing = store.manifest(run.run_id)
         with _sound(run) as recording:
             size, came = recording.size, recording.done()
             if dry_run or existing is None:
@@ -92,27 +92,25 @@ class _Archiving:
                 manifest = existing
             else:
                 raise RunnerError(
-                    f"{target.place(run.run_id)}: found an archive of another content, made of this run at "
+                    f"{store.place(run.run_id)}: found an archive of another content, made of this run at "
                     f"another time ({existing.digest[:16]}…); remove it, or choose another --to."
                 )
         if dry_run:
-            return Archived(run, target.place(run.run_id), manifest, existing is None, False, size)
+            return Archived(run, store.place(run.run_id), manifest, existing is None, False, size)
         if remove or existing is not None:
-            with target.reading(run.run_id) as folder:
+            with store.reading(run.run_id) as folder:
                 check(folder, self._report)
-        run = run.update(archive=_stub(target.place(run.run_id), manifest, size, came))
+        run = run.update(archive=_stub(store.place(run.run_id), manifest, size, came))
         if remove:
             run.recording.unlink()
-        return Archived(run, target.place(run.run_id), manifest, existing is None, remove, size)
+        return Archived(run, store.place(run.run_id), manifest, existing is None, remove, size)
 
     def _write(self, recording: Recording, dry_run: bool) -> Manifest:
         if dry_run:
             with temporary_folder() as folder:
                 return write_archive(recording, folder, self._report)
-        with self._target.writing(self._run.run_id) as folder:
-            manifest = write_archive(recording, folder, self._report)
-            self._target.commit(self._run.run_id, folder)
-        return manifest
+        with self._store.writing(self._run.run_id) as folder:
+            return write_archive(recording, folder, self._report)
 
 
 def _holds(manifest: Manifest, recording: Recording) -> bool:
@@ -184,9 +182,9 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
         RecordingError: there is no archive, or it is damaged.
         StorageError: the run cannot be written.
     """
-    to, run_id = split_place(place)
-    target = target_of(to)
-    manifest = target.manifest(run_id)
+    location, run_id = split_place(place)
+    store = Store(location)
+    manifest = store.manifest(run_id)
     if manifest is None:
         raise no_archive(place)
     if manifest.run_id != run_id:
@@ -203,7 +201,7 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
     except OSError as error:
         raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
     try:
-        with target.reading(run_id) as archive:
+        with store.reading(run_id) as archive:
             restore_to(archive, folder / RECORDING_FILE, manifest.digest, report)
         with open_recording(folder / RECORDING_FILE) as recording:
             facts = recording.run_facts()

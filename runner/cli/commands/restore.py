@@ -30,7 +30,7 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     """  # noqa: D301 - Click wants the backspace itself
     from runner.archive.layout import MANIFEST
     from runner.archive.runs import restore_place, restore_run
-    from runner.archive.targets import S3
+    from runner.archive.store import S3
     from runner.cli.progress import steps_line
     from runner.cli.working import announcing, run_as_json, run_in_words
     from runner.runs.run import recordings_folder

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 
 import pytest
@@ -10,6 +11,7 @@ from click.testing import CliRunner
 
 from runner.archive import layout, writing
 from runner.archive.manifest import Entry, Manifest
+from runner.archive.store import Store
 from runner.cli import cli
 from runner.recording import schema
 from runner.recording.liveness import owner as this_process
@@ -279,3 +281,26 @@ def test_what_an_interrupted_archiving_left_is_no_archive_and_gives_way(run, rec
     done(command("archive", run.run_id, "--remove"))
     done(command("restore", run.run_id))
     assert not left.exists()
+
+
+def test_two_processes_do_not_write_the_same_archive_at_once(run, recordings, command):
+    to = recordings.parent / "archive"
+    with Store(str(to)).writing(run.run_id) as folder:
+        result = command("archive", run.run_id, "--remove")
+        assert result.exit_code == 2
+        assert "another process is writing this archive" in result.output
+        assert folder.is_dir()
+        with open_recording(run.recording) as recording:
+            writing.write_archive(recording, folder)
+    assert "it was there already" in done(command("archive", run.run_id, "--remove"))
+    assert [path.name for path in to.iterdir()] == [run.run_id]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
+def test_a_pipe_in_place_of_a_manifest_is_refused(run, recordings, command):
+    place = recordings.parent / "archive" / run.run_id
+    place.mkdir(parents=True)
+    os.mkfifo(place / layout.MANIFEST)
+    result = command("archive", run.run_id)
+    assert result.exit_code == 1
+    assert "it is not a regular file" in result.output

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections import Counter
 
-import boto3
 import pytest
 from click.testing import CliRunner
 from moto.server import ThreadedMotoServer
+from pyarrow import fs
 
-from runner.archive import layout, s3
-from runner.archive.manifest import Manifest, entries_of, read_manifest
-from runner.archive.places import target_of
+from runner.archive import layout
+from runner.archive.manifest import Manifest, entries_of
 from runner.archive.restoring import check
+from runner.archive.store import Store
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.runs.resolve import find_run
@@ -38,55 +37,53 @@ def server():
 
 @pytest.fixture
 def bucket(server, monkeypatch):
-    """Return a client; `lab` is an empty bucket."""
+    """Return a file system of that server; `lab` is an empty bucket."""
     for name, value in {
         "AWS_ENDPOINT_URL": server,
         "AWS_ACCESS_KEY_ID": "test",
         "AWS_SECRET_ACCESS_KEY": "test",
         "AWS_DEFAULT_REGION": "us-east-1",
-        "AWS_MAX_ATTEMPTS": "1",
     }.items():
         monkeypatch.setenv(name, value)
-    client = boto3.client("s3")
-    client.create_bucket(Bucket="lab")
-    yield client
-    for key in keys(client):
-        client.delete_object(Bucket="lab", Key=key)
-    for upload in client.list_multipart_uploads(Bucket="lab").get("Uploads", []):
-        client.abort_multipart_upload(Bucket="lab", Key=upload["Key"], UploadId=upload["UploadId"])
-    client.close()
+    files = fs.S3FileSystem(endpoint_override=server, allow_bucket_creation=True)
+    files.create_dir("lab")
+    yield files
+    files.delete_dir_contents("lab")
 
 
-def keys(client):
-    return {found["Key"] for found in client.list_objects_v2(Bucket="lab").get("Contents", [])}
+def keys(bucket):
+    found = bucket.get_file_info(fs.FileSelector("lab", recursive=True))
+    return {info.path.removeprefix("lab/") for info in found if info.type == fs.FileType.File}
 
 
-class Cut(Exception):
-    """The connection is gone."""
+def put(bucket, key, data):
+    with bucket.open_output_stream(f"lab/{key}") as stream:
+        stream.write(data)
 
 
-class CountingClient:
-    """Counts calls; fails at one of them, if told to."""
+def store_copy(archive, run_id):
+    """Store a copy of an archive's folder."""
+    with Store(URL).writing(run_id) as folder:
+        shutil.copytree(archive, folder, dirs_exist_ok=True)
 
-    def __init__(self, client, fail_at=None):
-        self._client, self._fail_at = client, fail_at
-        self.calls = Counter()
+
+class CutOff:
+    """A file system whose connection breaks when it has written some bytes of the nth file."""
+
+    def __init__(self, files, fail_at):
+        self._files, self._left = files, fail_at
 
     def __getattr__(self, name):
-        def call(*args, **kwargs):
-            self.calls[name] += 1
-            if (name, self.calls[name]) == self._fail_at:
-                raise Cut
-            return getattr(self._client, name)(*args, **kwargs)
+        return getattr(self._files, name)
 
-        return call
-
-
-def counted(monkeypatch, client, fail_at=None):
-    """Return a target that goes through a counting client."""
-    counting = CountingClient(client, fail_at)
-    monkeypatch.setattr(boto3, "client", lambda _: counting)
-    return target_of(URL), counting
+    def open_output_stream(self, path, **options):
+        self._left -= 1
+        stream = self._files.open_output_stream(path, **options)
+        if self._left == 0:
+            stream.write(b"half of it")
+            stream.close()
+            raise OSError("the connection is gone")
+        return stream
 
 
 def test_a_run_goes_there_and_comes_back(run, bucket, tmp_path):
@@ -100,7 +97,7 @@ def test_a_run_goes_there_and_comes_back(run, bucket, tmp_path):
     told = json.loads(command("archive", run.run_id, "--to", URL, "--remove", "--json").stdout)
     assert told["place"] == f"{URL}/{run.run_id}"
     assert find_run(run.run_id, recordings).status == "archived"
-    manifest = target_of(URL).manifest(run.run_id)
+    manifest = Store(URL).manifest(run.run_id)
     assert keys(bucket) == {f"runs/{run.run_id}/{name}" for name in (*manifest.files, layout.MANIFEST)}
     command("restore", run.run_id)
     assert find_run(run.run_id, recordings).summary["content_digest"] == told["content_digest"]
@@ -109,63 +106,44 @@ def test_a_run_goes_there_and_comes_back(run, bucket, tmp_path):
     command("verify", run.run_id)
 
 
-@pytest.mark.parametrize(
-    "fail_at",
-    [
-        ("upload_part", 3),
-        ("complete_multipart_upload", 1),
-        ("complete_multipart_upload", 4),
-        ("put_object", 1),
-    ],
-    ids=lambda fail_at: f"{fail_at[0]} {fail_at[1]}",
-)
-def test_an_upload_cut_off_leaves_no_archive_and_goes_on_where_it_was(archive, bucket, monkeypatch, fail_at):
-    target, cut = counted(monkeypatch, bucket, fail_at)
-    with pytest.raises(Cut):
-        target.commit("k3v9m2xq", archive)
-    assert target.manifest("k3v9m2xq") is None
-    if fail_at[0] == "upload_part":
-        assert keys(bucket) == set()
-    target, second = counted(monkeypatch, bucket)
-    target.commit("k3v9m2xq", archive)
-    files = read_manifest((archive / layout.MANIFEST).read_bytes(), "here").files
-    sent_before = cut.calls["upload_part"] - (fail_at[0] == "upload_part")
-    assert second.calls["upload_part"] == len(files) - sent_before
-    with target.reading("k3v9m2xq") as folder:
+@pytest.mark.parametrize("fail_at", [1, 3, -1], ids=["first file", "third file", "manifest"])
+def test_an_interrupted_upload_leaves_no_archive_and_is_repeated(archive, bucket, monkeypatch, fail_at):
+    files = len(entries_of(archive)) + 1
+    with monkeypatch.context() as patched:
+        patched.setattr(fs, "S3FileSystem", lambda **_: CutOff(bucket, fail_at % (files + 1)))
+        with pytest.raises(StorageError, match=r"the connection is gone.*uploads all of it again"):
+            store_copy(archive, "k3v9m2xq")
+    if fail_at != -1:
+        assert Store(URL).manifest("k3v9m2xq") is None
+    else:
+        with pytest.raises(RecordingError, match="is no manifest"):
+            Store(URL).manifest("k3v9m2xq")
+    store_copy(archive, "k3v9m2xq")
+    with Store(URL).reading("k3v9m2xq") as folder:
         check(folder)
 
 
-def test_the_parts_of_a_large_file_are_sent_once(bucket, monkeypatch, tmp_path):
-    monkeypatch.setattr(s3, "PART_BYTES", 5 << 20)
+def test_files_of_several_parts(bucket, tmp_path):
     folder = tmp_path / "large"
     folder.mkdir()
-    data = bytes(range(256)) * (12 << 12)  # 12 MiB: three parts
+    data = bytes(range(256)) * (24 << 12)  # 24 MiB; parts are 10 MiB at least
     (folder / "steps.parquet").write_bytes(data)
     seal(folder)
-    target, _ = counted(monkeypatch, bucket, ("upload_part", 3))
-    with pytest.raises(Cut):
-        target.commit("k3v9m2xq", folder)
-    target, second = counted(monkeypatch, bucket)
-    target.commit("k3v9m2xq", folder)
-    assert second.calls["upload_part"] == 1
-    with target.reading("k3v9m2xq") as back:
+    store_copy(folder, "k3v9m2xq")
+    with Store(URL).reading("k3v9m2xq") as back:
         assert (back / "steps.parquet").read_bytes() == data
 
 
-def test_parts_of_another_content_are_not_taken_for_this_one(bucket, monkeypatch, tmp_path):
-    folder = tmp_path / "changing"
-    folder.mkdir()
-    (folder / "steps.parquet").write_bytes(b"then")
-    seal(folder)
-    target, _ = counted(monkeypatch, bucket, ("complete_multipart_upload", 1))
-    with pytest.raises(Cut):
-        target.commit("k3v9m2xq", folder)
-    (folder / "steps.parquet").write_bytes(b"now!")
-    seal(folder)
-    target, _ = counted(monkeypatch, bucket)
-    target.commit("k3v9m2xq", folder)
-    with target.reading("k3v9m2xq") as back:
-        assert (back / "steps.parquet").read_bytes() == b"now!"
+def test_an_upload_leaves_those_of_other_processes_alone(archive, bucket):
+    """Neither finished files of another run nor an unfinished upload of the same file is touched."""
+    put(bucket, "runs/p7/steps.parquet", b"another's")
+    other = bucket.open_output_stream("lab/runs/k3v9m2xq/steps.parquet")
+    other.write(bytes(11 << 20))  # more than a part: a multipart upload is begun
+    store_copy(archive, "k3v9m2xq")
+    assert bucket.open_input_stream("lab/runs/p7/steps.parquet").read() == b"another's"
+    with Store(URL).reading("k3v9m2xq") as folder:
+        check(folder)
+    other.close()  # it was not aborted
 
 
 def seal(folder):
@@ -174,26 +152,41 @@ def seal(folder):
 
 
 def test_what_is_missing_or_changed_there_is_named(archive, bucket):
-    target = target_of(URL)
-    target.commit("k3v9m2xq", archive)
+    store_copy(archive, "k3v9m2xq")
+    store = Store(URL)
     key = f"runs/k3v9m2xq/{layout.EPISODES}"
     data = bytearray((archive / layout.EPISODES).read_bytes())
     data[7] ^= 1
-    bucket.put_object(Bucket="lab", Key=key, Body=bytes(data))
-    with target.reading("k3v9m2xq") as folder, pytest.raises(RecordingError, match=r"episodes\.parquet"):
+    put(bucket, key, bytes(data))
+    with store.reading("k3v9m2xq") as folder, pytest.raises(RecordingError, match=r"episodes\.parquet"):
         check(folder)
-    bucket.delete_object(Bucket="lab", Key=key)
-    with pytest.raises(RecordingError, match=r"episodes\.parquet: is missing"), target.reading("k3v9m2xq"):
+    put(bucket, key, bytes(data[:-1]))
+    with pytest.raises(RecordingError, match=r"episodes\.parquet: found .* bytes"), store.reading("k3v9m2xq"):
         pass
-    with pytest.raises(RecordingError, match="found no archive there"), target.reading("p7"):
+    bucket.delete_file(f"lab/{key}")
+    with pytest.raises(RecordingError, match=r"episodes\.parquet: is missing"), store.reading("k3v9m2xq"):
+        pass
+    with pytest.raises(RecordingError, match="found no archive there"), store.reading("p7"):
         pass
 
 
-def test_a_storage_that_cannot_be_reached_or_refuses_is_told(archive, bucket, monkeypatch):
-    with pytest.raises(StorageError, match="NoSuchBucket"):
-        target_of("s3://nowhere/runs").commit("k3v9m2xq", archive)
+def test_a_storage_that_cannot_be_reached_or_refuses_is_reported(archive, bucket, monkeypatch):
+    with (
+        pytest.raises(StorageError, match="bucket does not exist"),
+        Store("s3://nowhere/runs").writing("k3v9m2xq") as folder,
+    ):
+        shutil.copytree(archive, folder, dirs_exist_ok=True)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     with pytest.raises(StorageError, match="Could not connect"):
-        target_of(URL).manifest("k3v9m2xq")
+        Store(URL).manifest("k3v9m2xq")
     with pytest.raises(RunnerError, match="found no bucket"):
-        target_of("s3://")
+        Store("s3://")
+
+
+@pytest.mark.parametrize("location", [URL, "folder"])
+def test_no_name_leads_out_of_the_store(bucket, location, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    store = Store(location)
+    for run_id in ("..", ".", "a/../..", "/etc", ""):
+        with pytest.raises(RecordingError, match="is not the name of an archive's file"):
+            store.manifest(run_id)
