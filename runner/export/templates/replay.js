@@ -77,7 +77,7 @@ class Replay {
     };
     say("State", episode.states[episode.state[i]]);
     if (i > 0) {
-      say("Last action", data.actions[episode.action[i - 1]] + (episode.explored[i - 1] ? " (explored: chosen at random)" : ""));
+      say("Last action", data.actions[episode.action[i - 1]] + this.explorers(episode.explored[i - 1]));
       say("Reward", this.several(episode.reward[i - 1]));
       const events = data.events.filter((_, bit) => episode.event[i - 1] >>> bit & 1);
       say("Events", events.length ? events.map((name) => Replay.made("span", name, "event")) : "none");
@@ -86,6 +86,13 @@ class Replay {
       say("Last action", "none yet: the episode begins");
     }
     this.find(".caption").replaceChildren(list);
+  }
+
+  // Bit i of a step's mask is learner i: whose part of the action was chosen at random.
+  explorers(mask) {
+    const { learners } = this.data, who = learners.filter((_, learner) => mask >>> learner & 1);
+    if (!who.length) return "";
+    return ` (${who.length < learners.length ? `${who.join(" and ")} ` : ""}explored: chosen at random)`;
   }
 
   several(values) {
