@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from html import escape
 from typing import Any, Final
 
@@ -27,14 +27,33 @@ HEIGHT: Final = 760
 """Pixels of a notebook's page that a run takes; it scrolls inside."""
 
 
+_FRAME_STYLE: Final = """<style>
+.picture { display: flex; flex-direction: column; }
+.picture svg { max-height: 19rem; }
+.scrub { order: -1; margin: 0 0 .6rem; }
+</style>
+"""
+"""The slider goes above a smaller picture, so that both are visible without scrolling inside the frame."""
+
+
 @dataclass(frozen=True)
 class Shown:
     """Something that a notebook shows as HTML."""
 
-    html: str
+    html: str = field(repr=False)
 
     def _repr_html_(self) -> str:
         return self.html
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture that a notebook shows."""
+
+    png: bytes = field(repr=False)
+
+    def _repr_png_(self) -> bytes:
+        return self.png
 
 
 def register_formatters() -> None:
@@ -47,11 +66,14 @@ def register_formatters() -> None:
 
 
 def run_html(run: Run) -> str:
-    """Return how a run shows itself: its report in a frame, or its facts where packages are missing."""
+    """Return how a run shows itself: its result as a sentence, with its report in a frame below.
+
+    Where packages are missing it shows its facts instead.
+    """
     if not run.recording.is_file():
         return facts_html(run)
     try:
-        return report(run).html
+        return _result_html(run) + report(run).html
     except MissingExtra as error:
         return facts_html(run) + f"<p>{escape(str(error))}</p>"
 
@@ -60,13 +82,14 @@ def report(*runs: Run, height: int = HEIGHT) -> Shown:
     """Return the report of runs (summary, replay, plots, maps) in a frame of its own.
 
     Raises:
-        MissingExtra: Jinja2 or Matplotlib is not installed.
+        MissingExtra: Jinja2 is not installed.
         RecordingError: a recording cannot be read.
     """
     from runner.archive.places import at_hand
     from runner.export.reports.report import render_report
 
     page, _ = render_report([at_hand(run).recording for run in runs])
+    page = page.replace("</head>", f"{_FRAME_STYLE}</head>", 1)
     title = ", ".join(f"{run.name}, run {run.run_id}" for run in runs)
     return Shown(
         f'<iframe title="{escape(title)}" srcdoc="{escape(page)}" width="100%" height="{height}" '
@@ -74,8 +97,8 @@ def report(*runs: Run, height: int = HEIGHT) -> Shown:
     )
 
 
-def plot(*runs: Run) -> Shown:
-    """Return the learning curves of runs in one figure, runs of one configuration as median and band.
+def plot(*runs: Run) -> Picture:
+    """Return the learning curves of runs as one picture, runs of one configuration as median and band.
 
     Raises:
         MissingExtra: Matplotlib is not installed.
@@ -93,10 +116,9 @@ def plot(*runs: Run) -> Shown:
         with open_recording(at_hand(run).recording) as recording:
             series.append(read_series(recording))
     groups = groups_of(series)
-    buffer = io.StringIO()
-    draw_figure(groups, panels_of(groups)).savefig(buffer, format="svg", facecolor="white")
-    svg = buffer.getvalue()
-    return Shown(svg[svg.index("<svg") :])
+    buffer = io.BytesIO()
+    draw_figure(groups, panels_of(groups)).savefig(buffer, format="png", facecolor="white", dpi=110)
+    return Picture(buffer.getvalue())
 
 
 def rerun_view(
@@ -127,6 +149,16 @@ def rerun_view(
     viewer = notebook.Viewer(width=width, height=height)
     viewer.send_rrd(path.read_bytes())
     return viewer
+
+
+def _result_html(run: Run) -> str:
+    """Return the last evaluation of a run as a sentence: where frames are not shown, all that there is."""
+    last = run.summary.last_evaluation
+    if last is None:
+        return f"<p><b>{escape(run.title)}</b></p>"
+    success = "" if last.success_percent is None else f"{last.success_percent:.1f} % of trials succeed, "
+    length = "" if last.mean_length is None else f"{last.mean_length:,.1f} steps on average"
+    return f"<p><b>{escape(run.title)}</b>, last evaluation: {success}{length}.</p>"
 
 
 def facts_html(run: Run) -> str:
