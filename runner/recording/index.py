@@ -24,6 +24,7 @@ from mcap.records import (
     Header,
     MetadataIndex,
     Schema,
+    Statistics,
 )
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
@@ -139,6 +140,8 @@ class Index:
     attachments: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Name to (offset, length) of the record."""
     metadata: dict[str, tuple[int, int]] = field(default_factory=dict)
+    message_counts: dict[int, int] = field(default_factory=dict)
+    """Messages by channel, as the summary states them; empty without one."""
     finished: bool = False
     end: int = 0
     """Offset behind the last whole record of the data section."""
@@ -235,6 +238,8 @@ def _note_summary(index: Index, path: str, opcode: int, offset: int, body: bytes
         _note_schema(index, path, offset, body)
     elif opcode == Opcode.CHANNEL:
         _note_channel(index, path, offset, body)
+    elif opcode == Opcode.STATISTICS:
+        index.message_counts = dict(_parse(Statistics, body, path, offset).channel_message_counts)
     elif opcode == Opcode.ATTACHMENT_INDEX:
         attachment = _parse(AttachmentIndex, body, path, offset)
         _within(path, "attachment", attachment.offset, attachment.length, data_end)

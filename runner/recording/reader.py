@@ -531,7 +531,7 @@ class Recording:
     @cached_property
     def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
         """Which chunks of the file are each topic's."""
-        return chunks_by_topic(self._index, self._store, str(self.path))
+        return chunks_by_topic(self._index, self._store, self.dtypes, str(self.path))
 
     @cached_property
     def _own(self) -> Mapping[str, Topic]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import Final
 
@@ -12,28 +12,99 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
+from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, MESSAGE_HEAD
 from runner.recording.chunk_cache import RecordStore
 from runner.recording.index import ChunkEntry, ChunkTable, Index
-from runner.recording.schema import ALL_TOPICS, Topic
+from runner.recording.schema import ALL_TOPICS, STEP_NANOSECONDS, Topic
 
 _MESSAGE: Final = int(Opcode.MESSAGE)
+_MANY: Final = 32
+"""Chunks of one size from which on they are not unpacked to learn whose messages they hold."""
 
 
-def chunks_by_topic(index: Index, store: RecordStore, path: str) -> dict[Topic, NDArray[np.intp]]:
+def chunks_by_topic(
+    index: Index, store: RecordStore, dtypes: Mapping[Topic, np.dtype[np.void]], path: str
+) -> dict[Topic, NDArray[np.intp]]:
     """Return which chunks of a file hold each topic's messages, in order.
 
+    Without message indexes only a chunk itself says whose messages it holds. Unpacking the beginning of every
+    chunk takes seconds in a long recording, so most are inferred from the summary where it determines them.
+
+    Args:
+        index: of the file.
+        store: gives the chunks' records.
+        dtypes: of the message records of fixed-width topics.
+        path: of the recording, for errors.
+
     Raises:
-        RecordingError: one holds messages of a channel that the file does not have.
+        RecordingError: a chunk holds messages of a channel that the file does not have.
     """
     table = index.chunks
     channels = table.columns["channel"].copy() if table else np.empty(0, np.uint16)
-    for k in np.flatnonzero(channels == 0).tolist():
-        channel = store.first_channel(table[k])
-        channels[k] = channel
+    if index.message_counts and np.count_nonzero(channels == 0) >= _MANY:
+        channels = _with_inferred(index, store, dtypes, channels)
+    _probe(np.flatnonzero(channels == 0), table, store, channels)
     for k in np.flatnonzero(~np.isin(channels, list(index.channels))).tolist():
         raise _damaged(path, table[k], f"messages of channel {channels[k]}, expected one of ours")
     return {topic: np.flatnonzero(channels == topic.channel) for topic in ALL_TOPICS}
+
+
+def _probe(
+    places: NDArray[np.intp], table: ChunkTable, store: RecordStore, channels: NDArray[np.uint16]
+) -> None:
+    """Set the channels of chunks by unpacking the beginning of each."""
+    for k in places.tolist():
+        channels[k] = store.first_channel(table[k])
+
+
+def _with_inferred(
+    index: Index,
+    store: RecordStore,
+    dtypes: Mapping[Topic, np.dtype[np.void]],
+    channels: NDArray[np.uint16],
+) -> NDArray[np.uint16]:
+    """Return the channels of all chunks, those of full chunks inferred; as they were if the counts disagree.
+
+    A chunk size that occurs often belongs to the one fixed-width topic whose records divide it and which has
+    enough messages. Where training and evaluation both do, chunks of steps that follow each other without
+    a gap in time are of one phase if the first and the last of them are: the first steps of an evaluation go
+    into a chunk of their own. A wrong inference would give a topic more messages than the summary counts.
+    """
+    columns = index.chunks.columns
+    sizes, times = columns["uncompressed_size"], (columns["start_time"], columns["end_time"])
+    inferred = channels.copy()
+    chosen = set()
+    found = np.unique(sizes[channels == 0], return_counts=True)
+    for size, count in zip(*(numbers.tolist() for numbers in found), strict=True):
+        fitting = [
+            topic
+            for topic, dtype in dtypes.items()
+            if size % dtype.itemsize == 0
+            and index.message_counts.get(topic.channel, 0) * dtype.itemsize >= size
+        ]
+        if count < _MANY or not fitting:
+            continue
+        places = np.flatnonzero((channels == 0) & (sizes == size))
+        if len(fitting) == 1:
+            inferred[places] = fitting[0].channel
+            chosen.update(fitting)
+        elif {topic.message for topic in fitting} <= {schema.STEP, schema.TRANSITION}:
+            span = np.uint64((size // dtypes[fitting[0]].itemsize - 1) * STEP_NANOSECONDS)
+            places = places[times[1][places] - times[0][places] == span]
+            breaks = times[0][places][1:] != times[1][places][:-1] + np.uint64(STEP_NANOSECONDS)
+            for chain in np.split(places, np.flatnonzero(breaks) + 1):
+                if len(chain):
+                    _probe(chain[[0, -1]], index.chunks, store, inferred)
+                    if inferred[chain[0]] == inferred[chain[-1]]:
+                        inferred[chain] = inferred[chain[0]]
+            chosen.update(fitting)
+    _probe(np.flatnonzero(inferred == 0), index.chunks, store, inferred)
+    for topic in chosen:
+        messages = int(sizes[inferred == topic.channel].sum(dtype=np.uint64)) // dtypes[topic].itemsize
+        if messages != index.message_counts.get(topic.channel, 0):
+            return channels
+    return inferred
 
 
 class TopicChunks:
