@@ -15,10 +15,15 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
 import runner
 from benchmarks.figures import Figure, figure
@@ -61,6 +66,7 @@ def measure(quick: bool) -> list[Figure]:
             figures += _environment(name, Path(folder), steps, repetitions)
         for name, kind, count in (("Blackjack-v1", "short", steps // 20), ("Taxi-v4", "long", steps // 2)):
             figures += _against_minari(name, kind, Path(folder), count, repetitions)
+        figures += [_vector(count, Path(folder), steps // 5, repetitions) for count in (1, 4, 16)]
         figures += _short(Path(folder), 100 if quick else 1_000, repetitions)
         figures += _logging(Path(folder), steps, repetitions)
         figures += _memory(Path(folder), 10_000_000 if not quick else 1_000_000)
@@ -155,20 +161,85 @@ def _whole(make: Callable[[], Any], steps: int) -> float:
     return time.process_time() - begin
 
 
+class Prepared(gymnasium.vector.VectorEnv[Any, Any, Any]):
+    """Vector environments that take no time: arrays made before, in which one step in 22 ends an episode."""
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as Gymnasium has it
+
+    def __init__(self, count: int) -> None:
+        self.num_envs = count
+        self.single_observation_space = spaces.Box(-9, 9, (4,), np.float32)
+        self.single_action_space = spaces.Discrete(2)
+        self.observation_space = batch_space(self.single_observation_space, count)
+        self.action_space = batch_space(self.single_action_space, count)
+        draws = np.random.default_rng(0)
+        self._observations = draws.normal(size=(1024, count, 4)).astype(np.float32)
+        self._rewards = np.ones(count)
+        self._ends = draws.random((1024, count)) < 1 / 22
+        self._never = np.zeros(count, np.bool_)
+        self._t = 0
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:  # noqa: ARG002
+        """Return the first observations."""
+        return self._observations[0], {}
+
+    def step(self, actions: Any) -> Any:  # noqa: ARG002
+        """Return the next of the prepared arrays."""
+        self._t = t = (self._t + 1) % 1024
+        return self._observations[t], self._rewards, self._ends[t], self._never, {}
+
+
+def _vector(count: int, folder: Path, steps: int, repetitions: int) -> Figure:
+    """Return what recording adds to a step of a vector environment."""
+    added, whole = [], []
+    for _ in range(repetitions):
+        alone = _times(partial(_drive_vector, Prepared(count), steps))
+        with runner.record_vector(Prepared(count), folder / "recordings") as envs:
+            recorded = _times(partial(_drive_vector, envs, steps))
+        added.append((recorded[0] - alone[0]) / steps * 1e6)
+        whole.append((recorded[1] - alone[1]) / steps * 1e6)
+    return figure(
+        f"vector step, {count} environment{'s' if count > 1 else ''}",
+        added,
+        "us",
+        (20, 6),
+        higher_is_better=False,
+        detail=f"processor time of the loop's thread; of all threads {statistics.median(whole):.2f} us",
+    )
+
+
+def _drive_vector(envs: Any, steps: int) -> None:
+    actions = np.zeros(envs.num_envs, np.int64)
+    envs.reset(seed=0)
+    for _ in range(steps):
+        envs.step(actions)
+
+
 def _short(folder: Path, loops: int, repetitions: int) -> list[Figure]:
     """Return what the start and the end of a recorded loop cost, of loops that log one value."""
-    spent = []
+    spent, lasted = [], []
     for _ in range(repetitions):
-        begin = time.process_time()
+        begin, began = time.process_time(), time.perf_counter()
         for _ in range(loops):
             with runner.record(gymnasium.make("CartPole-v1"), folder / "recordings") as env:
                 env.log("value", 1.0)
         whole = time.process_time() - begin
+        lasted.append((time.perf_counter() - began) * 1_000 / loops)
         begin = time.process_time()
         for _ in range(loops):
             gymnasium.make("CartPole-v1").close()
         spent.append((whole - (time.process_time() - begin)) / loops * 1e3)
-    return [figure("start and end of a loop", spent, "ms", (4, 2), higher_is_better=False)]
+    return [
+        figure("start and end of a loop", spent, "ms", (4, 2), higher_is_better=False),
+        figure(
+            "1,000 loops",
+            lasted,
+            "s",
+            (10, 4),
+            higher_is_better=False,
+            detail="elapsed time of loops that log one value, each made durable by one fsync",
+        ),
+    ]
 
 
 def _logging(folder: Path, steps: int, repetitions: int) -> list[Figure]:

@@ -25,7 +25,9 @@ class Group:
         """Its label, and which runs they are: `quick, 3 runs (k3v9m2xq seed 0, ...)`."""
         shown = listed(
             [
-                f"{run.run_id} seed {run.seed}" + ("" if run.finished else f", {run.status}")
+                run.run_id
+                + ("" if run.seed is None else f" seed {run.seed}")
+                + ("" if run.finished else f", {run.status}")
                 for run in self.runs
             ]
         )

@@ -32,7 +32,7 @@ def read_series(recording: Recording) -> RunSeries:
     return RunSeries(
         run_id=recording.run["run_id"],
         name=recording.name,
-        seed=int(recording.run["seed"]),
+        seed=recording.seed,
         status=recording.status,
         config=recording.config,
         evaluation=[
@@ -64,9 +64,9 @@ def loop_series(recording: Recording) -> RunSeries:
     return RunSeries(
         run_id=recording.run["run_id"],
         name=recording.name,
-        seed=int(recording.run["seed"]),
+        seed=recording.seed,
         status=recording.status,
-        config=_without_seed(recording.config, int(recording.run["seed"])),
+        config=_without_seed(recording.config, recording.seed),
         evaluation=[(record["episode"], _loop_readings(record)) for record in evaluations],
         training=sorted(training.items()),
         content_digest=recording.result.content_digest or "",
@@ -130,7 +130,7 @@ def training_readings(side: Mapping[str, Any]) -> Readings:
     }
 
 
-def _without_seed(config: Mapping[str, Any], seed: int) -> Mapping[str, Any]:
+def _without_seed(config: Mapping[str, Any], seed: int | None) -> Mapping[str, Any]:
     """Return a loop's configuration without the run's own seed among its settings, as in vars(args)."""
     own = config.get("config")
     if not isinstance(own, Mapping) or own.get("seed") != seed:

@@ -21,7 +21,8 @@ class RunSeries:
 
     run_id: str
     name: str
-    seed: int
+    seed: int | None
+    """None for a loop that was given none."""
     status: str
     """How it ended: `finished`, `interrupted` or `failed`."""
     config: Mapping[str, Any]

@@ -115,7 +115,7 @@ def _cells(removal: Removal) -> tuple[str, ...]:
     return (
         removal.run_id,
         removal.name,
-        str(removal.seed),
+        UNKNOWN if removal.seed is None else str(removal.seed),
         removal.status,
         UNKNOWN if removal.success_percent is None else number(removal.success_percent),
         age((datetime.now(UTC) - removal.created).total_seconds()),

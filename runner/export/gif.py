@@ -133,7 +133,7 @@ class Film:
 
     def __init__(self, recording: Recording, episode: Episode, width: int = WIDTH) -> None:
         mdp = recording.mdp
-        title = f"{recording.name}, seed {recording.run['seed']}: {episode.title}"
+        title = f"{recording.title}: {episode.title}"
         has_scene = mdp.scene is not None and mdp.scene_cells is not None
         room = int((width - 2 * _MARGIN) / (_FONT * _LETTER))
         self._captions = [

@@ -18,6 +18,7 @@ from runner.export.contents import whole_ranges
 from runner.export.minari_loops import Episode, loop_episodes, space_of
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.recording.run_file import run_title
 from runner.util.extras import require
 
 if TYPE_CHECKING:
@@ -195,8 +196,8 @@ def _told(recording: Recording, phase: str) -> dict[str, Any]:
     job = recording.kind == "job"
     what = "Observations are states, actions joint actions." if job else "Recorded from a loop."
     told = {
-        "description": f"The {phase} episodes of the dualtaxi run {run['run_id']} ({run['name']}, seed "
-        f"{run['seed']}), content digest {digest}. {what}",
+        "description": f"The {phase} episodes of the dualtaxi run {run['run_id']} "
+        f"({run_title(run['name'], recording.seed)}), content digest {digest}. {what}",
     }
     return told | ({"algorithm_name": str(config["algorithm"])} if job else {})
 

@@ -184,13 +184,13 @@ def _digest(recording: Recording) -> str:
 def _tags(recording: Recording) -> dict[str, str]:
     run = recording.run
     return {
-        "mlflow.runName": f"{recording.name}, seed {run['seed']}",
+        "mlflow.runName": recording.title,
         "mlflow.source.name": "dualtaxi",
         "mlflow.user": "",
         RUN_TAG: run["run_id"],
         DIGEST_TAG: _digest(recording),
         "dualtaxi.job": run["job"],
-        "dualtaxi.seed": run["seed"],
+        **({} if recording.seed is None else {"dualtaxi.seed": run["seed"]}),
         "dualtaxi.status": recording.status,
     }
 

@@ -43,7 +43,7 @@ from runner.recording.metadata import (
     sizes_of,
     spaces_of,
 )
-from runner.recording.run_file import Summary, parse_summary
+from runner.recording.run_file import Summary, parse_summary, run_title
 from runner.recording.scan import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
 from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
@@ -119,6 +119,16 @@ class Recording:
     def run(self) -> dict[str, str]:
         """Id, name, seed, job and creation of the run."""
         return self.metadata("run")
+
+    @property
+    def seed(self) -> int | None:
+        """Its job's seed; None for a loop that was given none."""
+        return None if self.run.get("seeded") == "false" else int(self.run["seed"])
+
+    @property
+    def title(self) -> str:
+        """What the run is called now, and its seed if it has one: `patient, seed 3`."""
+        return run_title(self.name, self.seed)
 
     @cached_property
     def lost(self) -> dict[str, list[list[int]]]:

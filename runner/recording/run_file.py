@@ -338,3 +338,8 @@ _RUN: Final = {
     "proof": _optional(_DIGEST),
     "recording": _TEXT,
 }
+
+
+def run_title(name: str, seed: int | None) -> str:
+    """Return a run's name, and its seed if it has one: `patient, seed 3`."""
+    return name if seed is None else f"{name}, seed {seed}"

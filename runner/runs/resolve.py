@@ -33,8 +33,8 @@ class Named(Protocol):
         """What it is called."""
 
     @property
-    def seed(self) -> int:
-        """Its job's seed."""
+    def title(self) -> str:
+        """Its name, and its seed if it has one."""
 
     @property
     def created(self) -> datetime:
@@ -103,8 +103,7 @@ def the_one(name: str, runs: Sequence[AnyNamed], recordings: Path) -> AnyNamed:
         return found[0]
     if found:
         several = "\n".join(
-            f"  {run.run_id}  {run.name}  seed {run.seed}  {run.created:%Y-%m-%d %H:%M}"
-            for run in found[:_TOLD]
+            f"  {run.run_id}  {run.title}  {run.created:%Y-%m-%d %H:%M}" for run in found[:_TOLD]
         )
         more = f"\n  and {len(found) - _TOLD:,} more" if len(found) > _TOLD else ""
         or_newest = (

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.recording.labels import Labels, change_labels, read_labels
 from runner.recording.liveness import lives, owner
-from runner.recording.run_file import RUN_ID, ArchiveReference, RunFile, Summary, parse_run_file
+from runner.recording.run_file import RUN_ID, ArchiveReference, RunFile, Summary, parse_run_file, run_title
 from runner.util.files import read_object, write_whole
 from runner.util.opening import as_utf8, is_utf8
 
@@ -119,7 +119,7 @@ class Run:
     @property
     def title(self) -> str:
         """Its name, and its seed if it has one: `patient, seed 3`."""
-        return f"{self.name}, seed {self.seed}" if self.has_seed else self.name
+        return run_title(self.name, self.seed if self.has_seed else None)
 
     @property
     def recording(self) -> Path:

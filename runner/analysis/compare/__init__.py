@@ -19,11 +19,14 @@ from runner.analysis.compare import statistics
 from runner.analysis.compare.moments import Moment, higher_is_better, value_of
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.groups import Group
-from runner.analysis.series import is_loop, points_of, title_of
+from runner.analysis.series import RunSeries, is_loop, points_of, title_of
 from runner.util.humanize import listed
 
 THRESHOLDS: Final = 101
-Measured = dict[int, tuple[list[str], float]]
+Seed = int | str
+"""A seed; of a run that has none, its id."""
+
+Measured = dict[Seed, tuple[list[str], float]]
 """Seed to the ids of its runs and their value."""
 
 
@@ -32,7 +35,7 @@ class GroupResult:
     """One group's values of one metric, a seed each; those that no seed has are not here."""
 
     label: str
-    seeds: list[int]
+    seeds: list[Seed]
     run_ids: list[str]
     """In the order of the seeds, which may have several runs each."""
     values: list[float]
@@ -56,10 +59,10 @@ class PairResult:
 
     a: str
     b: str
-    seeds: list[int]
-    left_out_a: list[int]
+    seeds: list[Seed]
+    left_out_a: list[Seed]
     """Seeds that only A has."""
-    left_out_b: list[int]
+    left_out_b: list[Seed]
     median: float
     """Of the differences A - B, seed by seed; nan without a common seed."""
     iqm: Estimate
@@ -150,7 +153,7 @@ def _with_simultaneous_intervals(metrics: list[MetricResult]) -> list[MetricResu
 def _identical(groups: Sequence[Group]) -> list[str]:
     """Return a note for each two groups whose runs have the same content."""
     digests = {
-        group.label: sorted((run.seed, run.content_digest) for run in group.runs)
+        group.label: sorted((run.seed or 0, run.content_digest) for run in group.runs)
         for group in groups
         if all(run.content_digest for run in group.runs)
     }
@@ -178,7 +181,7 @@ def _untested(metrics: Sequence[tuple[str, str]]) -> list[str]:
 
 
 def _few(groups: Sequence[Group]) -> list[str]:
-    seeds = {group.label: len({run.seed for run in group.runs}) for group in groups}
+    seeds = {group.label: len({_seed(run) for run in group.runs}) for group in groups}
     few = [group for group in groups if seeds[group.label] < statistics.FEW_SEEDS]
     if not few:
         return []
@@ -214,18 +217,28 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
     )
 
 
+def _seed(run: RunSeries) -> Seed:
+    """Return a run's seed; its id if it has none: such runs are not repetitions of each other."""
+    return run.run_id if run.seed is None else run.seed
+
+
+def _order(seed: Seed) -> tuple[bool, Seed]:
+    """Return what seeds are sorted by: numbers first."""
+    return isinstance(seed, str), seed
+
+
 def _values(
     group: Group, metric: str, line: str, moment: Moment, groups: Sequence[Group], notes: list[str]
 ) -> Measured:
     """Return the values of a group; says in `notes` which runs are left out."""
-    found: dict[int, list[tuple[str, float]]] = {}
+    found: dict[Seed, list[tuple[str, float]]] = {}
     without: dict[str, list[str]] = {}
     for run in group.runs:
         value, reason = value_of(run, metric, line, moment, groups)
         if value is None:
             without.setdefault(reason, []).append(run.run_id)
         else:
-            found.setdefault(run.seed, []).append((run.run_id, value))
+            found.setdefault(_seed(run), []).append((run.run_id, value))
     notes += [f"{group.label}, left out: {listed(runs)} ({reason})" for reason, runs in without.items()]
     if any(len(runs) > 1 for runs in found.values()):
         count = sum(map(len, found.values()))
@@ -234,7 +247,7 @@ def _values(
         )
     return {
         seed: ([run_id for run_id, _ in runs], float(np.mean([value for _, value in runs])))
-        for seed, runs in sorted(found.items())
+        for seed, runs in sorted(found.items(), key=lambda entry: _order(entry[0]))
     }
 
 
@@ -296,7 +309,7 @@ def _group(label: str, values: Measured, thresholds: Values, sign: float) -> Gro
 
 
 def _pair(a: str, ours: Measured, b: str, theirs: Measured, sign: float) -> PairResult:
-    seeds = sorted(ours.keys() & theirs.keys())
+    seeds = sorted(ours.keys() & theirs.keys(), key=_order)
     left, right = (np.array([values[seed][1] for seed in seeds]) for values in (ours, theirs))
     difference = left - right
     none = Estimate(np.nan, np.nan, np.nan)
@@ -304,8 +317,8 @@ def _pair(a: str, ours: Measured, b: str, theirs: Measured, sign: float) -> Pair
         a,
         b,
         seeds,
-        sorted(ours.keys() - theirs.keys()),
-        sorted(theirs.keys() - ours.keys()),
+        sorted(ours.keys() - theirs.keys(), key=_order),
+        sorted(theirs.keys() - ours.keys(), key=_order),
         statistics.median(difference) if seeds else np.nan,
         statistics.interquartile_mean(difference),
         none,

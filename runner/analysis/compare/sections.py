@@ -93,8 +93,13 @@ def unpaired(pairs: Sequence[PairResult]) -> list[str]:
     said = []
     for pair in pairs:
         for own, other, seeds in ((pair.a, pair.b, pair.left_out_a), (pair.b, pair.a, pair.left_out_b)):
-            if seeds:
-                left_out = listed([str(seed) for seed in seeds])
+            if without := [seed for seed in seeds if isinstance(seed, str)]:
+                said.append(
+                    f"{pair.a} against {pair.b} without {listed(without)} of {own}: only runs with a seed "
+                    "can be paired"
+                )
+            if numbers := [str(seed) for seed in seeds if not isinstance(seed, str)]:
+                left_out = listed(numbers)
                 said.append(
                     f"{pair.a} against {pair.b} without seed {left_out}, which {own} has and {other} has not"
                 )

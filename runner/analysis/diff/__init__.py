@@ -192,14 +192,14 @@ def can_compare_steps(a: Recording, b: Recording) -> bool:
 
 def _who(recording: Recording) -> dict[str, Any]:
     run = recording.run
-    named = {"run_id": run["run_id"], "name": recording.name, "seed": int(run["seed"])}
+    named = {"run_id": run["run_id"], "name": recording.name, "seed": recording.seed}
     return named | {"status": recording.status}
 
 
 def _settings(recording: Recording) -> dict[str, Any]:
     """Return the configuration with the run's own seed instead of the list."""
     settings = {key: value for key, value in recording.config.items() if key != "seeds"}
-    return settings | {"seed": int(recording.run["seed"])}
+    return settings | {"seed": recording.seed}
 
 
 def _costs(recording: Recording) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 from runner.analysis.diff import NOT_CONTENT, Cause, Change, Parting, RunDiff
 from runner.analysis.sections import Grid, Section
 from runner.environments.naming import spoken
+from runner.util.humanize import UNKNOWN
 
 MOST_NAMED = 4
 """So many settings are named in the first sentences."""
@@ -43,7 +44,13 @@ def _says(section: Section) -> bool:
 
 def _runs(difference: RunDiff) -> Section:
     rows = [
-        (name, who["run_id"], who["name"], str(who["seed"]), who["status"])
+        (
+            name,
+            who["run_id"],
+            who["name"],
+            UNKNOWN if who["seed"] is None else str(who["seed"]),
+            who["status"],
+        )
         for name, who in (("A", difference.a), ("B", difference.b))
     ]
     grid = Grid(("", "id", "name", "seed", "status"), rows)

@@ -13,6 +13,7 @@ from runner.analysis.sections import Grid
 from runner.export.plots.compare import intervals_svg, letter, profile_svg
 from runner.export.plots.figure import COLOURS, footnote
 from runner.export.reports.report import TEMPLATES, curves, require_packages, templates
+from runner.util.humanize import UNKNOWN
 
 
 def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
@@ -70,7 +71,13 @@ def _metric(metric: MetricResult, labels: list[str]) -> dict[str, Any]:
 
 def _runs(groups: Sequence[Group]) -> Grid:
     rows = [
-        (run.run_id, f"{letter(i)}: {group.label}", run.name, str(run.seed), run.status)
+        (
+            run.run_id,
+            f"{letter(i)}: {group.label}",
+            run.name,
+            UNKNOWN if run.seed is None else str(run.seed),
+            run.status,
+        )
         for i, group in enumerate(groups)
         for run in group.runs
     ]

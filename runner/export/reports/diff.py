@@ -32,6 +32,7 @@ from runner.export.reports.episode import deeds_in_words
 from runner.export.reports.maps import situation, situation_in_words
 from runner.export.reports.report import BROAD, TEMPLATES, curves, require_packages, templates
 from runner.recording.reader import Recording
+from runner.recording.run_file import run_title
 
 _MOST_VALUES: Final = 6
 """Q-values shown of each run: the highest."""
@@ -74,7 +75,9 @@ def told_of(difference: RunDiff, a: Recording, b: Recording) -> dict[str, Any]:
     Raises:
         MissingExtra: Matplotlib is not installed.
     """
-    names = [f"{who['name']}, seed {who['seed']} ({who['run_id']})" for who in (difference.a, difference.b)]
+    names = [
+        f"{run_title(who['name'], who['seed'])} ({who['run_id']})" for who in (difference.a, difference.b)
+    ]
     told = {section.title: section for section in sections(difference, everything=True)}
     return {
         "title": f"{difference.a['name']} against {difference.b['name']}",

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from runner.errors import RunNotFound
+from runner.recording.run_file import run_title
 from runner.runs.catalogue.folders import Depth
 from runner.runs.catalogue.index import Index, look
 from runner.runs.resolve import LATEST, run_at_once, the_one
@@ -21,8 +22,13 @@ class Candidate(NamedTuple):
     entry: str
     run_id: str
     name: str
-    seed: int
+    seed: int | None
     milliseconds: int
+
+    @property
+    def title(self) -> str:
+        """Its name, and its seed if it has one."""
+        return run_title(self.name, self.seed)
 
     @property
     def created(self) -> datetime:
@@ -94,7 +100,7 @@ def completions(beginning: str, recordings: Path) -> dict[str, str]:
     def work(index: Index) -> dict[str, str]:
         newest = index.newest()
         found = {LATEST: "the newest run"} if newest else {}
-        found |= {run_id: f"{name}, seed {seed}" for run_id, name, seed in index.ids_from(beginning)}
+        found |= {run_id: run_title(name, seed) for run_id, name, seed in index.ids_from(beginning)}
         for name, count in index.names_from(beginning.rpartition("@")[0] or beginning):
             if count == 1:
                 found[name] = "the run of this name"

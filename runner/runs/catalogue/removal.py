@@ -89,7 +89,7 @@ def plan(run: Run, root: Path, force: bool = False) -> Removal:
     return Removal(
         run_id=run.run_id,
         name=run.name,
-        seed=run.seed,
+        seed=run.seed if run.has_seed else None,
         status=run.status,
         success_percent=last.success_percent if last else None,
         created=run.created,

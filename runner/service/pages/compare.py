@@ -45,7 +45,7 @@ async def overview(request: Request, catalogue: CatalogueOf, run: Names = None) 
 
 
 def _overview(request: Request, found: list[Run]) -> Response:
-    settings = [{"seed": str(each.seed), **_flat(each)} for each in found]
+    settings = [{**({"seed": str(each.seed)} if each.has_seed else {}), **_flat(each)} for each in found]
     keys = list(dict.fromkeys(key for each in settings for key in each))
     told = [(key, [each.get(key, humanize.UNKNOWN) for each in settings]) for key in keys]
     return page(
