@@ -310,7 +310,7 @@ def test_the_command_says_what_differs_and_ends_with_1(record, folder):
     assert "step_size" not in told.stdout
     same = run(cli, ["diff", ids[0], ids[2], "--recordings", str(folder)])
     assert same.exit_code == 0, same.output
-    unknown = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--target", "finish=80"])
+    unknown = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--target", "sucess_percent=80"])
     assert unknown.exit_code == 2
     assert "Did you mean" in unknown.stderr
     wrong = run(cli, ["diff", ids[0], "nothing", "--recordings", str(folder)])

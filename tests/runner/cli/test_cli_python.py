@@ -22,6 +22,7 @@ def test_the_public_names():
         "Recording",
         "Run",
         "RunnerError",
+        "__version__",
         "find_run",
         "frames",
         "list_runs",

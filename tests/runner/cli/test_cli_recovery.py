@@ -329,7 +329,7 @@ def test_qtable_of_a_state(recorded, recorded_run):
         (("--state", 10**7), "state: found 10000000"),
         (("--step", 1, "--episode", 1), "choose one"),
         (("--step", -1), "-1"),
-        (("-o", "/dev/null/table.npy"), "cannot be written"),
+        (("-o", "/dev/null/table.npy"), "/dev/null is a file, expected a folder"),
     ],
 )
 def test_qtable_of_what_is_not_there(recorded, words, told):

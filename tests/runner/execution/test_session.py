@@ -92,7 +92,7 @@ def test_one_run_is_what_the_twin_does_from_beginning_to_end(tmp_path):
             if pause % 20 == 0:
                 twin.evaluate(3)
                 evaluated.append(twin.training_side())
-        assert len(logged) == 4
+        assert len(logged) == 5
         for found, expected in zip(recording.metrics("train"), logged, strict=True):
             assert {key: found[key] for key in expected} == expected
         for number, (found, expected) in enumerate(zip(recording.metrics("eval"), evaluated, strict=True)):

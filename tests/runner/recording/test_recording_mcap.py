@@ -66,13 +66,14 @@ def test_the_official_reader_gives_every_message_as_ours_does(run):
             for field in topic.message.fields:
                 found = [plain(getattr(decoded, field.name)) for _, decoded in theirs]
                 assert found == ours[field.name].tolist(), f"{topic.name} {field.name}"
+        kinds = {topic.name: topic for topic in schema.TOPICS}
         for phase, name in (("train", "/train/metrics"), ("eval", "/eval/metrics")):
             ours = recording.metrics(phase)
             assert len(ours) == len(messages[name])
             for mine, (message, decoded) in zip(ours, messages[name], strict=True):
                 assert mine.pop("log_time") == message.log_time
                 # As text: a mean of nothing is NaN, which equals nothing.
-                names = {field.name: field.stored_name for field in topic.message.fields}
+                names = {field.name: field.stored_name for field in kinds[name].message.fields}
                 assert repr(mine) == repr({key: plain(getattr(decoded, names[key])) for key in mine})
         snapshots = list(recording.snapshots())
         assert len(snapshots) == len(messages["/q_table"])
