@@ -192,7 +192,7 @@ def _after_reset(values: NDArray[Any]) -> NDArray[Any]:
 
 def _told(recording: Recording, phase: str) -> dict[str, Any]:
     run, config = recording.run, recording.config
-    digest = recording.result.content_digest or "none: it was interrupted"
+    digest = recording.result.content_digest or f"none ({recording.status})"
     job = recording.kind == "job"
     what = "Observations are states, actions joint actions." if job else "Recorded from a loop."
     told = {

@@ -182,7 +182,6 @@ def _return_of(evaluation: Mapping[str, Any]) -> float | None:
 
 def _facts(recording: Recording) -> dict[str, str]:
     """Return what identifies a run and how much of it there is."""
-    digest = recording.result.content_digest
     counts = {
         topic: recording.count(topic) for topic in (schema.TRAIN_EPISODE, schema.TRAIN_STEP, schema.EVAL_STEP)
     }
@@ -198,7 +197,7 @@ def _facts(recording: Recording) -> dict[str, str]:
         "Evaluation": f"{counts[schema.EVAL_STEP]:,} steps recorded",
         "Begun": recording.run["created"],
         "Job": recording.run["job"],
-        "Content digest": digest or "none: it was interrupted",
+        "Content digest": recording.result.content_digest or f"none ({recording.status})",
     }
     return {key: str(value) for key, value in told.items()}
 
@@ -214,7 +213,7 @@ def _loop_facts(recording: Recording, counts: Mapping[schema.Topic, int]) -> dic
         "Training": f"{counts[schema.TRAIN_EPISODE]:,} episodes, {counts[schema.TRAIN_STEP]:,} steps",
         "Evaluation": f"{counts[schema.EVAL_STEP]:,} steps",
         "Begun": recording.run["created"],
-        "Content digest": recording.result.content_digest or "none: it was interrupted",
+        "Content digest": recording.result.content_digest or f"none ({recording.status})",
     }
 
 

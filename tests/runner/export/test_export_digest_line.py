@@ -1,0 +1,22 @@
+"""What a report says of the content digest of a run that has none."""
+
+from __future__ import annotations
+
+import pytest
+from click.testing import CliRunner
+
+from runner.cli import cli
+from runner.recording.liveness import owner
+from tests.runner.recording.making import LAKE, make_run
+
+
+@pytest.mark.parametrize("status", ["running", "interrupted"])
+def test_a_report_says_why_there_is_no_digest(status, tmp_path):
+    run = make_run(tmp_path / "recordings", LAKE, episodes=200)
+    data = run.recording.read_bytes()
+    run.recording.write_bytes(data[: len(data) * 2 // 3])
+    run.update(status=status, owner=owner())
+    page = tmp_path / "report.html"
+    result = CliRunner().invoke(cli, ["report", str(run.folder), "-o", str(page)])
+    assert result.exit_code == 0, result.output
+    assert f"none ({status})" in page.read_text()
