@@ -27,7 +27,7 @@ def run_table(recording: Recording) -> pa.Table:
         raise RecordingError(f"{recording.path}: was created at {facts['created']!r}, no time.") from error
     columns: dict[str, tuple[pa.DataType, Any]] = {
         "run_id": (pa.string(), facts["run_id"]),
-        "name": (pa.string(), facts["name"]),
+        "name": (pa.string(), recording.name),
         "seed": (pa.uint64(), facts["seed"]),
         "job": (pa.string(), recording.run["job"]),
         "status": (pa.string(), facts["status"]),

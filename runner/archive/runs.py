@@ -204,7 +204,7 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
         with store.reading(run_id) as archive:
             restore_to(archive, folder / RECORDING_FILE, manifest.digest, report)
         with open_recording(folder / RECORDING_FILE) as recording:
-            facts = recording.run_facts()
+            facts = recording.run_facts() | {"name": manifest.run["name"]}  # it may have been renamed
             facts["summary"] |= {"bytes": recording.size}
         return Run(folder, facts).update()
     except BaseException:

@@ -137,7 +137,7 @@ class _Writing:
         return self._manifest(topics)
 
     def _manifest(self, topics: dict[str, Entry]) -> Manifest:
-        facts = self._recording.run_facts()
+        facts = self._recording.run_facts() | {"name": self._recording.name}
         run = {key: facts[key] for key in ("run_id", "name", "seed", "created", "status")}
         run |= {"content_digest": self._recording.result.content_digest, "lost": self._recording.lost}
         return Manifest(run, topics, entries_of(self._folder))

@@ -50,7 +50,7 @@ def require_packages() -> None:
 
 def dataset_id(recording: Recording) -> str:
     """Return the name of a run's dataset: NAME-RUN-v0, with what Minari allows in names."""
-    return re.sub(r"[^\w-]", "_", f"{recording.run['name']}-{recording.run['run_id']}-v0")
+    return re.sub(r"[^\w-]", "_", f"{recording.name}-{recording.run['run_id']}-v0")
 
 
 def write_dataset(
@@ -197,7 +197,7 @@ def _told(recording: Recording, phase: str) -> dict[str, Any]:
     what = "Observations are states, actions joint actions." if job else "Recorded from a loop."
     told = {
         "description": f"The {phase} episodes of the dualtaxi run {run['run_id']} "
-        f"({run_title(run['name'], recording.seed)}), content digest {digest}. {what}",
+        f"({run_title(recording.name, recording.seed)}), content digest {digest}. {what}",
     }
     return told | ({"algorithm_name": str(config["algorithm"])} if job else {})
 

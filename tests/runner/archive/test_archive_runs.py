@@ -304,3 +304,11 @@ def test_a_pipe_in_place_of_a_manifest_is_refused(run, recordings, command):
     result = command("archive", run.run_id)
     assert result.exit_code == 1
     assert "it is not a regular file" in result.output
+
+
+def test_a_renamed_run_keeps_its_name_where_only_its_archive_is_left(run, recordings, command):
+    done(command("rename", run.run_id, "patient"))
+    done(command("archive", run.run_id))
+    shutil.rmtree(recordings / run.run_id)
+    done(command("restore", recordings.parent / "archive" / run.run_id))
+    assert find_run(run.run_id, recordings).name == "patient"
