@@ -232,10 +232,10 @@ class Loop(Generic[R]):
         """
         if phase not in schema.PHASES:
             raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
-        if phase not in self._rows:
-            with self.lock:
+        with self.lock:
+            if phase not in self._rows:
                 self._rows[phase] = self._make_rows(self._recorder, self.described, phase, self._first_action)
-        return self._rows[phase]
+            return self._rows[phase]
 
     def activate(self, rows: R) -> None:
         """Make these the rows whose steps come now. The caller holds the lock."""

@@ -72,8 +72,8 @@ def import_recording(
     labels. When this returns the run is on disk, even if the power fails now.
 
     Args:
-        recording: the file, which nobody writes to any more. If nothing in it changes and it is on the same
-            disk, it is linked instead of copied.
+        recording: the file, which nobody writes to any more. If it is finished, nothing in it changes and it
+            is on the same disk, it is linked instead of copied.
         recordings: the folder of runs; created if it is missing.
         details: what `run.json` says where the run comes from; the file's own record of it by default. What
             the recording contradicts or cannot know is ignored.
@@ -265,7 +265,8 @@ def _place(source: Path, target: Path, facts: dict[str, Any], rewritten: bool) -
 
     Args:
         source: the recording.
-        target: its place; on the same disk it is a link, unless it is rewritten.
+        target: its place. A finished recording that is not rewritten becomes a link on the same disk; others
+            are copied, as `resume` continues them in place, which must not change the source.
         facts: what `run.json` is going to say.
         rewritten: write it with the id of the facts and without its export record.
 
@@ -280,13 +281,19 @@ def _place(source: Path, target: Path, facts: dict[str, Any], rewritten: bool) -
 
     if rewritten:
         rewrite(source, target, change)
-    else:
-        try:
-            os.link(source, target)
-        except OSError:  # another disk, or one without links
-            shutil.copyfile(source, target)
+    elif facts["status"] != "finished" or not _linked(source, target):
+        shutil.copyfile(source, target)
     if "bytes" in facts["summary"]:
         facts["summary"]["bytes"] = target.stat().st_size
+
+
+def _linked(source: Path, target: Path) -> bool:
+    """Link a file, and return whether that was possible: not to another disk, or one without links."""
+    try:
+        os.link(source, target)
+    except OSError:
+        return False
+    return True
 
 
 @contextlib.contextmanager

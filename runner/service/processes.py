@@ -165,6 +165,8 @@ class ProcessPool:
                 if self._closed.is_set():
                     raise ProcessDied("the service is stopping.")
                 child = self._idle.pop() if self._idle else None
+                if child is not None and child.timer is not None:
+                    child.timer.cancel()  # else each call would leave a thread behind for `keep_seconds`
             if child is None:
                 try:
                     child = _Child(self._context, self._memory_bytes)
@@ -185,14 +187,13 @@ class ProcessPool:
         A process that ended by itself could do so just as a call is sent to it.
         """
         with self._lock:
-            self._idle.append(child)
             child.uses += 1
-            uses = child.uses
-        if self._keep_seconds is None:
-            return
-        timer = threading.Timer(self._keep_seconds, self._end_idle, (child, uses))
-        timer.daemon = True
-        timer.start()
+            child.timer = None
+            if self._keep_seconds is not None:
+                child.timer = threading.Timer(self._keep_seconds, self._end_idle, (child, child.uses))
+                child.timer.daemon = True
+                child.timer.start()
+            self._idle.append(child)
 
     def _end_idle(self, child: _Child, uses: int) -> None:
         with self._lock:
@@ -214,6 +215,8 @@ class _Child:
 
     def __init__(self, context: Any, memory_bytes: int) -> None:
         self.uses = 0
+        self.timer: threading.Timer | None = None
+        """Ends the process while it is idle, unless that is kept until the pool is closed."""
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, memory_bytes), daemon=True)
         try:

@@ -20,6 +20,7 @@ from mcap.stream_reader import StreamReader
 
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError
+from runner.execution.resume import resume
 from runner.execution.verify import verify
 from runner.export.mcap import export_mcap
 from runner.recording.labels import Labels, change_labels, read_labels
@@ -89,6 +90,14 @@ def test_a_bare_recording_is_imported_too(lake, tmp_path):
     imported = import_recording(lake.recording, tmp_path / "theirs").run
     assert imported.recording.read_bytes() == lake.recording.read_bytes()
     assert imported.status == "finished"
+
+
+def test_a_resumed_import_leaves_the_imported_file_as_it_was(taxis, tmp_path):
+    file = cut_off(taxis, tmp_path / "mine", 20_000).recording
+    before = file.read_bytes()
+    imported = import_recording(file, tmp_path / "theirs").run
+    assert resume(imported).status == "finished"
+    assert file.read_bytes() == before
 
 
 def test_importing_twice_writes_nothing_the_second_time(lake, tmp_path):
