@@ -109,7 +109,7 @@ def test_what_is_shipped_is_found():
 
 def test_an_objective_that_is_never_recorded_is_refused_with_what_there_is():
     for metric, expected in (
-        ("finish_procent", "Did you mean 'success_percent'?"),
+        ("success_procent", "Did you mean 'success_percent'?"),
         ("exact.value", "evaluation: {exact: true}"),
     ):
         with pytest.raises(Exception, match="never recorded") as caught:
