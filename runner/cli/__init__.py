@@ -21,63 +21,66 @@ from runner.errors import ConfigError, Located, RunnerError, StorageError, neare
 from runner.util.version import __version__
 
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
-    "Do": {
+    "Run": {
         "run": ("runner.cli.commands.run", "Train, evaluate and record an experiment."),
-        "sweep": ("runner.cli.commands.sweep", "Run an experiment with many values; tell which are best."),
+        "sweep": ("runner.cli.commands.sweep", "Run an experiment with many values, and rank them."),
         "resume": (
             "runner.cli.commands.resume",
-            "Go on with a run that was interrupted, as if it never had been.",
+            "Resume an interrupted run, to the same content as an undisturbed one.",
         ),
-        "evaluate": ("runner.cli.commands.evaluate", "Play a run's table of any moment in new episodes."),
-        "rerecord": ("runner.cli.commands.rerecord", "Record the steps of a run that left them out."),
+        "evaluate": ("runner.cli.commands.evaluate", "Evaluate a run's Q-table at any step in new episodes."),
+        "rerecord": (
+            "runner.cli.commands.rerecord",
+            "Record the steps of a run that was recorded without them.",
+        ),
     },
-    "Look": {
+    "Inspect": {
         "ls": ("runner.cli.commands.ls", "List the recorded runs."),
-        "show": ("runner.cli.commands.show", "Tell all about a run: evaluations, tables, configuration."),
+        "show": ("runner.cli.commands.show", "Show a run: evaluations, tables, configuration."),
         "play": ("runner.cli.commands.play", "Replay a recorded episode in the terminal."),
-        "view": ("runner.cli.commands.view", "Look at runs in the Rerun viewer."),
+        "view": ("runner.cli.commands.view", "Open runs in the Rerun viewer."),
         "plot": ("runner.cli.commands.plot", "Draw every metric of one or several runs over episodes."),
         "report": ("runner.cli.commands.report", "Write one self-contained page about one or several runs."),
-        "export": ("runner.cli.commands.export", "Write a run in a form that other programs read."),
-        "qtable": ("runner.cli.commands.qtable", "Tell the exact Q-table of a run at any step."),
-        "table": ("runner.cli.commands.table", "Print an environment's transition table in words."),
+        "export": ("runner.cli.commands.export", "Export a run for other programs."),
+        "qtable": ("runner.cli.commands.qtable", "Show the exact Q-table of a run at any step."),
+        "table": ("runner.cli.commands.table", "Print an environment's transition table with names."),
     },
     "Compare": {
-        "diff": ("runner.cli.commands.diff", "Tell what differs between two runs, and where they part."),
+        "diff": ("runner.cli.commands.diff", "Show what differs between two runs, and where they diverge."),
         "compare": ("runner.cli.commands.compare", "Compare groups of runs, with statistics over seeds."),
     },
-    "Tidy": {
-        "tag": ("runner.cli.commands.tag", "Tag a run, or take tags away."),
+    "Manage": {
+        "tag": ("runner.cli.commands.tag", "Add tags to a run, or remove them."),
         "note": ("runner.cli.commands.note", "Write a note on a run."),
-        "rename": ("runner.cli.commands.rename", "Give a run another name."),
-        "du": ("runner.cli.commands.du", "Tell what uses the disk, and what could be freed."),
+        "rename": ("runner.cli.commands.rename", "Rename a run."),
+        "du": ("runner.cli.commands.du", "Show what uses disk space, and what could be freed."),
         "rm": ("runner.cli.commands.rm", "Remove runs."),
-        "prune": ("runner.cli.commands.prune", "Remove the runs that are old, unfinished or unwanted."),
-        "reindex": ("runner.cli.commands.reindex", "Read all runs again, and make their index anew."),
+        "prune": ("runner.cli.commands.prune", "Remove old, unfinished or unwanted runs."),
+        "reindex": ("runner.cli.commands.reindex", "Rebuild the index of runs."),
     },
     "Check": {
-        "verify": ("runner.cli.commands.verify", "Check every step of a run by doing it again."),
-        "repair": ("runner.cli.commands.repair", "Make a damaged recording whole; tell what was lost."),
+        "verify": ("runner.cli.commands.verify", "Check every step of a run by training it again."),
+        "repair": ("runner.cli.commands.repair", "Repair a damaged recording, and report what was lost."),
     },
-    "Keep": {
-        "archive": ("runner.cli.commands.archive", "Put runs into an archive of Parquet files, losslessly."),
-        "restore": ("runner.cli.commands.restore", "Bring the recording of an archived run back."),
+    "Archive": {
+        "archive": ("runner.cli.commands.archive", "Archive runs as Parquet files, losslessly."),
+        "restore": ("runner.cli.commands.restore", "Restore the recording of an archived run."),
     },
-    "Hand on": {
+    "Share": {
         "import": (
             "runner.cli.commands.import_",
-            "Import a recording from elsewhere into the folder of runs.",
+            "Import a recording into the folder of runs.",
         ),
-        "push": ("runner.cli.commands.push", "Send runs to a server."),
-        "pull": ("runner.cli.commands.pull", "Bring a run from a server."),
-        "submit": ("runner.cli.commands.submit", "Have an experiment or a sweep done by a server."),
+        "push": ("runner.cli.commands.push", "Upload runs to a server."),
+        "pull": ("runner.cli.commands.pull", "Download a run from a server."),
+        "submit": ("runner.cli.commands.submit", "Submit an experiment or a sweep to a server."),
     },
     "Serve": {
-        "serve": ("runner.cli.commands.serve", "Open the runs to browsers and programs, over HTTP."),
-        "token": ("runner.cli.commands.token", "Make, list and revoke the tokens that a service asks for."),
+        "serve": ("runner.cli.commands.serve", "Serve the runs to browsers and programs over HTTP."),
+        "token": ("runner.cli.commands.token", "Create, list and revoke access tokens of a server."),
     },
     "Set up": {
-        "init": ("runner.cli.commands.init", "Make a folder to start in, with the shipped experiments."),
+        "init": ("runner.cli.commands.init", "Create a folder to start in, with the shipped experiments."),
         "config": ("runner.cli.commands.config", "List, copy and check configurations; print their schema."),
         "completion": ("runner.cli.commands.completion", "Print the completion script of a shell."),
     },
