@@ -18,7 +18,7 @@ def choice_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that choose steps."""
     for option in (
         click.option("--all", "everything", is_flag=True, help="Every step of the run."),
-        click.option("--every", type=click.IntRange(1), metavar="N", help="Each Nth training episode."),
+        click.option("--every", type=click.IntRange(1), metavar="N", help="Every Nth training episode."),
         click.option(
             "--eval",
             "evaluations",

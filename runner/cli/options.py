@@ -47,7 +47,7 @@ folders_option: Final = click.option(
 
 filter_argument: Final = click.argument("words", metavar="[FILTER]...", nargs=-1, type=FilterWord())
 
-json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print JSON, for programs to read.")
+json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 set_option: Final = click.option(
     "--set",
@@ -55,7 +55,7 @@ set_option: Final = click.option(
     multiple=True,
     type=Setting(),
     metavar="KEY=VALUE",
-    help="Put another value in the configuration, such as evaluation.trials=50; may be repeated.",
+    help="Override a value of the configuration, such as evaluation.trials=50; may be repeated.",
 )
 
 episode_option: Final = click.option(
@@ -71,7 +71,9 @@ trial_option: Final = click.option(
 )
 
 token_option: Final = click.option(
-    "--token", metavar="TOKEN", help="Lets one in.  [default: $DUALTAXI_TOKEN, or of $DUALTAXI_TOKEN_FILE]"
+    "--token",
+    metavar="TOKEN",
+    help="The access token.  [default: $DUALTAXI_TOKEN, or the file $DUALTAXI_TOKEN_FILE]",
 )
 
 token_file_option: Final = click.option(

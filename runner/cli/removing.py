@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 _MOST_DRAWN: Final = 1000
 """Rows that are fitted to a terminal; more are printed as in a file, which is far quicker."""
 
-yes_option: Final = click.option("--yes", "-y", is_flag=True, help="Do not ask.")
+yes_option: Final = click.option("--yes", "-y", is_flag=True, help="Do not ask for confirmation.")
 force_option: Final = click.option(
     "--force", is_flag=True, help="Also remove files and folders in a run's folder that no run writes."
 )
 dry_run_option: Final = click.option(
-    "--dry-run", is_flag=True, help="Tell what would go and how much is freed, and leave it."
+    "--dry-run", is_flag=True, help="Show what would be removed and how much is freed, and remove nothing."
 )
 
 

@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 @click.option(
     "--to",
     metavar="DIR|URL",
-    help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` beside the recordings]",
+    help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` next to the recordings]",
 )
 @click.option(
-    "--remove", is_flag=True, help="Remove the recordings, each when its archive gave the same back."
+    "--remove", is_flag=True, help="Remove each recording once its archive has been read back and compared."
 )
-@click.option("--dry-run", is_flag=True, help="Pack and tell the sizes, but keep and change nothing.")
+@click.option("--dry-run", is_flag=True, help="Report the sizes, but write and change nothing.")
 @recordings_option
 @json_option
 def command(

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     "chosen",
     multiple=True,
     metavar="METRIC",
-    help="Which; may be repeated.  [default: the evaluation's]",
+    help="A metric; may be repeated.  [default: those of evaluations]",
 )
 @click.option(
     "--at",
@@ -40,13 +40,11 @@ if TYPE_CHECKING:
 @click.option(
     "--target",
     metavar="METRIC=LEVEL",
-    help="Instead: after how many episodes a level is first reached, such as success_percent=80.",
+    help="Compare instead after how many episodes a level is first reached, such as success_percent=80.",
 )
 @json_option
-@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for a note or an issue.")
-@click.option(
-    "--html", type=click.Path(path_type=Path), metavar="FILE", help="Write a page with plots instead."
-)
+@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
+@click.option("--html", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML page instead.")
 @click.option("--force", is_flag=True, help="Replace the page if it exists.")
 @recordings_option
 def command(

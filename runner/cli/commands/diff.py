@@ -23,22 +23,27 @@ if TYPE_CHECKING:
 @click.argument("b", metavar="B", type=RunName())
 @recordings_option
 @json_option
-@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for a note or an issue.")
-@click.option(
-    "--html", type=click.Path(path_type=Path), metavar="FILE", help="Write a page with pictures instead."
-)
+@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
+@click.option("--html", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML page instead.")
 @click.option("--force", is_flag=True, help="Replace the page if it exists.")
 @click.option(
-    "--ignore", multiple=True, metavar="GLOB", help="Leave out settings and provenance whose path fits."
+    "--ignore",
+    multiple=True,
+    metavar="GLOB",
+    help="Ignore settings and provenance whose path matches this pattern.",
 )
-@click.option("--all", "everything", is_flag=True, help="Also what is the same.")
+@click.option("--all", "everything", is_flag=True, help="Also list what is the same.")
 @click.option(
     "--first",
     is_flag=True,
-    help="Only settings, and where training parts first; not how the tables came to differ.",
+    help="Compare only settings and where training first diverges, not the tables.",
 )
 @click.option(
-    "--target", "targets", multiple=True, metavar="METRIC=LEVEL", help="Tell who reaches a level first."
+    "--target",
+    "targets",
+    multiple=True,
+    metavar="METRIC=LEVEL",
+    help="Show which run reaches a level first, such as success_percent=80.",
 )
 @click.pass_context
 def command(

@@ -28,11 +28,9 @@ TRIALS = 200
     help="The table after N training steps.  [default: the last]",
 )
 @click.option(
-    "--trials", type=click.IntRange(1), metavar="K", help=f"How many episodes.  [default: {TRIALS}]"
+    "--trials", type=click.IntRange(1), metavar="K", help=f"Number of episodes.  [default: {TRIALS}]"
 )
-@click.option(
-    "--all", "every_start", is_flag=True, help="One episode from each state that episodes start in."
-)
+@click.option("--all", "every_start", is_flag=True, help="Play one episode from each start state.")
 @click.option(
     "--start", type=click.IntRange(0), metavar="STATE", help="The state that all episodes start in."
 )
@@ -42,7 +40,7 @@ TRIALS = 200
     default=0,
     show_default=True,
     metavar="S",
-    help="What the new episodes' draws follow from.",
+    help="Seed of the new episodes.",
 )
 @recordings_option
 @json_option

@@ -23,7 +23,7 @@ from runner.cli.progress import counting
     default=EXPORTS / "episode.gif",
     show_default=True,
     metavar="FILE",
-    help="Where to.",
+    help="The file to write.",
 )
 @click.option(
     "--speed",
@@ -31,7 +31,7 @@ from runner.cli.progress import counting
     default=2.0,
     show_default=True,
     metavar="STEPS",
-    help="Steps a second.",
+    help="Steps per second.",
 )
 @click.option(
     "--steps",
@@ -39,7 +39,7 @@ from runner.cli.progress import counting
     default=200,
     show_default=True,
     metavar="N",
-    help="Show so many steps at most.",
+    help="Maximum number of steps.",
 )
 @click.option(
     "--width",

@@ -20,9 +20,7 @@ from runner.cli.output import draw, facts, print_json, say, size
     metavar="FILE",
     help="The file to write.  [default: NAME-RUN.mcap]",
 )
-@click.option(
-    "--anonymous", is_flag=True, help="Leave out host, user, command line and folder, wherever they stand."
-)
+@click.option("--anonymous", is_flag=True, help="Leave out host, user, command line and folder.")
 @click.option("--force", is_flag=True, help="Replace the file if it exists.")
 @recordings_option
 @json_option

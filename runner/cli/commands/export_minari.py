@@ -29,7 +29,7 @@ from runner.cli.progress import counting
     type=click.Choice(["train", "eval"]),
     default="train",
     show_default=True,
-    help="Whose episodes.",
+    help="The phase of the episodes.",
 )
 @click.option(
     "--episodes", type=EpisodeRanges(), metavar="RANGES", help="Episodes, such as 0:20,49980:50000."

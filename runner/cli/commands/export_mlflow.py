@@ -22,9 +22,11 @@ from runner.cli.output import say
     metavar="URI",
     help="The store: a database or a server.",
 )
-@click.option("--experiment", default="dualtaxi", show_default=True, help="The experiment; made if missing.")
-@click.option("--with-recording", is_flag=True, help="Store the recording as an artifact, too.")
-@click.option("--force", is_flag=True, help="Write the run anew, and delete what is there of it.")
+@click.option(
+    "--experiment", default="dualtaxi", show_default=True, help="The experiment; created if it is missing."
+)
+@click.option("--with-recording", is_flag=True, help="Also store the recording as an artifact.")
+@click.option("--force", is_flag=True, help="Restore the run again, and replace what is there.")
 @recordings_option
 def command(
     run_name: str, tracking: str, experiment: str, with_recording: bool, force: bool, recordings: Path | None

@@ -23,7 +23,9 @@ _OPTIONS = (
         metavar="FOLDER",
         help="The folder to write.  [default: exports/NAME-RUN-FORM]",
     ),
-    click.option("--phase", type=click.Choice(["train", "eval"]), help="Steps and episodes of it alone."),
+    click.option(
+        "--phase", type=click.Choice(["train", "eval"]), help="Only the steps and episodes of this phase."
+    ),
     click.option(
         "--episodes",
         type=EpisodeRanges(),
@@ -52,7 +54,7 @@ def _command(form: str, text: str) -> click.Command:
     run.__doc__ = text
     options = [*_OPTIONS]
     if form == "csv":
-        options.insert(-2, click.option("--gz", is_flag=True, help="Pack each file with gzip."))
+        options.insert(-2, click.option("--gz", is_flag=True, help="Compress each file with gzip."))
     for option in reversed(options):
         run = option(run)
     return click.command(form)(run)

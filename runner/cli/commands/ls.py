@@ -32,15 +32,17 @@ _SPOOL_BYTES: Final = 8 << 20
 @click.command("ls")
 @filter_argument
 @folders_option
-@click.option("--sort", default="", metavar="FIELD,...", help="By these fields; -FIELD: the largest first.")
+@click.option(
+    "--sort", default="", metavar="FIELD,...", help="Sort by these fields; -FIELD for descending order."
+)
 @click.option("--columns", metavar="FIELD,...", help="Show these fields.")
 @click.option(
     "--limit",
     type=click.IntRange(min=0),
     metavar="N",
-    help=f"At most so many runs, 0 for all.  [default: {ON_A_TERMINAL} in a terminal's table, else all]",
+    help=f"Maximum number of runs, 0 for all.  [default: {ON_A_TERMINAL} in a terminal's table, else all]",
 )
-@click.option("--offset", type=click.IntRange(min=0), default=0, metavar="N", help="Leave out the first N.")
+@click.option("--offset", type=click.IntRange(min=0), default=0, metavar="N", help="Skip the first N.")
 @click.option("-q", "--quiet", is_flag=True, help="Print ids only.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print CSV.")
 @json_option

@@ -17,7 +17,7 @@ from runner.errors import RunnerError
 @click.command("note")
 @run_argument
 @click.argument("text", required=False)
-@click.option("--clear", is_flag=True, help="Take the note away.")
+@click.option("--clear", is_flag=True, help="Remove the note.")
 @recordings_option
 @json_option
 def command(run_name: str, text: str | None, clear: bool, recordings: Path | None, as_json: bool) -> None:

@@ -35,7 +35,7 @@ _PAUSED_KEYS: Final = "paused   space: continue   arrows: back, forward   q: qui
     default=4.0,
     show_default=True,
     metavar="STEPS",
-    help="Steps a second.",
+    help="Steps per second.",
 )
 @recordings_option
 @json_option

@@ -21,7 +21,7 @@ from runner.cli.progress import counting, stage_line
     default=EXPORTS / "plot.png",
     show_default=True,
     metavar="FILE",
-    help="Where to: FILE.png, FILE.svg or FILE.pdf.",
+    help="The file to write: FILE.png, FILE.svg or FILE.pdf.",
 )
 @click.option("--force", is_flag=True, help="Replace the file if it exists.")
 @recordings_option

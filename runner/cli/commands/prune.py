@@ -22,16 +22,19 @@ if TYPE_CHECKING:
 @click.command("prune")
 @filter_argument
 @folders_option
-@click.option("--older-than", metavar="AGE", help="Begun longer ago than this: 30d, 12h, 2w.")
+@click.option("--older-than", metavar="AGE", help="Runs that started longer ago than this: 30d, 12h, 2w.")
 @click.option(
-    "--keep-last", type=click.IntRange(min=0), metavar="N", help="Not the newest N of each configuration."
+    "--keep-last",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="Keep the newest N runs of each configuration.",
 )
 @click.option(
     "--status",
     "statuses",
     multiple=True,
     type=click.Choice([status for status in STATUSES if status != "running"]),
-    help="Of this status; may be repeated. Archived ones go only if it is said.",
+    help="Runs with this status; may be repeated. Archived runs are removed only with --status archived.",
 )
 @dry_run_option
 @yes_option

@@ -39,7 +39,9 @@ if TYPE_CHECKING:
 @token_option
 @token_file_option
 @click.option(
-    "--outbox", is_flag=True, help="Push what was recorded for a server and is still here, each to its own."
+    "--outbox",
+    is_flag=True,
+    help="Upload the runs that could not be sent while they were recorded, each to its server.",
 )
 @recordings_option
 @json_option

@@ -15,7 +15,7 @@ from runner.cli.output import print_json
 @click.command("rename")
 @run_argument
 @click.argument("name", required=False)
-@click.option("--original", is_flag=True, help="Call it again as in the beginning.")
+@click.option("--original", is_flag=True, help="Restore the original name.")
 @recordings_option
 @json_option
 def command(run_name: str, name: str | None, original: bool, recordings: Path | None, as_json: bool) -> None:

@@ -22,7 +22,7 @@ from runner.cli.progress import stage_line
     default=EXPORTS / "report.html",
     show_default=True,
     metavar="FILE",
-    help="Where to.",
+    help="The file to write.",
 )
 @click.option(
     "--episode",

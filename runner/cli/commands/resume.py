@@ -18,7 +18,7 @@ from runner.cli.working import at_work, run_as_json, run_in_words
 @click.option(
     "--accept-changes",
     is_flag=True,
-    help="Go on although code, environment or numerical libraries are others than at the beginning.",
+    help="Resume although code, environment or numerical libraries have changed.",
 )
 @recordings_option
 @json_option

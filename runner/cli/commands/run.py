@@ -35,18 +35,18 @@ LIVE_EPISODES: Final = 200
 @config_argument
 @click.option("--seed", type=click.IntRange(0), metavar="N", help="The seed, instead of the configuration's.")
 @set_option
-@click.option("--name", help="What the run is called.  [default: the configuration's name]")
+@click.option("--name", help="Name of the run.  [default: the configuration's name]")
 @click.option("--live", is_flag=True, help="Open the Rerun viewer and watch the training in it.")
 @click.option(
     "--live-every",
     type=click.IntRange(1),
     metavar="N",
-    help="Show every N-th episode, step by step.  [default: some 200 of them]",
+    help="Show every Nth episode, step by step.  [default: about 200 of them]",
 )
 @click.option(
     "--live-url",
     metavar="URL",
-    help="Of a viewer that runs already, here or elsewhere, instead of a new one.",
+    help="Connect to a running viewer at this URL instead of starting one.",
 )
 @click.option(
     "--at-once",
@@ -54,7 +54,7 @@ LIVE_EPISODES: Final = 200
     default=1,
     show_default=True,
     metavar="N",
-    help="So many seeds learn side by side, on a thread each.",
+    help="Number of seeds to train in parallel, one thread each.",
 )
 @recordings_option
 @json_option

@@ -13,42 +13,50 @@ from runner.cli.output import say
 
 @click.command("serve")
 @folders_option
-@click.option("--host", default="127.0.0.1", show_default=True, metavar="HOST", help="Listen there.")
+@click.option(
+    "--host", default="127.0.0.1", show_default=True, metavar="HOST", help="The address to listen on."
+)
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),
     default=8000,
     show_default=True,
     metavar="PORT",
-    help="Listen there; 0: any port that is free.",
+    help="The port to listen on; 0 for any free port.",
 )
 @click.option(
     "--allow-host",
     "hosts",
     multiple=True,
     metavar="NAME",
-    help="A name by which it may be asked for, such as that of a proxy; may be repeated.",
+    help="A host name to accept requests for, such as that of a proxy; may be repeated.",
 )
-@click.option("--proxy", "proxies", multiple=True, metavar="ADDRESS", help="Believe this proxy who asks.")
-@click.option("--require-token", is_flag=True, help="Ask for a token for reading too, on any host.")
+@click.option(
+    "--proxy",
+    "proxies",
+    multiple=True,
+    metavar="ADDRESS",
+    help="Trust X-Forwarded-* headers from this proxy.",
+)
+@click.option("--require-token", is_flag=True, help="Require a token for reading too, on any host.")
 @click.option(
     "--workers",
     type=click.IntRange(1, 64),
     default=2,
     show_default=True,
     metavar="N",
-    help="So many jobs at the same time.",
+    help="Number of jobs to run in parallel.",
 )
 @click.option(
     "--ray",
     metavar="ADDRESS",
-    help="Have jobs done by the cluster of Ray there, which sees the recordings under the same path.",
+    help="Run jobs on this Ray cluster, which must see the recordings under the same path.",
 )
 @click.option(
     "--log",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE",
-    help="Append the log there, as JSON lines.  [default: stderr]",
+    help="Append the log to this file, as JSON lines.  [default: stderr]",
 )
 def command(
     recordings: tuple[Path, ...],

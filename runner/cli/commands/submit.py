@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @server_option
 @token_option
 @token_file_option
-@click.option("--watch", "watching", is_flag=True, help="Stay, and tell what happens until it is over.")
+@click.option("--watch", "watching", is_flag=True, help="Wait until the job is over, and show its progress.")
 @json_option
 @click.pass_context
 def command(

@@ -67,7 +67,10 @@ def command() -> None:
 @command.command(START)
 @click.argument("file", metavar="FILE", type=ConfigName("sweep"))
 @click.option(
-    "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes.  [default: one a processor]"
+    "--workers",
+    type=click.IntRange(1, 1024),
+    metavar="N",
+    help="Number of processes.  [default: one per processor]",
 )
 @click.option(
     "--ray",
@@ -75,13 +78,13 @@ def command() -> None:
     is_flag=False,
     flag_value="",
     metavar="[ADDRESS]",
-    help="Have the runs done by Ray: a cluster's, or without ADDRESS one of this machine.",
+    help="Run on Ray: on the cluster at ADDRESS, or on this machine.",
 )
-@click.option("--resume", "resuming", is_flag=True, help="Go on with a sweep that was begun.")
-@click.option("--retry-failed", is_flag=True, help="With --resume: try again what failed.")
-@click.option("--accept-changes", is_flag=True, help="Go on although the file, or the code, has changed.")
-@click.option("--dry-run", is_flag=True, help="Say what would run, and how much disk it takes.")
-@click.option("--name", help="What the sweep is called.  [default: as the file says, or is called]")
+@click.option("--resume", "resuming", is_flag=True, help="Resume a sweep.")
+@click.option("--retry-failed", is_flag=True, help="With --resume: retry failed runs.")
+@click.option("--accept-changes", is_flag=True, help="Resume although the file or the code has changed.")
+@click.option("--dry-run", is_flag=True, help="Show what would run and how much disk it takes, and stop.")
+@click.option("--name", help="Name of the sweep.  [default: the name in the file, or of the file]")
 @json_option
 @recordings_option
 @click.pass_context
@@ -168,7 +171,7 @@ def start(
     help="Write the best configuration, with fresh seeds.",
 )
 @click.option("--force", is_flag=True, help="Replace the file if it exists.")
-@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for a note or an issue.")
+@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
 @json_option
 @recordings_option
 def show(

@@ -15,7 +15,7 @@ from runner.cli.output import print_json, say
 @click.command("tag")
 @run_argument
 @click.argument("tags", metavar="[TAG]...", nargs=-1)
-@click.option("--remove", multiple=True, metavar="TAG", help="Take this tag away; may be repeated.")
+@click.option("--remove", multiple=True, metavar="TAG", help="Remove this tag; may be repeated.")
 @recordings_option
 @json_option
 def command(

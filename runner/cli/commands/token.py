@@ -29,7 +29,7 @@ def command() -> None:
     type=click.Choice(("read", "write")),
     default="read",
     show_default=True,
-    help="What it allows; who may write may read.",
+    help="What the token allows; writing includes reading.",
 )
 @json_option
 def create(name: str, scope: str, as_json: bool) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @click.command("verify")
 @run_argument
-@click.option("--rerun", is_flag=True, help="Compare with what the installed environment gives.")
+@click.option("--rerun", is_flag=True, help="Compare with the installed environment.")
 @recordings_option
 @json_option
 @click.pass_context

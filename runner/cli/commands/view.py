@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     "spot",
     type=StepReference(),
     metavar="EPISODE:T",
-    help="Where to look: a step of a training episode; eval:N:TRIAL:T for a step of an evaluation. "
-    "A T or TRIAL that is left out is 0.",
+    help="The step to show: EPISODE:T of training, or eval:N:TRIAL:T of an evaluation. "
+    "T and TRIAL default to 0.",
 )
 @click.option("--web", is_flag=True, help="Serve the web viewer on 127.0.0.1 instead of opening a window.")
 @click.option(
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     type=click.IntRange(0, 65535),
     default=0,
     metavar="PORT",
-    help="Of the viewer.  [default: any free]",
+    help="Port of the viewer.  [default: any free port]",
 )
 @click.option(
     "--screenshot",
     type=click.Path(dir_okay=False, path_type=Path),
     metavar="FILE.png",
-    help="Draw one frame into a file; needs no screen.",
+    help="Write one frame to a file; no screen is needed.",
 )
 @click.option(
     "--size",
