@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @click.option(
     "--to",
     metavar="DIR|URL",
-    help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` next to the recordings]",
+    help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` by the recordings]",
 )
 @click.option(
     "--remove", is_flag=True, help="Remove each recording once its archive has been read back and compared."
