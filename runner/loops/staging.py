@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.loops.spaces import Described, parts_of
-from runner.loops.values import Leaf, leaves, put_batch
+from runner.loops.values import Leaf, leaves, put_batch, require_reset
 from runner.recording import schema
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
@@ -181,6 +181,7 @@ class AgentRows(StagedRows):
         over: bool,
     ) -> None:
         """Put down a step; agents that are missing take no part in it."""
+        require_reset(self._were_reset, self._phase)
         self._settle(actions)
         stage = self._stage
         for name in ("action", "next_observation"):

@@ -11,13 +11,12 @@ from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
-from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.loops.episode_events import Judge
 from runner.loops.spaces import Described, parts_of
-from runner.loops.values import filler, leaves, lone_number, value_bytes, whole_number
+from runner.loops.values import filler, leaves, lone_number, require_reset, value_bytes, whole_number
 from runner.recording import schema
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
@@ -294,8 +293,8 @@ class DiscreteRows(BlockRows):
 
     def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
         """Put down a step."""
-        if self._state is None and not self._reset_rows:
-            raise ResetNeeded("the recording has seen no reset of this environment yet: call reset() first")
+        if self._state is None:
+            require_reset(len(self._reset_rows), self._phase)
         try:
             reward = float(reward)
         except (TypeError, ValueError):
@@ -361,6 +360,8 @@ class ArrayRows(BlockRows):
     def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
         """Put down a step."""
         row = self.filled
+        if not row:
+            require_reset(self._were_reset + len(self._reset_rows), self._phase)
         try:
             reward = float(reward)
         except (TypeError, ValueError):
@@ -396,6 +397,7 @@ class VariableRows(Rows):
     def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
         """Put down a step."""
         row, reward = self.filled, lone_number(reward, "reward")
+        require_reset(self._were_reset, self._phase)
         if not self._is_settled:
             self._is_settled = True
             self._first_action(action)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
@@ -239,6 +240,18 @@ def _lone(value: Any, what: str, kinds: str, expected: str) -> Any:
     if array.size != 1 or array.dtype.kind not in kinds:
         raise RecordingError(f"found the {what} {value!r}, expected {expected}.")
     return array.reshape(())
+
+
+def require_reset(resets: int, phase: str) -> None:
+    """Refuse the first step of a phase that has no reset: the state before it would be unknown.
+
+    Raises:
+        ResetNeeded: `resets` is zero.
+    """
+    if not resets:
+        raise ResetNeeded(
+            f"phase {phase!r}: the recording has seen no reset of this environment yet: call reset() first"
+        )
 
 
 def warn_user(message: str) -> None:

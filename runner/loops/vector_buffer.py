@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from runner.loops.spaces import Described, parts_of
 from runner.loops.staging import Flags, StagedRows
-from runner.loops.values import filler, leaves, put_batch, put_chosen
+from runner.loops.values import filler, leaves, put_batch, put_chosen, require_reset
 from runner.recording import schema
 from runner.recording.recorder import Recorder
 
@@ -167,6 +167,10 @@ class VectorRows(StagedRows):
             self._settle(actions)
             self._make_room()
         row = self._filled
+        if not row:
+            require_reset(self._were_reset, self._phase)
+            # Only where they ended among the steps of another phase, and nobody reset them since.
+            self._abandon(np.flatnonzero(self._over))
         self._put_action(row, actions)
         self._put_observation(row, observations)
         if rewards.__class__ is not np.ndarray or rewards.shape != (self._n,):

@@ -10,11 +10,13 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import SyncVectorEnv
 
 import runner
 from runner.config import from_mapping
 from runner.errors import ConfigError, RunnerError, StorageError
+from runner.execution.verify import verify
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
 from runner.runs.run import list_runs
@@ -244,3 +246,44 @@ def test_packing_has_the_bounds_that_a_configuration_has(packing, tmp_path):
     config = {"episodes": 1, "recording": packing}
     expected = outcome(lambda: from_mapping(config).to_mapping()["recording"])
     assert outcome(record) == expected
+
+
+@pytest.mark.parametrize(
+    ("record", "make_env"),
+    [
+        (runner.record, pole),
+        (runner.record, lambda: Rooms(with_text=True)),
+        (runner.record_vector, poles),
+        (runner.record_parallel, game),
+    ],
+)
+def test_a_phase_is_not_begun_without_a_reset(tmp_path, record, make_env):
+    with record(make_env(), tmp_path) as rec:
+        if record is runner.record_parallel:
+            action = {agent: rec.action_space(agent).sample() for agent in rec.possible_agents}
+        else:
+            action = rec.action_space.sample()
+        rec.reset(seed=1)
+        rec.step(action)
+        with rec.phase("eval"):
+            with pytest.raises(ResetNeeded, match="'eval'"):
+                rec.step(action)
+            rec.reset(seed=2)
+            rec.step(action)
+    assert verify(rec.run.recording).sound
+
+
+def test_an_episode_that_ends_in_another_phase_leaves_a_sound_recording(tmp_path):
+    envs = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1", max_episode_steps=5)] * 2)
+    action = np.zeros(2, np.int64)
+    with runner.record_vector(envs, tmp_path) as rec:
+        rec.reset(seed=1)
+        for _ in range(3):
+            rec.step(action)
+        with rec.phase("eval"):
+            rec.reset(seed=2)
+            for _ in range(5):
+                rec.step(action)  # with the last, both episodes are over
+        for _ in range(3):
+            rec.step(action)
+    assert verify(rec.run.recording).sound
