@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from runner.errors import RunnerError
+from runner.errors import RecordingError, RunnerError
 from runner.export.places import write_new
 from runner.recording.labels import Labels, as_json
 from runner.recording.reader import open_recording
@@ -55,7 +55,7 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
     def change(name: str, entries: dict[str, str]) -> dict[str, str] | None:
         if name == EXPORT_RECORD:
             return None
-        return _without_names(name, entries) if anonymous else entries
+        return _without_names(name, entries, run.recording) if anonymous else entries
 
     def write(fresh: Path) -> None:
         rewrite(run.recording, fresh, change, {EXPORT_RECORD: record})
@@ -74,12 +74,24 @@ def _record(run: Run, anonymous: bool) -> dict[str, Any]:
     return record | ({"proof": run.file.proof} if run.file.proof else {})
 
 
-def _without_names(name: str, entries: dict[str, str]) -> dict[str, str]:
-    """Return the entries of a metadata record without host, user, command line and folder."""
+def _without_names(name: str, entries: dict[str, str], recording: Path) -> dict[str, str]:
+    """Return the entries of a metadata record without host, user, command line and folder.
+
+    Raises:
+        RecordingError: the record cannot be understood.
+    """
     if name in {"provenance", "rerecord"} or name.startswith("resume/"):
         return {key: text for key, text in entries.items() if key not in PRIVATE}
     if name == "result" and "json" in entries:
-        result = json.loads(entries["json"])
+        try:
+            result = json.loads(entries["json"])
+        except (ValueError, RecursionError):
+            result = None
+        if not isinstance(result, dict):
+            raise RecordingError(
+                f"{recording}: the metadata 'result' holds no JSON object, so names cannot be removed from "
+                "it; export without --anonymous."
+            )
         if "error" in result:
             return entries | {"json": json.dumps(result | {"error": LEFT_OUT}, sort_keys=True)}
     return entries

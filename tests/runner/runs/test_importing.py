@@ -271,6 +271,20 @@ def test_an_anonymous_file_names_no_person_host_or_folder(taxis, tmp_path, monke
         assert recording.provenance["dualtaxi"]
 
 
+@pytest.mark.parametrize("text", ["no JSON", '["error"]', "[" * 100_000])
+def test_a_result_that_is_no_object_is_not_exported_anonymously(lake, tmp_path, text):
+    run = copy_of(lake, tmp_path / "mine")
+    rewrite(
+        lake.recording,
+        tmp_path / "changed.mcap",
+        lambda name, entries: entries | {"json": text} if name == "result" else entries,
+    )
+    (tmp_path / "changed.mcap").replace(run.recording)
+    with pytest.raises(RecordingError, match="'result' holds no JSON object"):
+        export_mcap(run, tmp_path / "a.mcap", anonymous=True)
+    assert not (tmp_path / "a.mcap").exists()
+
+
 def test_an_anonymous_export_warns_of_a_path_that_belongs_to_the_job(lake, tmp_path):
     later = make_run(tmp_path / "mine", LAKE, initial_q={"run": str(lake.recording), "step": 0}, name="later")
     (warning,) = export_mcap(later, tmp_path / "a.mcap", anonymous=True).warnings
