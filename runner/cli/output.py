@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
@@ -95,8 +95,9 @@ def _least_width(part: RenderableType) -> int:
     if not isinstance(part, Table) or not part.columns or part.show_header is False:
         return 0
     widths = [
-        max(cell_len(line) for cell in (column.header, *column.cells) for line in str(cell).split("\n"))
+        max(cell_len(line) for cell in (heading, *column.cells) for line in str(cell).split("\n"))
         for column in part.columns
+        for heading in [getattr(column.header, "renderable", column.header)]
     ]
     shown = [
         width if column.no_wrap else min(width, SHRUNK)
@@ -115,19 +116,22 @@ def title(text: str) -> Text:
 def table(*headings: str, left: tuple[str, ...] = (), shrinking: tuple[str, ...] = ()) -> Table:
     """Return an empty table with these headings.
 
+    Headings of several lines end on the same line; the cells of a row begin on the same line.
+
     Args:
         headings: of the columns, in order.
         left: the columns to be aligned to the left, as text is; the others to the right, as numbers are.
         shrinking: the columns that give way, with an ellipsis, where a terminal is too narrow.
     """
+    from rich.align import Align
     from rich.table import Table
 
     made = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     for heading in headings:
+        side: Literal["left", "right"] = "left" if heading in left else "right"
         made.add_column(
-            heading,
-            justify="left" if heading in left else "right",
-            vertical="bottom",
+            Align(heading, side, vertical="bottom"),
+            justify=side,
             overflow="ellipsis",
             no_wrap=heading not in shrinking,
         )

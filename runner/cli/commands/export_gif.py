@@ -65,8 +65,8 @@ def command(
     """Make a short film of a recorded episode of RUN, for slides and READMEs.
 
     Each frame has step, actions, rewards and events written below it. Without a choice it is the typical
-    trial of the last evaluation: the median by success, return and length; in a run that has no whole
-    evaluation, such as your own loop over a tabular environment, the last training episode.
+    trial of the last evaluation: the median by success, return and length; of your own loop, the first
+    trial of its last evaluation; in a run that has no whole evaluation, the last training episode.
 
     \b
     Examples:
@@ -87,14 +87,15 @@ def command(
     with open_recording(find_recorded(run_name, recordings).recording) as recording:
         require_states(recording)
         require_steps(recording, "show")
-        if episode is None and trial is None and replay.last_whole_evaluation(recording) is None:
-            episode = replay.last_episode(recording)
-            say(f"There is no whole evaluation: this is the last training episode, {episode:,}.")
-        if episode is not None:
-            shown = replay.training_episode(recording, episode, steps)
+        if episode is None and trial is None:
+            trial = replay.default_trial(recording)
+        if trial is not None:
+            shown = replay.trial(recording, *trial, steps)
         else:
-            after, number = trial or replay.typical_trial(recording)
-            shown = replay.trial(recording, after, number, steps)
+            if episode is None:
+                episode = replay.last_episode(recording)
+                say(f"There is no whole evaluation: this is the last training episode, {episode:,}.")
+            shown = replay.training_episode(recording, episode, steps)
         with counting("frames", shown.steps + 1) as progress:
 
             def write(path: Path) -> None:

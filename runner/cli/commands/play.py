@@ -87,15 +87,15 @@ def _chosen(recording: Recording, episode: int | None, trial: tuple[int, int] | 
     """
     from runner.analysis.evaluations import evaluation_after, evaluations_of
     from runner.environments.naming import trial_in_words
-    from runner.export.reports.episode import last_whole_evaluation, typical_trial
+    from runner.export.reports.episode import default_trial
     from runner.recording.schema import TRAIN_EPISODE
 
     evaluations = [] if episode is not None else evaluations_of(recording)
     if trial is None and not evaluations:
         number = max(recording.count(TRAIN_EPISODE) - 1, 0) if episode is None else episode
         return "train", number, f"training episode {number:,}"
-    if trial is None and last_whole_evaluation(recording) is not None:
-        trial = typical_trial(recording)
+    if trial is None:
+        trial = default_trial(recording)
     after, number = trial or (evaluations[-1].after, 0)
     where = str(recording.path)
     index = evaluation_after(evaluations, after, where).trial(number, where)

@@ -160,6 +160,18 @@ def typical_trial(recording: Recording) -> tuple[int, int]:
     return after, ranked_trials(recording, after)[1]
 
 
+def default_trial(recording: Recording) -> tuple[int, int] | None:
+    """Return the trial to show if the user names none: training episodes before it, and its number.
+
+    It is the typical trial of the last whole evaluation. A loop does not say how many trials an evaluation
+    has: there it is the first trial after the most training episodes. None if there is no such trial.
+    """
+    if recording.kind == "job":
+        return typical_trial(recording) if last_whole_evaluation(recording) is not None else None
+    evaluations = evaluations_of(recording)
+    return (evaluations[-1].after, 0) if evaluations else None
+
+
 def last_episode(recording: Recording) -> int:
     """Return the number of the last training episode that ended; 0 if none did."""
     return max(0, recording.count(schema.TRAIN_EPISODE) - 1)

@@ -104,6 +104,22 @@ def test_the_table_of_evaluations_fits(width):
     assert ("No room for: pickup" in text) == (width <= 80)
 
 
+def test_wrapped_cells_begin_beside_the_rest_of_their_row():
+    table = output.table("in\nepisode", "about", left=("about",), shrinking=("about",))
+    table.add_row("7", "a text that takes several lines")
+    console = Console(width=20)
+    with console.capture() as captured:
+        console.print(table)
+    lines = [line.split() for line in captured.get().splitlines()]
+    assert lines == [
+        ["in"],
+        ["episode", "about"],
+        ["7", "a", "text", "that"],
+        ["takes", "several"],
+        ["lines"],
+    ]
+
+
 def test_successes_are_told_apart_and_other_events_summed():
     events = dict.fromkeys(NAMES, 4) | {"taxi_1.drop_off": 12, "taxi_2.drop_off": 9, "collision": 3}
     *_, line = _lines([_record(events)], ["taxi_1.drop_off", "taxi_2.drop_off"], 200)

@@ -316,6 +316,11 @@ def test_what_a_loop_has_not_is_refused_in_a_sentence(folder, words):
 
 
 def test_the_grid_of_a_loop_becomes_a_film(folder, tmp_path):
+    done = dualtaxi(folder, "export", "gif", "lake", "-o", str(tmp_path / "trial.gif"))
+    assert done.exit_code == 0, done.output
+    played = dualtaxi(folder, "play", "lake").stdout.splitlines()[0]
+    assert "trial 0 of the evaluation after" in played
+    assert played.removeprefix("lake, seed 0: ") in done.stdout
     done = dualtaxi(folder, "export", "gif", "lake", "--episode", "2", "-o", str(tmp_path / "film.gif"))
     assert done.exit_code == 0, done.output
     with open_recording(runner.find_run("lake", folder).recording) as recording:
