@@ -512,7 +512,11 @@ class _Buffer:
 
 
 def _records(recording: Recording, name: str) -> Iterator[NDArray[np.void]]:
-    """Yield the records of a topic in blocks; of messages that vary in size all but their values."""
+    """Yield the records of a topic in blocks; of messages that vary in size all but their values.
+
+    Raises:
+        Inconsistent: messages of varying size are misnumbered, or have not one reward for each learner.
+    """
     topic = recording.topic(name)
     if topic in recording.dtypes:
         yield from recording.blocks(topic)
@@ -526,8 +530,15 @@ def _records(recording: Recording, name: str) -> Iterator[NDArray[np.void]]:
     ]
     fields.append(("log_time", "u8"))
     rows: list[tuple[Any, ...]] = []
-    for message in recording.decoded(topic):
-        values = (message[name] for name, _ in fields)
+    number = schema.NUMBERED_BY[topic.message]
+    for expected, message in enumerate(recording.decoded(topic)):
+        if message[number] != expected:
+            raise Inconsistent(f"{name}: found {number} {message[number]}, expected {expected}")
+        if len(message.get("rewards", [None] * learners)) != learners:
+            raise Inconsistent(
+                f"{name}, {number} {expected}: found {len(message['rewards'])} rewards, expected {learners}"
+            )
+        values = (message[field] for field, _ in fields)
         rows.append(tuple(tuple(value) if isinstance(value, list) else value for value in values))
         if len(rows) == _ROWS:
             yield np.array(rows, np.dtype(fields))

@@ -14,9 +14,10 @@ import runner
 from runner.execution.verify import verify
 from runner.recording.blocks import message_record
 from runner.recording.digest import ContentHash
+from runner.recording.messages import encode
 from runner.recording.reader import open_recording
 from tests.runner.altering import altered
-from tests.runner.loops.making import Leaving, drive, make, parallel, play
+from tests.runner.loops.making import Leaving, Rooms, drive, make, parallel, play
 
 
 def forged(source, target, topics=None, result=None):
@@ -214,3 +215,26 @@ def test_a_loop_that_was_killed_is_sound_as_far_as_it_goes(loops, tmp_path, name
         finding = verify(tmp_path / "cut.mcap").finding
         assert "/train/" not in finding, finding
         assert "/eval/" not in finding, finding
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "finding"),
+    [
+        ("rewards", [1.0, 2.0], "step 3: found 2 rewards, expected 1"),
+        ("rewards", [], "step 3: found 0 rewards, expected 1"),
+        ("step", 4, "found step 4, expected 3"),
+    ],
+)
+def test_messages_of_varying_size_have_their_number_and_their_rewards(
+    tmp_path, monkeypatch, field, value, finding
+):
+    def encoded(message, fields):
+        wrong = "rewards" in fields and fields["step"] == 3
+        return encode(message, fields | ({field: value} if wrong else {}))
+
+    monkeypatch.setattr("runner.loops.step_buffer.encode", encoded)
+    with runner.record(Rooms(with_text=True), tmp_path) as rec:
+        rec.reset(seed=1)
+        for _ in range(5):
+            rec.step(rec.action_space.sample())
+    assert finding in verify(rec.run.recording).finding
