@@ -37,10 +37,10 @@ def command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    """Put runs into an archive, losslessly: Parquet, which DuckDB, pandas and Polars read (docs/archive.md).
+    """Archive runs losslessly as Parquet, which DuckDB, pandas and Polars read (docs/archive.md).
 
-    A run takes a tenth of the room there. Where its recording is removed, it is still listed, and every
-    command that looks at it restores it when it needs it; `dualtaxi restore` brings the recording back.
+    An archived run takes a tenth of the space. With --remove its recording is removed, but the run stays
+    listed; commands that need the recording restore it into the cache, and `dualtaxi restore` brings it back.
 
     \b
     Examples:

@@ -59,12 +59,12 @@ def command(
     force: bool,
     recordings: Path | None,
 ) -> None:
-    """Compare groups of runs: medians, interquartile means, intervals, and how likely one beats the other.
+    """Compare groups of runs: medians, interquartile means, intervals, probabilities of improvement.
 
-    Runs that differ in nothing but the seed are one group; the name of several runs stands for all of
-    them. Groups are compared seed by seed, as runs of one seed share their draws. For each metric: median
-    and interquartile mean (IQM) with a 95 % bootstrap interval; for each two groups the differences, and
-    the probability that a run of A is better than one of B; and the share of runs that reach a level.
+    Runs that differ in nothing but the seed are one group; the name of several runs stands for all of them.
+    Groups are compared seed by seed, as runs of one seed share their draws. For each metric: median and
+    interquartile mean (IQM) with a 95 % bootstrap interval; for each pair of groups the differences, and the
+    probability that a run of A is better than one of B; and the share of runs that reach a level.
 
     Exit code 0 when groups were compared, 2 when there is nothing to compare.
 

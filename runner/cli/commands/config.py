@@ -86,9 +86,8 @@ def copy(name: str, output: Path | None, as_json: bool) -> None:
 def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     """Check CONFIG, a file or a shipped experiment, and print it with every value spelled out.
 
-    What is printed is a configuration again. Problems are told with file, line, column and key, all at
-    once; the exit code is then 2. Whether there is such an environment is not looked up: `dualtaxi run`
-    does so before it begins.
+    The output is a configuration again. All problems are reported at once, with file, line, column and key;
+    the exit code is then 2. Whether the environment exists is checked by `dualtaxi run`, before it begins.
 
     \b
     Examples:

@@ -60,9 +60,9 @@ def command(
     first: bool,
     targets: tuple[str, ...],
 ) -> None:
-    """Tell what differs between the runs A and B, down to the first step at which they part, and why.
+    """Show what differs between the runs A and B, down to the first step at which they diverge, and why.
 
-    Exit code 0 if both have the same content, whatever they are called, 1 if not.
+    Exit code 0 if both have the same content, 1 if not.
 
     \b
     Examples:

@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 )
 @json_option
 def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as_json: bool) -> None:
-    """Tell what the runs that fit FILTER (as in `dualtaxi ls`), or all, use of the disk; the largest first.
+    """Show the disk usage of the runs that match FILTER (as in `dualtaxi ls`), or of all, largest first.
 
-    Told are recordings; exports that `view` made, and recordings restored from archives, both kept in the
-    user's cache and made again when needed; and what else is in the runs' folders. Below stand the totals,
-    and what could be freed.
+    It counts recordings; exports made by `view` and recordings restored from archives, both kept in the
+    user's cache and made again when needed; and other files in the folders of runs. The totals and what could
+    be freed come last.
 
     \b
     Examples:

@@ -56,10 +56,10 @@ def command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    """Play the trained table of RUN, greedily, in new episodes.
+    """Evaluate the trained Q-table of RUN greedily in new episodes.
 
-    The table of any moment can be played. The episodes are recorded as a run of its own, whose
-    configuration names the run and step that the table comes from.
+    The table at any step can be evaluated. The episodes are recorded as a separate run, whose configuration
+    names the run and the step of the table.
 
     \b
     Examples:

@@ -47,7 +47,7 @@ class _Forms(click.Group):
 
 @click.group("export", cls=_Forms)
 def command() -> None:
-    """Write a run in a form that other programs read.
+    """Export a run for other programs.
 
     \b
     Example:

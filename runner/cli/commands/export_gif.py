@@ -64,9 +64,9 @@ def command(
 ) -> None:
     """Make a short film of a recorded episode of RUN, for slides and READMEs.
 
-    Each frame has step, actions, rewards and events written below it. Without a choice it is the typical
-    trial of the last evaluation: the median by success, return and length; of your own loop, the first
-    trial of its last evaluation; in a run that has no whole evaluation, the last training episode.
+    Each frame has step, actions, rewards and events written below it. By default it is the typical trial of
+    the last evaluation: the median by success, return and length; of your own loop the first trial of its
+    last evaluation; of a run without a whole evaluation the last training episode.
 
     \b
     Examples:

@@ -33,7 +33,7 @@ def command(
 ) -> None:
     """Export RUN into MLflow: parameters, metrics over training steps, tags, and run.json as an artifact.
 
-    A run that is there already is left as it is: it is known by its id and content digest, kept as tags.
+    A run that is already in the store, recognised by its id and content digest, is left as it is.
 
     \b
     Examples:

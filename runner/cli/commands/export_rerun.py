@@ -36,8 +36,8 @@ def command(
 ) -> None:
     """Export RUN for the Rerun viewer, arranged and ready to look at.
 
-    All metrics are exported. Of the steps, unless told otherwise, those of 20 training episodes spread
-    from the first to the last, and the trials of the last evaluation: what is left out is said.
+    All metrics are exported. By default the steps are those of 20 training episodes spread from the first to
+    the last, and the trials of the last evaluation; what is left out is reported.
 
     \b
     Examples:

@@ -14,9 +14,9 @@ from runner.cli.output import print_json, say
 @click.argument("folder", metavar="[FOLDER]", default=".", type=click.Path(file_okay=False, path_type=Path))
 @json_option
 def command(folder: Path, as_json: bool) -> None:
-    """Make FOLDER one to start in: configs/, recordings/ and a README of what to type.
+    """Create a folder to start in, with configs/, recordings/ and a README of what to type.
 
-    The folder is the current one, unless another is given. Files that exist already are left as they are.
+    FOLDER defaults to the current one. Files that exist already are left as they are.
 
     \b
     Examples:

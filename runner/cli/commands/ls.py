@@ -57,11 +57,11 @@ def command(
     as_csv: bool,
     as_json: bool,
 ) -> None:
-    """List the runs that fit FILTER, or all, the newest first.
+    """List the runs that match FILTER, or all, newest first.
 
-    A filter is of words, looked for in id, name, configuration, tags and note; of FIELD:VALUE, FIELD:>VALUE
-    and FIELD:[LOW TO HIGH]; of AND, OR, NOT and parentheses. Text is compared as a whole, * and ? stand for
-    any; FIELD:* is: known. The fields:
+    A filter consists of words, searched for in id, name, configuration, tags and note; of FIELD:VALUE,
+    FIELD:>VALUE and FIELD:[LOW TO HIGH]; of AND, OR, NOT and parentheses. Text must match as a whole, with
+    the wildcards * and ?; FIELD:* matches every run that has the field. The fields:
 
     \b
       id name config seed status tag note created age episodes steps success_percent

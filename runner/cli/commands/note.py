@@ -21,9 +21,9 @@ from runner.errors import RunnerError
 @recordings_option
 @json_option
 def command(run_name: str, text: str | None, clear: bool, recordings: Path | None, as_json: bool) -> None:
-    """Write a note on a run in place of the one it has; without TEXT, print it. - reads it from stdin.
+    """Write a note on a run, replacing its present one; without TEXT, print it. - reads it from stdin.
 
-    It stands in labels.json beside the recording; find it by `dualtaxi ls note:WORD`.
+    Notes are stored in labels.json next to the recording; search them by `dualtaxi ls note:WORD`.
 
     \b
     Examples:

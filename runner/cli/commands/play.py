@@ -49,11 +49,11 @@ def command(
 ) -> None:
     """Replay a recorded episode of RUN, frame by frame, with actions and rewards.
 
-    Without a choice it is the typical trial of the last evaluation: the median by success, return and
-    length; of a run without evaluations the last training episode. All is drawn from the recording: its
-    environment need not be installed. In a terminal the space bar pauses, the arrow keys (or b and n) step
-    back and forward, and q quits. Where stdout is no terminal, the frames come one after another, without
-    waiting. With --json: a line for each step.
+    By default it is the typical trial of the last evaluation: the median by success, return and length; of a
+    run without evaluations the last training episode. Everything is drawn from the recording; its environment
+    need not be installed. In a terminal the space bar pauses, the arrow keys (or b and n) step back and
+    forward, and q quits. Where stdout is no terminal, the frames come one after another, without waiting.
+    With --json, one line for each step.
 
     \b
     Examples:

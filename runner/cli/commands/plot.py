@@ -28,8 +28,8 @@ from runner.cli.progress import counting, stage_line
 def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: Path | None) -> None:
     """Draw every metric of one or several runs over episodes, in one figure; or a sweep.
 
-    Runs that differ in nothing but the seed are drawn as one line, their median, with a band from the
-    lowest to the highest; one that was recorded twice counts once, which is said. The name of several runs
+    Runs that differ in nothing but the seed are drawn as one line, their median, with a band from the lowest
+    to the highest; a run that was recorded twice counts once, with a message. A name shared by several runs
     stands for all of them.
 
     The name of a sweep stands for it: its objective is drawn against each parameter and in parallel

@@ -51,11 +51,11 @@ def command(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Remove the runs that fit FILTER (as in `dualtaxi ls`) and all the options, after showing and asking.
+    """Remove the runs that match FILTER (as in `dualtaxi ls`) and all options, after confirmation.
 
-    At least one of them must be given. --keep-last spares the newest runs of each configuration's name,
-    counted over all runs. Runs that are running, or tagged `keep`, stay, and so do those whose folder holds
-    files that no run writes.
+    At least one of them must be given. --keep-last keeps the newest runs of each configuration name, counted
+    over all runs. Runs that are running or tagged `keep` stay, and so do those whose folder holds files of
+    other origin.
 
     \b
     Examples:

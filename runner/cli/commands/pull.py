@@ -32,7 +32,7 @@ def command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    """Bring RUN from a server into the folder of runs, with its tags and note.
+    """Download RUN from a server into the folder of runs, with its tags and note.
 
     RUN is named as the server knows it: its id, the beginning of one, its name, or @latest. Every byte is
     checked before the run appears; a run that is here already with the same content is left as it is.

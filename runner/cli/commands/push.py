@@ -54,11 +54,11 @@ def command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    """Send runs to a server, which lists them when it has verified every byte.
+    """Upload runs to a server, which lists them once it has verified every byte.
 
-    RUN may also be the path of a recording. What was sent before a connection broke is not sent
-    again, and a run that the server has already is left as it is. With --outbox, the runs that
-    `runner.record(env, "http://...")` could not send are sent now.
+    RUN may also be the path of a recording. An upload resumes after a broken connection, and a run that the
+    server already has is left as it is. With --outbox, the runs that `runner.record(env, "http://...")` could
+    not send are sent now.
 
     \b
     Examples:

@@ -46,7 +46,7 @@ def command(
     recordings: Path | None,
     as_json: bool,
 ) -> None:
-    """Tell the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
+    """Show the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
 
     With --state: its values, the policy if the algorithm learns one, the greedy action (ties go to the
     first), how often each action was taken there so far, and which step last changed each value. In Python:

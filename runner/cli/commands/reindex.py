@@ -30,10 +30,10 @@ class _Found:
 @json_option
 @click.pass_context
 def command(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> None:
-    """Read every run of the recordings folder again, and make its index anew.
+    """Rebuild the index from the runs in the recordings folder.
 
-    It is never needed: `ls` and the other commands look at what changed by themselves, and nothing is kept in
-    the index alone. Exit code 1 if there are folders with files of a run of which nothing can be made.
+    This is never required: commands notice changes by themselves, and the index holds nothing of its own.
+    Exit code 1 if there are folders with files of a run that cannot be read.
 
     \b
     Examples:

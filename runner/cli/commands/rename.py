@@ -19,9 +19,9 @@ from runner.cli.output import print_json
 @recordings_option
 @json_option
 def command(run_name: str, name: str | None, original: bool, recordings: Path | None, as_json: bool) -> None:
-    """Give a run another name. Its id stays, and so does what its recording says.
+    """Rename a run; its id and its recording stay as they are.
 
-    The name stands in labels.json beside the recording.
+    The name is stored in labels.json next to the recording.
 
     \b
     Examples:

@@ -44,12 +44,12 @@ _WORDS: Final = {
 @json_option
 @click.pass_context
 def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json: bool) -> None:
-    """Make the recording of RUN, or one by its path, whole again: for every reader, with index and summary.
+    """Repair the recording of RUN, or one given by its path, so that every reader opens it.
 
-    Every good chunk is copied to a new file, also those behind a damaged place; the file is read back and
-    counted before it takes the place of the old one, which is not touched until then. Where something in
-    the middle was lost, the damaged file is kept beside it. What was lost is said; `dualtaxi resume`
-    brings it back.
+    Every good chunk is copied to a new file, also those after a damaged place; the file is read back and
+    counted before it replaces the old one, which is not touched until then. If something in the middle was
+    lost, the damaged file is kept next to it. The command reports what was lost; `dualtaxi resume` brings it
+    back.
 
     Exit code 1 if anything was lost, also in an earlier repair.
 

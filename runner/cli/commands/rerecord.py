@@ -19,9 +19,8 @@ from runner.cli.working import at_work, refuse_running, run_as_json, run_in_word
 def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     """Record the steps of RUN, which was run with recording.steps: none.
 
-    The job is done again. The full recording takes the place of the old one when it is complete and has
-    the content digest that the run had: that proves that these are its steps. A run that holds its steps
-    has nothing to do.
+    The run is trained again. The full recording replaces the old one once it is complete and has the same
+    content digest, which proves that these are its steps. Nothing is done for a run that has its steps.
 
     \b
     Example:

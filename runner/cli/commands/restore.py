@@ -17,10 +17,10 @@ from runner.cli.parameters import RunName
 @recordings_option
 @json_option
 def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
-    """Bring the recording of an archived run back, with the same content digest.
+    """Restore the recording of an archived run, with the same content digest.
 
-    ARCHIVE is the folder or URL of one run's archive: it becomes a run of the recordings folder again, also
-    where nothing else is left of it. The archive stays where it is.
+    ARCHIVE is the folder or URL of one run's archive: it becomes a run of the recordings folder again, even
+    if nothing else is left of it. The archive stays where it is.
 
     \b
     Examples:

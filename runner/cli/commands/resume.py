@@ -26,15 +26,14 @@ from runner.cli.working import at_work, run_as_json, run_in_words
 def command(
     ctx: click.Context, run_name: str, accept_changes: bool, recordings: Path | None, as_json: bool
 ) -> None:
-    """Go on with RUN, interrupted or failed, to its end: as if it had never stopped.
+    """Resume RUN, which was interrupted or failed, as if it had never stopped.
 
-    Its job is done again without recording, which is quick, and compared with what is recorded, byte for
-    byte; what is missing is then recorded. The content digest is that of an uninterrupted run. A recording
-    that lost something in its middle is made anew and replaced at the end. A finished run has nothing to
-    do.
+    The run is trained again without recording, which is quick, and compared byte for byte with its recording;
+    what is missing is then recorded. The content digest is that of an uninterrupted run. A recording that
+    lost something in its middle is written again and replaced at the end. Nothing is done for a finished run.
 
-    A run that was begun by another version of the code, the environment or a numerical library is refused
-    with what differs. --accept-changes goes on all the same, and the recording says so.
+    A run that was started with another version of the code, the environment or a numerical library is
+    refused, with a list of what differs. --accept-changes resumes it anyway, and the recording notes that.
 
     \b
     Examples:

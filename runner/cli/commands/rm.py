@@ -23,10 +23,10 @@ from runner.runs.run import recordings_folder
 def command(
     run_names: tuple[str, ...], recordings: Path | None, yes: bool, dry_run: bool, force: bool, as_json: bool
 ) -> None:
-    """Remove runs with their recordings, after showing them and asking.
+    """Remove runs and their recordings, after confirmation.
 
-    A run that is running, or tagged `keep`, is refused, and so is one whose folder holds files that no run
-    writes; then nothing is removed. No link is followed. Archives stay.
+    If a run is running or tagged `keep`, or its folder holds files of other origin, nothing is removed. Links
+    are not followed. Archives stay.
 
     \b
     Examples:

@@ -74,16 +74,16 @@ def command(
 ) -> None:
     """Train, evaluate and record the experiment CONFIG: a file, or a shipped one (`dualtaxi config ls`).
 
-    Every step goes into a recording of its own folder. Several seeds make one run each, one after the
-    other, or --at-once; what a run records is the same. Ctrl-C ends a run properly: what it recorded is
-    kept; a second Ctrl-C kills it.
+    Each run gets a folder with a recording of every step. Several seeds make one run each, one after the
+    other or in parallel with --at-once; the recordings are the same. Ctrl-C ends a run properly and keeps
+    what it recorded; a second Ctrl-C kills it.
 
-    Steps and disk are estimated first. The estimate takes it that evaluation trials and the first 500
-    training episodes last half the step limit, and later ones a tenth; "at most" is all of the limit.
+    Steps and disk are estimated first. The estimate assumes that evaluation trials and the first 500 training
+    episodes last half the step limit, and later ones a tenth; "at most" is all of the limit.
 
-    With --live the training is watched while it goes on: all metrics, and one episode in every so many.
+    With --live the Rerun viewer shows training as it happens: all metrics, and every Nth episode.
 
-    With --json: a line for each run.
+    With --json, one line for each run.
 
     \b
     Examples:

@@ -69,13 +69,13 @@ def command(
     ray: str | None,
     log: Path | None,
 ) -> None:
-    """Open the runs to browsers and programs: list, replay, compare, upload, submit.
+    """Serve the runs to browsers and programs: list, replay, compare, upload, submit.
 
-    The address is printed on stdout; a log goes to stderr, as JSON lines unless that is a terminal. Ctrl-C
-    or SIGTERM stops it: what is under way comes to its end, and jobs are finished or left resumable.
+    The address is printed on stdout; a log goes to stderr, as JSON lines unless that is a terminal. Ctrl-C or
+    SIGTERM stops it: requests in progress are completed, and jobs are finished or can be resumed.
 
     Other hosts than loopback ones need a token (`dualtaxi token create NAME`), and a proxy for TLS in front:
-    docs/deploy.md tells how.
+    see docs/deploy.md.
 
     \b
     Examples:

@@ -39,13 +39,13 @@ MOST_CYCLES: Final = 8
 @recordings_option
 @json_option
 def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
-    """Tell all about a run: what it is, its evaluations, its tables, configuration and provenance.
+    """Show a run: its evaluations, tables, configuration and provenance.
 
-    With --json also the whole series: under `eval` an object for each evaluation, with the training
-    episodes before it, success_percent, mean_length, mean_penalties and the count of every event; under
-    `optimality` its exact measures, if the run takes them; under `train` one for each report of training;
-    under `loop` the last results of a loop: its last evaluation, the means of its last 100 training episodes
-    and the last values it logged.
+    With --json also the whole series: under `eval` an object for each evaluation, with the training episodes
+    before it, success_percent, mean_length, mean_penalties and the count of every event; under `optimality`
+    its exact measures, if the run takes them; under `train` one for each report of training; under `loop` the
+    last results of a loop: its last evaluation, the means of its last 100 training episodes and the last
+    values it logged.
 
     \b
     Examples:

@@ -33,10 +33,10 @@ def command(
     watching: bool,
     as_json: bool,
 ) -> None:
-    """Have the experiment or the sweep in FILE done by a server.
+    """Submit the experiment or sweep in FILE to a server.
 
-    It is checked there as it would be here, and queued. The server's pages and `--watch` tell how far it is;
-    Ctrl-C ends the watching, not the job. A connection that breaks is taken up again.
+    The server checks it as `dualtaxi run` would, and queues it. The server's pages and `--watch` show its
+    progress; Ctrl-C ends the watching, not the job. A broken connection is restored.
 
     Exit code 0 when it is queued, or with --watch finished; 1 when it failed or was cancelled.
 

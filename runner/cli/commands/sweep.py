@@ -52,7 +52,7 @@ class _StartsUnlessTold(click.Group):
 
 @click.group("sweep", cls=_StartsUnlessTold, context_settings={"ignore_unknown_options": True})
 def command() -> None:
-    """Run an experiment with many values; tell which are best.
+    """Run an experiment with many values, and rank them.
 
     `dualtaxi sweep FILE` is short for `dualtaxi sweep start FILE`.
 
@@ -105,10 +105,10 @@ def start(
 
     FILE may also be the name of a shipped sweep, which `dualtaxi config ls` lists.
 
-    Each trial is an ordinary run a seed, tagged sweep=NAME, in the recordings folder. A sweep that was
-    killed or interrupted is gone on with by --resume: finished runs are not repeated, unfinished ones are
-    resumed, and what comes out is what would have come out. It depends neither on the number of workers
-    nor on where they run.
+    Each trial is one ordinary run per seed, tagged sweep=NAME, in the recordings folder. --resume continues a
+    sweep that was killed or interrupted: finished runs are not repeated, unfinished ones are resumed, and the
+    results are those of an undisturbed sweep. They depend neither on the number of workers nor on where they
+    run.
 
     Exit code 0 when all is done, 1 when runs failed or a limit was reached, 130 when interrupted.
 
@@ -183,11 +183,11 @@ def show(
     as_json: bool,
     recordings: Path | None,
 ) -> None:
-    """Rank the trials of the sweep NAME, with intervals over seeds; tell what mattered.
+    """Rank the trials of the sweep NAME with intervals over seeds, and show which parameters mattered.
 
-    A trial counts by the median over its seeds; beside it stands the interquartile mean (IQM) with its
-    95 % bootstrap interval, for four seeds and more. What mattered is the share of the
-    objective's variance that each parameter, and each two, explain (functional ANOVA).
+    A trial counts by the median over its seeds; beside it stands the interquartile mean (IQM) with its 95 %
+    bootstrap interval, for four seeds and more. What mattered is the share of the objective's variance that
+    each parameter, and each two, explain (functional ANOVA).
 
     \b
     Examples:

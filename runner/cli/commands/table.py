@@ -30,11 +30,11 @@ ROWS_AT_ONCE = 50_000
 @set_option
 @json_option
 def command(env_id: str, overrides: tuple[str, ...], as_json: bool) -> None:
-    """Print an environment's transition table in words, as CSV.
+    """Print an environment's transition table as CSV, with names.
 
-    A row for each state, action and outcome that can happen: state, action, probability, next_state,
-    reward, is_over. With --set mode=competitive also the reward of each agent. With --json: a line for
-    each row. In Python: runner.frames.transition_table().
+    A row for each state, action and outcome that can happen: state, action, probability, next_state, reward,
+    is_over. With --set mode=competitive also the reward of each agent. With --json, one line for each row. In
+    Python: runner.frames.transition_table().
 
     \b
     Examples:

@@ -21,10 +21,10 @@ from runner.cli.output import print_json, say
 def command(
     run_name: str, tags: tuple[str, ...], remove: tuple[str, ...], recordings: Path | None, as_json: bool
 ) -> None:
-    """Tag a run, or take tags away; print the tags that it has then.
+    """Add tags to a run, or remove them; print its tags.
 
-    A run tagged `keep` is never removed by rm or prune. Tags stand in labels.json beside the recording; find
-    what has one by `dualtaxi ls tag:TAG`.
+    A run tagged `keep` is never removed by rm or prune. Tags are stored in labels.json next to the recording;
+    search them by `dualtaxi ls tag:TAG`.
 
     \b
     Examples:

@@ -10,9 +10,9 @@ from runner.cli.output import print_json, say
 
 @click.group("token")
 def command() -> None:
-    """Make, list and revoke the tokens that a service asks for.
+    """Create, list and revoke access tokens.
 
-    They are kept hashed, in the configuration folder of the user who serves.
+    They are stored as hashes, in the configuration folder of the user who runs the server.
 
     \b
     Examples:
@@ -33,7 +33,7 @@ def command() -> None:
 )
 @json_option
 def create(name: str, scope: str, as_json: bool) -> None:
-    """Make a token called NAME and print it, this once: only its hash is kept.
+    """Create a token called NAME and print it, once: only its hash is stored.
 
     \b
     Examples:
@@ -55,7 +55,7 @@ def create(name: str, scope: str, as_json: bool) -> None:
 @command.command("ls")
 @json_option
 def ls(as_json: bool) -> None:
-    """List the tokens there are; what they are is not known, only their hashes.
+    """List the tokens; only their hashes are stored.
 
     \b
     Example:
@@ -82,7 +82,7 @@ def ls(as_json: bool) -> None:
 @click.argument("which", metavar="TOKEN")
 @json_option
 def revoke(which: str, as_json: bool) -> None:
-    """Take the token of an id or a name away; a service that runs refuses it from now on.
+    """Revoke a token by its id or name; a running server refuses it from now on.
 
     \b
     Example:

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | None, as_json: bool) -> None:
     """Check RUN, or a recording by its path: every byte, step, episode, figure and table.
 
-    The job is done again, in memory, by the environment that the recording holds, and compared. The first
-    thing that is wrong is named: topic, episode, step, field, what was found and what was expected. With
-    --rerun the job is done by the installed environment: the verdict says whether the run can be
-    reproduced here, and if not, at which step it diverges and what differs from then: packages,
-    processor, code. It also compares how the recording describes its environment: scene and names.
+    The run is trained again in memory, with the environment in the recording, and compared. The first
+    difference is named: topic, episode, step, field, what was found and what was expected. With --rerun the
+    run is trained with the installed environment: the verdict says whether it can be reproduced here, and if
+    not, at which step it diverges and what differs: packages, processor, code. It also compares how the
+    recording describes its environment: scene and names.
 
     A run that was interrupted before it recorded anything is neither sound nor wrong: there is nothing to
     verify yet.

@@ -70,10 +70,10 @@ def command(
     everything: bool,
     recordings: Path | None,
 ) -> None:
-    """Look at RUN in the Rerun viewer, at the right spot; at two runs side by side, where they part.
+    """Open RUN in the Rerun viewer at a step, or two runs side by side where they diverge.
 
-    The run is exported first, unless it was before; which steps, is chosen as for `export rerun`, and the
-    episode of --at is among them; with two runs and no --at, the one in which they part. It ends when the
+    The run is exported first, unless it was before. The steps are chosen as for `export rerun`, with the
+    episode of --at among them, or of two runs the episode in which they diverge. The command ends when the
     viewer is closed, or by Ctrl-C.
 
     \b
