@@ -12,8 +12,7 @@ from runner.cli.options import filter_argument, folders_option, json_option
 from runner.cli.output import UNKNOWN, draw, facts, print_json, say, size, table, title
 
 if TYPE_CHECKING:
-    from runner.runs.catalogue.index import Index
-    from runner.runs.catalogue.usage import Usage
+    from runner.runs.catalogue.usage import Sums, Usage
 
 
 @click.command("du")
@@ -40,62 +39,56 @@ def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as
       dualtaxi du
       dualtaxi du status:finished age:>30d --limit 5
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.runs.catalogue.columns import with_originals
     from runner.runs.catalogue.filters import parse
     from runner.runs.catalogue.index import look
-    from runner.runs.catalogue.usage import USED_BY, freeable_of, totals, usages
+    from runner.runs.catalogue.usage import usage_of
 
     chosen = parse(" ".join(words))
-
-    def work(index: Index) -> list[dict[str, Any]]:
-        return with_originals(index.select(chosen, columns=USED_BY), index)
-
-    found = usages(look(recordings, work, say))
-    freeable = freeable_of(found, recordings)
+    most = None if as_json or not limit else limit
+    largest, sums = usage_of(lambda work: look(recordings, work, say), chosen, most)
+    freeable = sums.freeable(recordings)
     if as_json:
         print_json(
-            {"runs": [_as_json(usage) for usage in found], "total": totals(found), "freeable": freeable}
+            {"runs": [_as_json(usage) for usage in largest], "total": sums.by_kind(), "freeable": freeable}
         )
-    elif found:
-        _draw(found, freeable, limit or len(found))
+    elif sums.runs:
+        _draw(largest, sums, freeable)
     else:
         say(f"No run in {', '.join(map(str, recordings))} fits." if words else "No runs yet.")
 
 
 def _as_json(usage: Usage) -> dict[str, Any]:
-    from runner.runs.catalogue.usage import totals
+    from runner.runs.catalogue.usage import sizes
 
     row = usage.row
-    told = {key: row[key] for key in ("name", "status", "same_as")}
+    facts = {key: row[key] for key in ("name", "status", "same_as")}
     path = str(Path(row["root"], row["entry"]))
-    return {"run_id": row["id"], **told, "path": path, **totals([usage])}
+    return {"run_id": row["id"], **facts, "path": path, **sizes([usage])}
 
 
-def _draw(found: Sequence[Usage], freeable: dict[str, int], limit: int) -> None:
-    from runner.runs.catalogue.usage import totals
+def _draw(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> None:
+    from runner.runs.catalogue.usage import sizes
 
-    every = dict(
-        zip(("recording", "exports", "restored", "other", "total"), totals(found).values(), strict=True)
-    )
+    every, shown = sums.by_kind(), sizes(largest)
     kinds = [kind for kind, number in every.items() if number or kind == "total"]  # none of nothing
 
-    def sizes(usages: Sequence[Usage]) -> list[str]:
-        numbers = dict(zip(every, totals(usages).values(), strict=True))
+    def cells(numbers: dict[str, int]) -> list[str]:
         return [_bytes(numbers[kind]) for kind in kinds]
 
-    same = ["same as"] if any(usage.row["same_as"] for usage in found) else []
+    same = ["same as"] if any(usage.row["same_as"] for usage in largest) else []
     drawn = table(
         *("id", "name", "status", *kinds, *same),
         left=("id", "name", "status", "same as"),
         shrinking=("name",),
     )
-    for usage in found[:limit]:
+    for usage in largest:
         row = usage.row
         others = [row["same_as"] or ""] if same else []
-        drawn.add_row(row["id"], row["name"], row["status"], *sizes([usage]), *others)
-    if found[limit:]:
-        drawn.add_row(f"{len(found) - limit:,} more", "", "", *sizes(found[limit:]))
-    drawn.add_row("all", "", "", *sizes(found), style="bold")
+        drawn.add_row(row["id"], row["name"], row["status"], *cells(sizes([usage])), *others)
+    if sums.runs > len(largest):
+        rest = {kind: number - shown[kind] for kind, number in every.items()}
+        drawn.add_row(f"{sums.runs - len(largest):,} more", "", "", *cells(rest))
+    drawn.add_row("all", "", "", *cells(every), style="bold")
     draw(drawn)
     told = {
         _FREED_BY[kind][0]: f"{size(number)}  {_FREED_BY[kind][1]}"

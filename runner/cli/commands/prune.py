@@ -68,7 +68,7 @@ def command(
     wish = Wish(parse(" ".join(words)), _seconds(older_than), keep_last, statuses)
     if wish.filter.condition is None and older_than is None and keep_last is None and not statuses:
         raise click.UsageError("expected a FILTER, --older-than, --keep-last or --status: which runs?")
-    removals, protected = _chosen(recordings, wish, force)
+    removals, protected = _chosen(recordings, wish, force, dry_run)
     kept = {each.run_id: each.refusal for each in removals if each.refusal}
     for run_id, why in kept.items():
         say(f"Run {run_id} stays: {why}.")
@@ -95,13 +95,17 @@ def _seconds(text: str | None) -> float | None:
         raise RunnerError(f"--older-than: found {text!r}, expected an age such as 30d, 12h or 2w.") from None
 
 
-def _chosen(recordings: tuple[Path, ...], wish: Wish, force: bool) -> tuple[list[Removal], Counter[str]]:
+def _chosen(
+    recordings: tuple[Path, ...], wish: Wish, force: bool, dry_run: bool
+) -> tuple[list[Removal], Counter[str]]:
     """Return what may go, and how many runs are protected, by reason."""
     from runner.runs.catalogue.index import look
-    from runner.runs.catalogue.removal import plan, unwanted
+    from runner.runs.catalogue.removal import plan, plan_row, unwanted
     from runner.runs.run import runs_in
 
     rows, protected = look(recordings, lambda index: unwanted(index, wish, time.time()), say)
+    if dry_run:
+        return [plan_row(row, force) for row in rows], protected
     places = [(Path(row["root"]), row["entry"]) for row in rows]
     planned = [plan(run, root, force) for root, entry in places for run in runs_in(root / entry)]
     return planned, protected

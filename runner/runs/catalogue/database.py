@@ -23,8 +23,8 @@ Tell = Callable[[str], None]
 
 INDEX_FILE: Final = "catalogue.sqlite"
 _APPLICATION: Final = 0x44546178  # "DTax"
-_VERSION: Final = zlib.crc32(",".join(["6", *Row._meta.sorted_field_names]).encode()) >> 1
-"""Of the columns, and of what is put in them (the number before them); another one is thrown away."""
+_VERSION: Final = zlib.crc32(",".join(["7", *Row._meta.sorted_field_names]).encode()) >> 1
+"""Of the columns, and of indexes and contents (the number before them); another one is thrown away."""
 _HEAD_BYTES: Final = 100
 """Of an SQLite file; at 24 stands how often it was changed."""
 _BUSY_SECONDS: Final = 60

@@ -59,6 +59,10 @@ class Filter:
     settings: frozenset[str] = frozenset()
     """The paths in configurations that it asks for."""
 
+    def also(self, condition: Any) -> Filter:
+        """Return the filter that lets through what fits another condition as well."""
+        return Filter(condition if self.condition is None else condition & self.condition, self.settings)
+
 
 def parse(text: str, now: datetime | None = None) -> Filter:
     """Return the filter in a text; an empty one lets everything through.

@@ -26,6 +26,13 @@ _TEXT: Final = 4000
 """The most characters kept of a text, and the most settings of a configuration."""
 
 
+_SUMMED: Final = (
+    *("root", "used_recording", "used_other", "used_left_over", "used_freed"),
+    *("status", "tags", "digest", "created", "id"),
+)
+"""What sums over the use of the disk need: an index of these spares a look at all rows."""
+
+
 class SeedField(Field):
     """A seed, from 0 to 2^64 - 1, kept in order as SQLite's signed integers."""
 
@@ -105,6 +112,7 @@ class Row(Model):
             (("root", "entry", "fingerprint", "mark", "settled", "status"), False),
             (("digest",), False),
             (("root", "created", "id", "name", "seed"), False),
+            (_SUMMED, False),
         )
 
 

@@ -7,15 +7,19 @@ import os
 import re
 import stat
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from peewee import DatabaseError
+from peewee import Case, DatabaseError, Value, chunked, fn
 
 from runner.recording.labels import KEEP, LABELS_FILE, LOCK_FILE
+from runner.runs.catalogue.columns import with_originals
 from runner.runs.catalogue.database import keep_usage, opened
+from runner.runs.catalogue.filters import Filter
+from runner.runs.catalogue.index import Index
+from runner.runs.catalogue.rows import Row
 from runner.runs.locking import RUN_LOCK
 from runner.runs.run import RECORDING_FILE, RUN_FILE
 from runner.util.cache import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
@@ -106,37 +110,166 @@ class Usage:
         """All of it."""
         return self.contents.recording + self.contents.other + self.exports + self.restored
 
+    @classmethod
+    def of(cls, row: dict[str, Any], exports: Mapping[str, int], restored: Mapping[str, int]) -> Usage:
+        """Return the usage of a run that the index keeps, given the bytes cached by id."""
+        contents = Contents(
+            row["used_recording"], row["used_other"], row["used_left_over"], row["used_freed"]
+        )
+        return cls(row, contents, exports.get(row["id"], 0), restored.get(row["id"], 0))
+
 
 USED_BY: Final = (
-    *("root", "entry", "id", "name", "status", "tags", "digest", "problem", "fingerprint", "mark", "settled"),
+    *("root", "entry", "id", "name", "status", "tags", "digest", "fingerprint", "mark", "settled"),
     *("used_recording", "used_other", "used_left_over", "used_freed"),
 )
-"""The columns of the index that `usages` needs."""
+"""The columns of the index that a `Usage` needs."""
 
 
-def usages(rows: Sequence[dict[str, Any]]) -> list[Usage]:
-    """Return what runs use of the disk, the largest first.
+@dataclass
+class Sums:
+    """Bytes that several runs use together."""
 
-    What is found in a folder is kept in the index: it is looked at again when something in it changed.
+    runs: int = 0
+    """How many runs these are."""
+    recording: int = 0
+    exports: int = 0
+    restored: int = 0
+    other: int = 0
+    same_content: int = 0
+    """What removing runs whose content another run recorded first would free; without protected runs."""
+    unfinished: int = 0
+    """What removing interrupted and failed runs would free; without protected runs."""
+    left_over: int = 0
+    """What repairs and interrupted commands left behind; without protected runs."""
+
+    def by_kind(self) -> dict[str, int]:
+        """Return the bytes by what they are, and their total."""
+        kinds = {
+            "recording": self.recording,
+            "exports": self.exports,
+            "restored": self.restored,
+            "other": self.other,
+        }
+        return {**kinds, "total": sum(kinds.values())}
+
+    def freeable(self, recordings: Sequence[Path]) -> dict[str, int]:
+        """Return the bytes that could be freed, by what they are.
+
+        Args:
+            recordings: the folders searched for runs whose removal was cut off.
+        """
+        cut_off = [contents_of(stray) for root in recordings for stray in strays(root)]
+        return {
+            "same_content": self.same_content,
+            "unfinished": self.unfinished,
+            "left_over": self.left_over,
+            "cached": self.exports + self.restored,
+            "half_removed": sum(contents.recording + contents.other for contents in cut_off),
+        }
+
+    def add(self, usage: Usage) -> None:
+        """Add a run whose folder was measured just now."""
+        row, contents = usage.row, usage.contents
+        self.runs += 1
+        self.recording += contents.recording
+        self.other += contents.other
+        if KEEP in row["tags"].split() or row["status"] == "running":
+            return
+        self.left_over += contents.left_over
+        self.same_content += contents.freed if row["same_as"] else 0
+        self.unfinished += contents.freed if row["status"] in ("interrupted", "failed") else 0
+
+
+def sizes(usages: Iterable[Usage]) -> dict[str, int]:
+    """Return the bytes that a few runs use, by what they are, and their total."""
+    sums = Sums()
+    for usage in usages:
+        sums.recording += usage.contents.recording
+        sums.exports += usage.exports
+        sums.restored += usage.restored
+        sums.other += usage.contents.other
+    return sums.by_kind()
+
+
+def usage_of(
+    read: Callable[[Callable[[Index], _Parts]], _Parts], chosen: Filter, limit: int | None
+) -> tuple[list[Usage], Sums]:
+    """Return the runs that use most of the disk, the largest first, and the sums over all runs.
+
+    SQLite adds up and sorts what the index keeps. Folders that it knows nothing of, or that changed, are
+    measured here, after the index was read: that may take long, and must not keep others from writing to it.
+
+    Args:
+        read: does some work on the index and returns what came of it, as `look` does.
+        chosen: which runs.
+        limit: how many of the largest runs to return at most; all if None.
     """
     exports, restored = cached(EXPORTS) + cached(TABLES), cached(RESTORED)
-    found, fresh = [], []
-    for row in rows:
-        contents = _kept_contents(row)
-        if contents is None:
-            contents = _contents(row)
-            if row["settled"] and row["status"] != "running" and not contents.strange:
-                fresh.append((row, contents))
-        found.append(Usage(row, contents, exports[row["id"]], restored[row["id"]]))
+    with_cache = {*exports, *restored}
+    parts = read(lambda index: _parts(index, chosen, with_cache, limit))
+    fresh, sums = [], parts.sums
+    found = {(row["root"], row["entry"]): Usage.of(row, exports, restored) for row in parts.kept}
+    measured = []
+    for row in parts.unknown:
+        contents = _contents(row)
+        if row["settled"] and row["status"] != "running" and not contents.strange:
+            fresh.append((row, contents))
+        usage = Usage(row, contents, exports[row["id"]], restored[row["id"]])
+        sums.add(usage)
+        measured.append(usage)
     if fresh:
         _keep(fresh)
-    return sorted(found, key=lambda usage: (-usage.total, usage.row["id"]))
+    every = [*found.values(), *measured]
+    sums.exports = sum(usage.exports for usage in every)
+    sums.restored = sum(usage.restored for usage in every)
+    every.sort(key=lambda usage: (-usage.total, usage.row["id"]))
+    return every[:limit], sums
 
 
-def _kept_contents(row: dict[str, Any]) -> Contents | None:
-    if row["used_recording"] is None:
-        return None
-    return Contents(row["used_recording"], row["used_other"], row["used_left_over"], row["used_freed"])
+class _Parts(NamedTuple):
+    """What the index knows of the runs' usage."""
+
+    sums: Sums
+    """Over the runs whose usage it keeps; without cached files."""
+    kept: list[dict[str, Any]]
+    """Of these runs: the largest, and all that have cached files."""
+    unknown: list[dict[str, Any]]
+    """The runs whose folders have to be measured."""
+
+
+def _parts(index: Index, chosen: Filter, with_cache: set[str], limit: int | None) -> _Parts:
+    is_kept = Row.used_recording.is_null(False)
+    sums = Sums(*index.sums(chosen.also(is_kept), _columns(index)))
+    own = Row.used_recording + Row.used_other
+    kept = index.largest(chosen.also(is_kept), own, limit, USED_BY)
+    if limit is not None:  # a run that is small by itself may have large files in the cache
+        for ids in chunked(sorted(with_cache), 500):
+            kept += index.select(chosen.also(is_kept & Row.id.in_(ids)), columns=USED_BY)
+    unknown = index.select(chosen.also(Row.used_recording.is_null()), columns=USED_BY)
+    with_originals([*kept, *unknown], index)
+    return _Parts(sums, kept, unknown)
+
+
+def _columns(index: Index) -> list[Any]:
+    """Return the sums that make the fields of `Sums`, in their order."""
+    line = "\n"
+    protected = fn.INSTR(Value(line).concat(Row.tags).concat(line), f"{line}{KEEP}{line}") > 0
+    free = ~protected & (Row.status != "running")
+
+    def total(condition: Any, column: Any) -> Any:
+        return fn.SUM(Case(None, [(condition, column)], 0))
+
+    return [
+        fn.COUNT(Row.entry),
+        fn.SUM(Row.used_recording),
+        Value(0),
+        Value(0),
+        fn.SUM(Row.used_other),
+        total(free & index.is_copy(), Row.used_freed),
+        total(free & Row.status.in_(("interrupted", "failed")), Row.used_freed),
+        total(free, Row.used_left_over),
+    ]
 
 
 def _keep(fresh: Sequence[tuple[dict[str, Any], Contents]]) -> None:
@@ -150,30 +283,6 @@ def _keep(fresh: Sequence[tuple[dict[str, Any], Contents]]) -> None:
     ]
     with contextlib.suppress(DatabaseError, OSError), contextlib.closing(opened(lambda _: None)) as database:
         keep_usage(database, values)
-
-
-def totals(found: Sequence[Usage]) -> dict[str, int]:
-    """Return the bytes that runs use, by what they are."""
-    return {
-        "recording": sum(usage.contents.recording for usage in found),
-        "exports": sum(usage.exports for usage in found),
-        "restored": sum(usage.restored for usage in found),
-        "other": sum(usage.contents.other for usage in found),
-        "total": sum(usage.total for usage in found),
-    }
-
-
-def freeable_of(found: Sequence[Usage], recordings: Sequence[Path]) -> dict[str, int]:
-    """Return the bytes that could be freed, by what they are; not those of runs that are to stay."""
-    free = [u for u in found if KEEP not in u.row["tags"].split() and u.row["status"] != "running"]
-    cut_off = [contents_of(stray) for root in recordings for stray in strays(root)]
-    return {
-        "same_content": sum(u.contents.freed for u in free if u.row["same_as"]),
-        "unfinished": sum(u.contents.freed for u in free if u.row["status"] in ("interrupted", "failed")),
-        "left_over": sum(u.contents.left_over for u in free),
-        "cached": sum(u.exports + u.restored for u in found),
-        "half_removed": sum(contents.recording + contents.other for contents in cut_off),
-    }
 
 
 def strays(root: Path) -> list[Path]:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 from fastapi import APIRouter, Request, Response
 
-from runner.runs.catalogue.columns import with_originals
 from runner.runs.catalogue.filters import Filter
-from runner.runs.catalogue.usage import USED_BY, freeable_of, totals, usages
+from runner.runs.catalogue.usage import sizes, usage_of
 from runner.service.dependencies import CatalogueOf, JobsOf, SettingsOf
 from runner.service.pages.rendering import page
-
-if TYPE_CHECKING:
-    from runner.runs.catalogue.index import Index
 
 router = APIRouter(include_in_schema=False)
 
@@ -33,18 +29,14 @@ FREED_BY: Final = {
 @router.get("/disk")
 def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: JobsOf) -> Response:
     """Show what uses the disk, and what could be freed."""
-
-    def work(index: Index) -> list[dict[str, Any]]:
-        return with_originals(index.select(Filter(None), columns=USED_BY), index)
-
-    found = usages(catalogue.read(work))
-    freeable = freeable_of(found, settings.recordings)
+    largest, sums = usage_of(catalogue.read, Filter(None), ROWS)
+    freeable = sums.freeable(settings.recordings)
     return page(
         request,
         "disk.html",
-        total=totals(found),
+        total=sums.by_kind(),
         free=jobs.standing().free_bytes,
         freeable=[(*FREED_BY[kind], size) for kind, size in freeable.items() if size],
-        rows=[{"row": usage.row, "sizes": totals([usage])} for usage in found[:ROWS]],
-        left=len(found) - ROWS,
+        rows=[{"row": usage.row, "sizes": sizes([usage])} for usage in largest],
+        left=sums.runs - len(largest),
     )
