@@ -1,4 +1,7 @@
-"""How long the catalogue takes: `ls` over ten thousand runs, and reading a thousand recordings anew."""
+"""How long the catalogue takes: `ls` over ten thousand runs, and reading a thousand recordings anew.
+
+`python -m benchmarks.bench_catalogue 100000` measures commands over so many runs, and their peak memory.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import json
 import os
 import random
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,6 +23,17 @@ from runner.util.cache import CACHE_VARIABLE
 LISTED, RECORDED = 10_000, 1_000
 SMALL = ("episodes=30", "env.kwargs={max_episode_steps: 40}", "evaluation.every=10", "evaluation.trials=5")
 FILTER = "status:finished config.discount:>0.5 NOT tag:keep"
+DISK = """
+import sys
+from pathlib import Path
+from runner.runs.catalogue.filters import Filter
+from runner.runs.catalogue.index import look
+from runner.runs.catalogue.usage import usage_of
+place = Path(sys.argv[2])
+_, sums = usage_of(lambda work: look([place], work, as_known=True), Filter(None), 50)
+sums.freeable([place])
+"""
+"""The work of the page `/disk` in a process of its own; what the service looked at before is not repeated."""
 OLD = 1_700_000_000
 """When the files were last changed, as far as can be seen: an index need not read them twice."""
 
@@ -61,6 +76,31 @@ def measure(quick: bool) -> list[Figure]:
     ]
 
 
+def measure_many(count: int) -> list[Figure]:
+    """Return processor seconds and peak memory of commands over very many runs without recordings."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {CACHE_VARIABLE: f"{folder}/cache", "COLUMNS": "120"}
+        place = many(one_run(Path(folder, "one")), Path(folder, "many"), count, recordings=False)
+
+        def measured(name: str, *words: str, times: int = 1) -> list[Figure]:
+            line = [*words, "--recordings", str(place)]
+            done = [run(line, environment) for _ in range(times)]
+            seconds, peaks = [each.cpu_seconds for each in done], [each.peak_megabytes for each in done]
+            return [
+                figure(name, seconds, "s", higher_is_better=False, detail=f"{count:,} runs; processor time"),
+                figure(f"  peak memory of {name}", peaks, "MB", higher_is_better=False),
+            ]
+
+        return [
+            *measured("reindex", *command("reindex")),
+            *measured("first du", *command("du")),
+            *measured("du", *command("du"), times=3),
+            *measured("what /disk calls", sys.executable, "-c", DISK, times=3),
+            *measured("prune --dry-run", *command("prune", "--older-than", "1d", "--dry-run")),
+            *measured("ls --json", *command("ls", "--json")),
+        ]
+
+
 def one_run(folder: Path) -> Path:
     """Return the folder of a small run."""
     run(run_command("cooperative", str(folder), *SMALL))
@@ -93,3 +133,8 @@ def age(paths: Iterable[Path]) -> None:
     """Make files look as if they had last changed long ago."""
     for path in paths:
         os.utime(path, (OLD, OLD))
+
+
+if __name__ == "__main__":
+    for each in measure_many(int(sys.argv[1])):
+        print(f"{each.what:40} {each.value:10.2f} {each.unit}")
