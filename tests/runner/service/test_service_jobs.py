@@ -310,7 +310,7 @@ def test_a_cancelled_job_is_not_forgotten_while_its_worker_closes(client, submit
     number = submit(ENDLESS)
     job_until(client, number, lambda job: job["progress"] is not None)
     with jobs._lock:  # the worker's end is not taken in before the next job is there
-        client.post(f"/api/v1/jobs/{number}/cancel")
+        jobs.cancel(number)
         other = jobs.submit(json.dumps(CONFIG | {"seeds": [0]})).number
     job_until(client, other, lambda job: job["state"] == "finished")
 
