@@ -9,6 +9,7 @@ steps make them); by the installed environment, whether the run can be reproduce
 from __future__ import annotations
 
 import json
+import os
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -138,9 +139,13 @@ def verify(
 def _holds_nothing_yet(path: Path) -> bool:
     """Return whether a recording is cut off before its first messages, and good as far as it goes."""
     try:
+        with open_regular(path) as stream:
+            stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
+            if stream.tell() and stream.read() == MCAP0_MAGIC:
+                return False  # it was closed: a damaged length may look like a cut
         contents = checked_survey(path)
         return not contents.chunks and may_be_cut(path, contents)
-    except RecordingError:
+    except (RecordingError, OSError):
         return False
 
 

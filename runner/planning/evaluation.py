@@ -122,7 +122,8 @@ def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
     """Return what the outcomes of chosen actions come to."""
     starts = np.flatnonzero(mdp.start > 0)
     weights = mdp.start[starts]
-    if ((chosen.probability > 0).sum(axis=1) == 1).all():
+    certain = ((chosen.probability > 0).sum(axis=1) == 1).all()
+    if certain and np.isin(chosen.penalty, (0, 1)).all():  # merged outcomes may be penalties by chance
         return _deterministic(chosen, starts, weights, mdp.step_limit, discount, bool(mdp.success_mask))
     return _stochastic(chosen, starts, weights, mdp.step_limit, discount, bool(mdp.success_mask))
 

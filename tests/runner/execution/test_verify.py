@@ -386,3 +386,15 @@ def test_names_that_stand_in_a_recording_twice_are_compared(run, tmp_path):
 
     finding = verify(altered(run.recording, tmp_path / "b.mcap", None, id, run=others)).finding
     assert "metadata run: agents" in finding
+
+
+def test_a_closed_recording_with_a_damaged_length_is_not_taken_for_an_interrupted_one(lake, tmp_path):
+    """The length of the record before the first chunk is made so large that the walk ends there."""
+    data = bytearray(lake.recording.read_bytes())
+    length = data.index(b"provenance") - 4 - 8
+    data[length + 4] ^= 1
+    path = tmp_path / "changed.mcap"
+    path.write_bytes(data)
+    found = verify(path)
+    assert not found.nothing_yet
+    assert not found.sound

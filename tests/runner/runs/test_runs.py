@@ -122,7 +122,7 @@ def test_several_runs_of_a_name_are_told(folder):
     made = [create_run(folder, CONFIG, seed) for seed in (1, 2)]
     with pytest.raises(RunNotFound, match=r"'some' answers to 2 runs; .* by some@latest") as caught:
         find_run("some", folder)
-    assert all(f"{run.run_id}  some  seed {run.seed}" in str(caught.value) for run in made)
+    assert all(f"{run.run_id}  some, seed {run.seed}" in str(caught.value) for run in made)
 
 
 @pytest.mark.parametrize("name", ["nothing", "nothing@latest", "@latest", ""])

@@ -106,8 +106,10 @@ def test_a_running_job_is_cancelled_and_goes_on_when_it_is_resumed(client, submi
     number = submit(config)
     job_until(client, number, lambda job: (job["progress"] or {}).get("episode", 0) > 0)
     begun = job(client, number)["begun"][0]["run_id"]
-    listed = client.get("/api/v1/runs").json()["runs"]
-    assert {run["run_id"]: run["status"] for run in listed}[begun] == "running"
+    until(
+        lambda listed: {run["run_id"]: run["status"] for run in listed}.get(begun) == "running",
+        lambda: client.get("/api/v1/runs").json()["runs"],
+    )
     cancelled = client.post(f"/api/v1/jobs/{number}/cancel").json()
     assert cancelled["state"] == "cancelled"
     again = client.post(f"/api/v1/jobs/{number}/cancel")
