@@ -91,7 +91,7 @@ def run_all(
     experiment = experiment_of(config, overrides)
     if at_once == 1:
         return _run_jobs(experiment, name, recordings, report)
-    return _run_abreast(experiment, name, recordings, report, at_once)
+    return _run_parallel(experiment, name, recordings, report, at_once)
 
 
 def experiment_of(config: Config, overrides: Sequence[str] = (), seed: int | None = None) -> ExperimentConfig:
@@ -121,7 +121,7 @@ def jobs_in(config: ExperimentConfig, recordings: Path) -> Iterator[Job]:
     return jobs_of(config)
 
 
-def abreast(
+def run_parallel(
     jobs: Iterable[Job],
     folder: Path,
     name: str | None,
@@ -221,7 +221,7 @@ def _run_jobs(
         yield _run_job(job, folder, called, report)
 
 
-def _run_abreast(
+def _run_parallel(
     config: ExperimentConfig,
     name: str | None,
     recordings: str | os.PathLike[str] | None,
@@ -230,7 +230,7 @@ def _run_abreast(
 ) -> Iterator[Run]:
     called, folder = checked_name(name), recordings_folder(recordings)
     with interruptible() as interrupt:
-        for run in abreast(jobs_in(config, folder), folder, called, at_once, interrupt, report):
+        for run in run_parallel(jobs_in(config, folder), folder, called, at_once, interrupt, report):
             if interrupt.came:
                 raise KeyboardInterrupt(f"runs were interrupted; what they recorded is in {folder}")
             yield run

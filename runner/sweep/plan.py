@@ -20,7 +20,7 @@ from runner.sweep.model import Limits, Sweep
 from runner.sweep.readings import curve_of
 from runner.sweep.search import Search
 from runner.sweep.task import Task
-from runner.sweep.trials import Room, Standing
+from runner.sweep.trials import Room, SweepStatus
 from runner.util.humanize import size
 
 BYTES_AN_EPISODE: Final = 40
@@ -127,16 +127,16 @@ def room(limits: Limits, plan: Plan, recordings: Path, before: int) -> Room:
         before: the sweep's runs that there were.
     """
 
-    def reason(standing: Standing, task: Task) -> str:
-        runs = before + standing.begun - standing.gone_on
-        under_way = (standing.running + 1) * plan.bytes_a_run
+    def reason(status: SweepStatus, task: Task) -> str:
+        runs = before + status.begun - status.resumed
+        under_way = (status.running + 1) * plan.bytes_a_run
         if limits.runs is not None and not task.run_id and runs >= limits.runs:
             return f"limits.runs: {limits.runs:,} runs were begun"
-        if limits.seconds is not None and standing.seconds >= limits.seconds:
+        if limits.seconds is not None and status.seconds >= limits.seconds:
             return f"limits.seconds: {limits.seconds:g} s are over"
-        if limits.disk is not None and standing.bytes + under_way > limits.disk:
+        if limits.disk is not None and status.bytes + under_way > limits.disk:
             return (
-                f"limits.disk: {size(standing.bytes)} of {size(limits.disk)} are used, and a run needs about "
+                f"limits.disk: {size(status.bytes)} of {size(limits.disk)} are used, and a run needs about "
                 f"{size(plan.bytes_a_run)}"
             )
         if free_bytes(recordings) < under_way:

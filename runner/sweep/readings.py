@@ -100,7 +100,7 @@ def value_of(objective: Objective, curve: Curve) -> float:
             return NEVER if at is None else float(at)
 
 
-def hopeless(objective: Objective, curve: Curve, bounds: Mapping[int, float]) -> bool:
+def should_prune(objective: Objective, curve: Curve, bounds: Mapping[int, float]) -> bool:
     """Return whether the best reading so far is worse than the last bound that a curve came to."""
     passed = [episode for episode in bounds if curve and episode <= max(curve)]
     if not passed:

@@ -25,7 +25,7 @@ from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.runs.run import Run, create_run, list_runs, unless_empty
 from runner.sweep.model import Objective
-from runner.sweep.readings import Curve, curve_of, hopeless, readings
+from runner.sweep.readings import Curve, curve_of, readings, should_prune
 from runner.sweep.state import PRUNED, is_over
 
 
@@ -180,7 +180,7 @@ class _Pruning:
         self._events = mdp.event_names
         self._curve: Curve = {}
         self._seen = 0
-        self._hopeless = False
+        self._is_pruned = False
 
     def report(self, progress: Progress) -> None:
         """Look at the evaluations that are new."""
@@ -192,15 +192,15 @@ class _Pruning:
                 self._curve[metrics["episode"]] = read[self._task.objective.metric]
         self._seen = len(progress.evaluations)
         done = progress.episode >= progress.episodes
-        self._hopeless = not done and hopeless(self._task.objective, self._curve, self._task.bounds)
+        self._is_pruned = not done and should_prune(self._task.objective, self._curve, self._task.bounds)
 
     def stop(self) -> bool:
         """Return whether the run is to stop."""
-        return self._hopeless or self._stop()
+        return self._is_pruned or self._stop()
 
     def labelled(self, run: Run) -> Run:
         """Return a run, tagged if it was given up."""
-        if not self._hopeless or run.status == "finished":
+        if not self._is_pruned or run.status == "finished":
             return run
         change_labels(run.folder, lambda said: Labels(said.name, (*said.tags, PRUNED), said.note))
         return Run(run.folder, run.facts)

@@ -85,7 +85,7 @@ class Trial:
 
 
 @dataclass
-class Standing:
+class SweepStatus:
     """How far a sweep is, as its `report` is told."""
 
     runs: int
@@ -99,7 +99,7 @@ class Standing:
     """Trials whose values do not go together; they have no runs."""
     begun: int = 0
     """Runs that this process had begun, or gone on with."""
-    gone_on: int = 0
+    resumed: int = 0
     """Of them, those that were there already."""
     bytes: int = 0
     seconds: float = 0.0
@@ -108,8 +108,8 @@ class Standing:
     """Why it stopped before its end; empty if it did not."""
 
 
-Report = Callable[[Standing], None]
-Room = Callable[[Standing, Task], str]
+Report = Callable[[SweepStatus], None]
+Room = Callable[[SweepStatus, Task], str]
 
 
 class Trials:
@@ -197,7 +197,7 @@ def run_sweep(
     report: Report = lambda _: None,
     room: Room = lambda *_: "",
     accept_changes: bool = False,
-) -> tuple[Trials, Standing]:
+) -> tuple[Trials, SweepStatus]:
     """Run what is left of a sweep; return its trials, and how it stands.
 
     Args:
@@ -205,7 +205,7 @@ def run_sweep(
         recordings: the folder of its runs.
         workers: those who do the runs.
         stop: asked several times a second whether to stop.
-        report: called with the standing several times a second.
+        report: called with the status several times a second.
         room: says why a task may not be begun; empty if it may.
         accept_changes: go on with runs that were begun by other code.
 
@@ -213,19 +213,19 @@ def run_sweep(
         RunnerError: a run that is there cannot be read.
     """
     trials = Trials(sweep)
-    standing = Standing(trials.search.trials * len(sweep.seeds), trials.search.trials)
+    status = SweepStatus(trials.search.trials * len(sweep.seeds), trials.search.trials)
     watch = Watch(stop, report, room)
     record = _Record(sweep, recordings)
     while batch := trials.ask():
-        work = _Batch(sweep, batch, recordings, standing, record)
+        work = _Batch(sweep, batch, recordings, status, record)
         work.prepare(trials.bounds(), accept_changes)
         work.run(workers, watch)
-        if standing.stopped:
+        if status.stopped:
             break
         trials.tell(batch)
-        standing.best = trials.best()
-    report(standing)
-    return trials, standing
+        status.best = trials.best()
+    report(status)
+    return trials, status
 
 
 @dataclass(frozen=True)
@@ -245,11 +245,11 @@ class _Batch:
         sweep: Sweep,
         batch: list[Trial],
         recordings: Path,
-        standing: Standing,
+        status: SweepStatus,
         record: _Record,
     ) -> None:
         self._sweep, self._batch, self._recordings = sweep, batch, recordings
-        self._standing, self._record = standing, record
+        self._status, self._record = status, record
         self._retried: set[str] = set()
         self._waiting: deque[Task] = deque()
 
@@ -258,8 +258,8 @@ class _Batch:
         tasks: dict[str, Task] = {}
         for trial in self._batch:
             if trial.error:
-                self._standing.excluded += 1
-                self._standing.runs -= len(self._sweep.seeds)
+                self._status.excluded += 1
+                self._status.runs -= len(self._sweep.seeds)
             for seed, identity in trial.identities.items():
                 result = self._record.result_of(identity)
                 if result is None:
@@ -271,32 +271,32 @@ class _Batch:
         self._waiting.extend(sorted(tasks.values(), key=lambda task: not task.run_id))
 
     def run(self, workers: Workers, watch: Watch) -> None:
-        """Have every run done; or say in the standing why not, when those under way have come to rest."""
-        began, before = time.monotonic(), self._standing.seconds
-        standing = self._standing
-        while standing.running or (self._waiting and not standing.stopped):
-            if not standing.stopped and watch.stop():
-                standing.stopped = INTERRUPTED
+        """Have every run done; or say in the status why not, when those under way have come to rest."""
+        began, before = time.monotonic(), self._status.seconds
+        status = self._status
+        while status.running or (self._waiting and not status.stopped):
+            if not status.stopped and watch.stop():
+                status.stopped = INTERRUPTED
                 workers.stop()
             self._give(workers, watch)
-            standing.seconds = before + time.monotonic() - began
-            watch.report(standing)
+            status.seconds = before + time.monotonic() - began
+            watch.report(status)
             for task, result in workers.collect(WAIT_SECONDS):
-                standing.running -= 1
+                status.running -= 1
                 self._take(task, result)
 
     def _give(self, workers: Workers, watch: Watch) -> None:
         """Give tasks to those who are idle, while there is room for their runs."""
-        standing = self._standing
-        while self._waiting and workers.idle and not standing.stopped:
+        status = self._status
+        while self._waiting and workers.idle and not status.stopped:
             task = self._waiting[0]
-            standing.stopped = watch.room(standing, task)
-            if not standing.stopped:
+            status.stopped = watch.room(status, task)
+            if not status.stopped:
                 workers.give(self._waiting.popleft())
-                standing.running += 1
+                status.running += 1
                 if task.identity not in self._retried:
-                    standing.begun += 1
-                    standing.gone_on += bool(task.run_id)
+                    status.begun += 1
+                    status.resumed += bool(task.run_id)
 
     def _take(self, task: Task, result: Result | None) -> None:
         """Take in what came of a task; that of a worker that died is tried once more."""
@@ -307,7 +307,7 @@ class _Batch:
             return
         result = result or Result("failed", task.run_id, error="its worker died twice")
         if result.status == "interrupted":
-            self._standing.stopped = self._standing.stopped or INTERRUPTED
+            self._status.stopped = self._status.stopped or INTERRUPTED
         self._record.note(task.identity, result)
         for trial in self._batch:
             for seed, identity in trial.identities.items():
@@ -316,11 +316,11 @@ class _Batch:
                     self._count(result)
 
     def _count(self, result: Result) -> None:
-        standing = self._standing
-        standing.bytes += self._record.weigh(result)
-        standing.done += result.status in ("finished", "pruned")
-        standing.pruned += result.status == "pruned"
-        standing.failed += result.status == "failed"
+        status = self._status
+        status.bytes += self._record.weigh(result)
+        status.done += result.status in ("finished", "pruned")
+        status.pruned += result.status == "pruned"
+        status.failed += result.status == "failed"
 
     def _task(self, trial: Trial, seed: int, bounds: Curve) -> Task:
         identity = trial.identities[seed]

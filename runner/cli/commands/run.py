@@ -103,7 +103,7 @@ def command(
     if at_once > 1:
         if live or live_every or live_url:
             raise click.UsageError("--live shows one run at a time: leave out --at-once.")
-        _run_abreast(ctx, experiment, folder, called, at_once, as_json)
+        _run_parallel(ctx, experiment, folder, called, at_once, as_json)
         return
     watch = _watcher(experiment, live, live_every, live_url)
     for number, job in enumerate(jobs_in(experiment, folder)):
@@ -122,11 +122,11 @@ def _tell(run: Run, number: int, as_json: bool) -> None:
     sys.stdout.flush()
 
 
-def _run_abreast(
+def _run_parallel(
     ctx: click.Context, config: ExperimentConfig, folder: Path, name: str | None, at_once: int, as_json: bool
 ) -> None:
     """Run an experiment's seeds side by side, and tell of each run."""
-    from runner.api import abreast, interruptible, jobs_in
+    from runner.api import interruptible, jobs_in, run_parallel
     from runner.cli.progress import counting
     from runner.environments.loading import load_mdp
 
@@ -138,7 +138,7 @@ def _run_abreast(
         announcing(),
         counting("runs", len(config.seeds)) as done,
     ):
-        for run in abreast(jobs_in(config, folder), folder, name, at_once, interrupt):
+        for run in run_parallel(jobs_in(config, folder), folder, name, at_once, interrupt):
             runs.append(run)
             done(len(runs))
             _tell(run, len(runs) - 1, as_json)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from runner.sweep.local import Workers
     from runner.sweep.model import Sweep
     from runner.sweep.plan import Plan
-    from runner.sweep.trials import Standing, Trials
+    from runner.sweep.trials import SweepStatus, Trials
 
 START: Final = "start"
 
@@ -147,7 +147,7 @@ def start(
             state.begin(sweep, folder, resuming, accept_changes)
             if retry_failed:
                 state.forget_failures(sweep.name, folder)
-            trials, standing = run_sweep(
+            trials, status = run_sweep(
                 sweep,
                 folder,
                 those,
@@ -156,8 +156,8 @@ def start(
                 room=room(sweep.file.limits, plan, folder, before),
                 accept_changes=accept_changes,
             )
-    _tell(sweep, trials, standing, as_json)
-    if standing.stopped or standing.failed:
+    _tell(sweep, trials, status, as_json)
+    if status.stopped or status.failed:
         ctx.exit(INTERRUPTED if interrupt.came else 1)
 
 
@@ -273,7 +273,7 @@ def _workers(count: int | None, ray: str | None, runs: int) -> Iterator[Workers]
 
 @contextlib.contextmanager
 def _table(sweep: Sweep) -> Iterator[Any]:
-    """Give what is told the standing: it keeps a table up to date, where there is a terminal."""
+    """Give what is told the status: it keeps a table up to date, where there is a terminal."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return
@@ -281,28 +281,28 @@ def _table(sweep: Sweep) -> Iterator[Any]:
     from rich.live import Live
 
     with Live(console=Console(stderr=True, highlight=False), transient=True, refresh_per_second=4) as live:
-        yield lambda standing: live.update(facts(_standing(sweep, standing)))
+        yield lambda status: live.update(facts(_status(sweep, status)))
 
 
-def _standing(sweep: Sweep, standing: Standing) -> dict[str, str]:
+def _status(sweep: Sweep, status: SweepStatus) -> dict[str, str]:
     """Return how a sweep stands, in words."""
     from runner.cli.output import duration
     from runner.sweep.results import reading, words
 
-    left = standing.runs - standing.done - standing.failed
-    here = standing.begun - standing.running
-    rate = here / standing.seconds if standing.seconds and here > 0 else 0.0
-    bar = "█" * round(20 * standing.done / max(standing.runs, 1))
+    left = status.runs - status.done - status.failed
+    here = status.begun - status.running
+    rate = here / status.seconds if status.seconds and here > 0 else 0.0
+    bar = "█" * round(20 * status.done / max(status.runs, 1))
     told = {
-        sweep.name: f"{bar:░<20} {standing.done:,} of {standing.runs:,} runs, {standing.running} running"
-        + (f", {standing.pruned:,} given up" if standing.pruned else "")
-        + (f", {standing.excluded:,} trials left out" if standing.excluded else "")
-        + (f", {standing.failed:,} failed" if standing.failed else ""),
+        sweep.name: f"{bar:░<20} {status.done:,} of {status.runs:,} runs, {status.running} running"
+        + (f", {status.pruned:,} given up" if status.pruned else "")
+        + (f", {status.excluded:,} trials left out" if status.excluded else "")
+        + (f", {status.failed:,} failed" if status.failed else ""),
         "rate": (f"{rate:.1f} runs/s, {duration(left / rate)} left" if rate else "–")
-        + f", {duration(standing.seconds)} so far, {size(standing.bytes)} of disk",
+        + f", {duration(status.seconds)} so far, {size(status.bytes)} of disk",
     }
-    if standing.best is not None:
-        told["best"] = f"{reading(standing.best.value)} with {words(standing.best.values)}"
+    if status.best is not None:
+        told["best"] = f"{reading(status.best.value)} with {words(status.best.values)}"
     return told
 
 
@@ -338,7 +338,7 @@ def _described(parameter: Any) -> str:
     return f"{parameter.low:g} to {parameter.high:g}{kind}"
 
 
-def _tell(sweep: Sweep, trials: Trials, standing: Standing, as_json: bool) -> None:
+def _tell(sweep: Sweep, trials: Trials, status: SweepStatus, as_json: bool) -> None:
     """Say what came of it."""
     from runner.analysis.compare.statistics import bounded
     from runner.sweep.results import reading, words
@@ -349,24 +349,24 @@ def _tell(sweep: Sweep, trials: Trials, standing: Standing, as_json: bool) -> No
         print_json(
             {
                 "name": sweep.name,
-                "runs": standing.runs,
-                "done": standing.done,
-                "pruned": standing.pruned,
-                "failed": standing.failed,
-                "excluded": standing.excluded,
-                "stopped": standing.stopped or None,
-                "seconds": round(standing.seconds, 3),
-                "bytes": standing.bytes,
+                "runs": status.runs,
+                "done": status.done,
+                "pruned": status.pruned,
+                "failed": status.failed,
+                "excluded": status.excluded,
+                "stopped": status.stopped or None,
+                "seconds": round(status.seconds, 3),
+                "bytes": status.bytes,
                 "best": best and {"trial": best.number, "value": value, "values": best.values},
             }
         )
     else:
-        told = _standing(sweep, standing)
+        told = _status(sweep, status)
         if best is not None:
             told["best"] = f"{reading(best.value)} in trial {best.number}: {words(best.values)}"
         draw(facts(told | {"next": f"dualtaxi sweep show {sweep.name}"}))
     for trial in trials.told:
         for error in trial.errors if trial.state == "failed" else ():
             say(f"Failed: trial {trial.number}, {error}")
-    if standing.stopped:
-        say(f"Stopped: {standing.stopped}. --resume goes on from there.")
+    if status.stopped:
+        say(f"Stopped: {status.stopped}. --resume goes on from there.")

@@ -21,7 +21,7 @@ from runner.service.jobs.spec import (
 if TYPE_CHECKING:
     from runner.sweep.local import Workers
     from runner.sweep.task import Result, Task
-    from runner.sweep.trials import Standing
+    from runner.sweep.trials import SweepStatus
 
 
 def do_sweep(order: Order, line: Line) -> Outcome:
@@ -154,13 +154,13 @@ class _SweepTelling:
         self._line = line
         self._last, self._best = 0.0, -1
 
-    def report(self, standing: Standing) -> None:
+    def report(self, standing: SweepStatus) -> None:
         """Take in how the sweep stands."""
         if time.monotonic() - self._last >= TELL_SECONDS:
             self._last = time.monotonic()
             self.tell(standing)
 
-    def tell(self, standing: Standing) -> None:
+    def tell(self, standing: SweepStatus) -> None:
         """Pass it on."""
         best = standing.best
         if best is not None and best.number != self._best:
