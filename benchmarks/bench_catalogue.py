@@ -18,7 +18,7 @@ from benchmarks.bench_cold_start import command
 from benchmarks.figures import Figure, figure
 from benchmarks.processes import run, run_command
 from runner.runs.run import RUN_FILE, list_runs
-from runner.util.cache import CACHE_VARIABLE
+from runner.util.files import CACHE_VARIABLE
 
 LISTED, RECORDED = 10_000, 1_000
 SMALL = ("episodes=30", "env.kwargs={max_episode_steps: 40}", "evaluation.every=10", "evaluation.trials=5")

@@ -10,7 +10,7 @@ from typing import Final
 from benchmarks.bench_catalogue import LISTED, many, one_run
 from benchmarks.figures import Figure, figure
 from benchmarks.serving import asked, serving
-from runner.util.cache import CACHE_VARIABLE
+from runner.util.files import CACHE_VARIABLE
 
 COLD: Final = (1000, 300)
 """Milliseconds: at least, and aim."""

@@ -10,7 +10,7 @@ from typing import Final
 from benchmarks.bench_catalogue import LISTED, many, one_run
 from benchmarks.figures import Figure
 from benchmarks.serving import Service, asked, memory_of, percentile, serving
-from runner.util.cache import CACHE_VARIABLE
+from runner.util.files import CACHE_VARIABLE
 
 CLIENTS: Final = 20
 MEDIAN: Final = (60, 20)

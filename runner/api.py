@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 from runner.config import ConfigError, ExperimentConfig, RunTable, from_mapping, load
 from runner.config.job import Job, jobs_of
 from runner.runs.run import Run, create_run, recordings_folder, unless_empty
-from runner.util.names import checked_name
+from runner.util.values import checked_name
 
 if TYPE_CHECKING:  # both are imported late: a run is to stand on disk before NumPy and Numba are loaded
     from runner.execution.session import Progress

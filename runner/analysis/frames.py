@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from runner.errors import RecordingError
 from runner.runs.run import Run
 from runner.util.extras import require
+from runner.util.values import flatten
 
 if TYPE_CHECKING:
     import numpy as np
@@ -57,12 +58,8 @@ def evaluations(run: Source) -> pd.DataFrame:
         RecordingError: the recording cannot be read.
     """
     with _opened(run) as recording:
-        return _frame(
-            [
-                _flat(record, {"events": "", "mean_returns": "mean_return."})
-                for record in evaluation_records(recording)
-            ]
-        )
+        records = [_flat(record) for record in evaluation_records(recording)]
+        return _frame([{_evaluation_column(key): value for key, value in each.items()} for each in records])
 
 
 def training(run: Source) -> pd.DataFrame:
@@ -73,7 +70,7 @@ def training(run: Source) -> pd.DataFrame:
         RecordingError: the recording cannot be read.
     """
     with _opened(run) as recording:
-        return _frame([_flat(record, {}) for record in training_records(recording)])
+        return _frame([_flat(record) for record in training_records(recording)])
 
 
 def episodes(
@@ -427,16 +424,14 @@ def _frame(data: Any) -> pd.DataFrame:
     return frame
 
 
-def _flat(record: Mapping[str, Any], prefixes: Mapping[str, str]) -> dict[str, Any]:
-    """Return a record with its mappings spread out; what is unknown (None) is NaN."""
-    flat: dict[str, Any] = {}
-    for key, value in record.items():
-        if isinstance(value, Mapping):
-            before = prefixes.get(key, f"{key}.")
-            flat |= {f"{before}{name}": part for name, part in _flat(value, {}).items()}
-        else:
-            flat[key] = math.nan if value is None else value
-    return flat
+def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a record by dotted key; an unknown one (None) is NaN."""
+    return {key: math.nan if value is None else value for key, value in flatten(record).items()}
+
+
+def _evaluation_column(key: str) -> str:
+    """Return the column of a value of an evaluation: events by their own names, returns by agent."""
+    return key.removeprefix("events.").replace("mean_returns.", "mean_return.", 1)
 
 
 def _plain_columns(records: NDArray[np.void], names: Sequence[str]) -> dict[str, Any]:

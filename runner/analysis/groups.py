@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from runner.analysis.series import RunSeries, is_loop
 from runner.util.humanize import listed
+from runner.util.values import flatten
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ def groups_of(series: Sequence[RunSeries]) -> list[Group]:
     for run in series:
         content = {key: value for key, value in run.config.items() if key not in ("seeds", "recording")}
         found.setdefault(f"{run.name} {json.dumps(content, sort_keys=True)}", []).append(run)
-    flat = [dict(flat_config(runs[0].config)) for runs in found.values()]
+    flat = [flat_config(runs[0].config) for runs in found.values()]
     names = [runs[0].name for runs in found.values()]
     labels = [label_of(i, names, flat) for i in range(len(names))]
     once = [each_once(runs, sameness) for runs in found.values()]
@@ -90,12 +91,6 @@ def label_of(own: int, names: Sequence[str], flat: Sequence[Mapping[str, Any]]) 
     return f"{names[own]}, {told}" if told else names[own]
 
 
-def flat_config(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of a configuration by dotted key."""
-    for key, value in values.items():
-        if key in ("seeds", "name") and not prefix:
-            continue
-        if isinstance(value, Mapping):
-            yield from flat_config(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+def flat_config(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a configuration by dotted key, without name and seeds."""
+    return flatten({key: value for key, value in config.items() if key not in ("seeds", "name")})

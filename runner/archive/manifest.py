@@ -11,11 +11,11 @@ from typing import Any, Final
 from blake3 import blake3
 
 from runner.archive.layout import FORMAT, MANIFEST, VERSION
-from runner.environments.scene import is_whole
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.digest import combine
-from runner.util.hashing import hash_of
+from runner.util.files import hash_of
+from runner.util.values import is_whole
 
 MAX_MANIFEST_BYTES: Final = 1 << 20
 _MOST: Final = 2**53

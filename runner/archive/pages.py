@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, Final
 import pyarrow.parquet as pq
 
 from runner.errors import RecordingError
-from runner.util.opening import open_regular
+from runner.util.files import open_regular
 
 _MAX_HEADER_BYTES: Final = 1 << 15
 _MAX_DEPTH: Final = 8

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from runner.errors import RecordingError, StorageError
 from runner.runs.run import RUN_FILE, Run
-from runner.util.cache import CACHE_VARIABLE, RESTORED, cache_folder
+from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder
 
 ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
 KEPT: Final = 8

@@ -24,7 +24,7 @@ from runner.errors import RecordingError
 from runner.recording.index import UNPACKED_A_BYTE
 from runner.recording.metadata import check_run, environment_of, environment_said, json_object, kind_of
 from runner.recording.schema import Topic
-from runner.util.opening import open_regular
+from runner.util.files import open_regular
 
 MAX_DESCRIPTION_BYTES: Final = 64 << 20
 MAX_ROWS_A_GROUP: Final = 1 << 21

@@ -22,7 +22,7 @@ from runner.archive.rows import message_payload
 from runner.config import from_mapping
 from runner.config.loading import packing_from
 from runner.config.sections import Recording as Plan
-from runner.errors import RecordingError, StorageError
+from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.batching import Piles
 from runner.recording.blocks import HEADER_BYTES, message_record
@@ -36,6 +36,7 @@ from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 from runner.replay.snapshots import DerivedTables, SnapshotVisitor
 from runner.replay.tables import StepReplay
+from runner.util.files import storage_errors
 
 _ROWS_AT_ONCE: Final = 1024
 _MOST_STEPS: Final = 2**63 // STEP_NANOSECONDS
@@ -58,13 +59,10 @@ def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: 
     archive = Archive(folder)
     archive.check_files()
     try:
-        with RecordingFile(path, schema.KINDS[archive.kind]) as file:
+        with storage_errors(path), RecordingFile(path, schema.KINDS[archive.kind]) as file:
             _Restoring(archive, file, report).restore()
         with open_recording(path):  # what cannot be read is not restored
             pass
-    except OSError as error:
-        path.unlink(missing_ok=True)
-        raise StorageError(f"{path}: cannot be written ({error.strerror}).") from error
     except BaseException:
         path.unlink(missing_ok=True)
         raise

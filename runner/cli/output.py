@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
-from runner.util.files import finite
 from runner.util.humanize import UNKNOWN, age, amount, duration, number, size
+from runner.util.values import finite
 
 if TYPE_CHECKING:  # imported when something is drawn
     from rich.console import Console, RenderableType

@@ -22,7 +22,7 @@ from runner.client.pull import pull
 from runner.client.upload_source import Parcel, Sent
 from runner.errors import RunnerError
 from runner.runs.run import Run
-from runner.util.hashing import hash_of
+from runner.util.files import hash_of
 
 if TYPE_CHECKING:
     import httpx2

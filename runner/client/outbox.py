@@ -25,7 +25,7 @@ from runner.client.upload_source import Sent
 from runner.errors import RunnerError
 from runner.runs.locking import locked
 from runner.runs.run import Run, list_runs
-from runner.util.files import read_object, write_whole
+from runner.util.files import read_object, write_object
 
 OUTBOX_VARIABLE: Final = "DUALTAXI_OUTBOX"
 STATE_VARIABLE: Final = "XDG_STATE_HOME"
@@ -154,7 +154,7 @@ def connected(url: str) -> Client:
 
 def _note(run: Run, server: str, upload: str | None) -> None:
     with contextlib.suppress(OSError):  # without it, all is sent anew
-        write_whole(run.folder / PUSH_FILE, {"server": server, "upload": upload})
+        write_object(run.folder / PUSH_FILE, {"server": server, "upload": upload})
 
 
 def _read(run: Run) -> dict[str, object]:

@@ -28,7 +28,7 @@ from runner.config.problems import found, problems_in, refuse
 from runner.config.sections import Recording
 from runner.config.shipped import config_path, suggestion
 from runner.errors import ConfigError
-from runner.util.names import NAME_EXPECTED, NAME_PATTERN
+from runner.util.values import NAME_EXPECTED, NAME_PATTERN
 
 MAX_BYTES = 1 << 20
 """The largest file that is read; a configuration of a thousand lines is a twentieth of it."""

@@ -22,7 +22,7 @@ from runner.config.sections import (
     WolfPhc,
 )
 from runner.config.values import Section, refusal
-from runner.util.names import NAME_EXPECTED, NAME_PATTERN
+from runner.util.values import NAME_EXPECTED, NAME_PATTERN
 
 Mode = Literal["cooperative", "competitive"]
 Algorithm = Literal[

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.scene import is_text, is_whole, scene_mistake
+from runner.environments.scene import scene_mistake
 from runner.errors import EnvironmentNotUsable
+from runner.util.values import is_text, is_whole
 
 MAX_EVENTS = 31
 MAX_AGENTS = 31

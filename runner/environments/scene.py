@@ -13,21 +13,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.util.values import is_text, is_whole
+
 MAX_CELLS: Final = 2**15 - 1
 """Cells are numbered in int16."""
-MAX_TEXT: Final = 200
 _COLOUR: Final = re.compile(r"#[0-9A-Fa-f]{6}")
 _KEYS: Final = {"rows", "columns", "walls", "landmarks", "things", "actions"}
-
-
-def is_text(value: Any) -> bool:
-    """Return whether this is a short text that can be printed."""
-    return isinstance(value, str) and 0 < len(value) <= MAX_TEXT and value.isprintable()
-
-
-def is_whole(value: Any, low: int, high: int) -> bool:
-    """Return whether this is an integer from `low` to `high`."""
-    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
 
 
 def scene_mistake(

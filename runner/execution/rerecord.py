@@ -11,7 +11,7 @@ import numpy as np
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.environments.loading import load_mdp
-from runner.errors import Diverged, RunnerError, StorageError
+from runner.errors import Diverged, RunnerError
 from runner.execution.initial_tables import address
 from runner.execution.session import Report, Session, Stop, describe, recorder_for, run_job
 from runner.execution.verify import initial_tables
@@ -25,6 +25,7 @@ from runner.runs import run as runs
 from runner.runs.locking import locked
 from runner.runs.provenance import provenance
 from runner.runs.run import Run, unless_empty
+from runner.util.files import storage_errors
 
 Start = int | Literal["random", "each"]
 
@@ -63,11 +64,10 @@ def _rerecord(run: Run, report: Report, stop: Stop) -> Run:
     fresh = run.recording.with_suffix(".rerecording")
     started = time.monotonic()
     try:
-        fresh.unlink(missing_ok=True)
-        summary = _record(Job(config, run.seed), run, fresh, report, stop)
-        fresh.replace(run.recording)
-    except OSError as error:
-        raise StorageError(f"{fresh}: cannot be written ({error.strerror}).") from error
+        with storage_errors(fresh):
+            fresh.unlink(missing_ok=True)
+            summary = _record(Job(config, run.seed), run, fresh, report, stop)
+            fresh.replace(run.recording)
     finally:
         fresh.unlink(missing_ok=True)
     summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": run.recording.stat().st_size}

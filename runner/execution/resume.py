@@ -22,7 +22,7 @@ from runner.config.job import Job
 from runner.config.sections import RunTable
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
-from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, StorageError, kept_message
+from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, kept_message
 from runner.execution.initial_tables import configured_tables, settle
 from runner.execution.session import (
     Report,
@@ -46,6 +46,7 @@ from runner.recording.writer import RecordingFile, storage_error
 from runner.runs.locking import locked
 from runner.runs.provenance import provenance
 from runner.runs.run import RECORDING_FILE, Run, run_at
+from runner.util.files import storage_errors
 
 DECISIVE: Final = (
     *("dualtaxi", "git", "python", "machine"),
@@ -209,12 +210,10 @@ def _opened(
 ) -> Iterator[RecordingFile]:
     """Give the file to go on with: cut behind what is good of it, or begun anew where that says nothing."""
     described = bool(contents.chunks) and {entry.name for entry in contents.metadata} >= NEEDED
-    try:
+    with storage_errors(path):
         if not described:
             path.unlink(missing_ok=True)
         file = RecordingFile.reopen(path, contents) if described else RecordingFile(path)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror}).") from error
     with file:
         if not described:
             describe(file, job, run, learner)

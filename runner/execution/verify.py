@@ -40,7 +40,7 @@ from runner.recording.reference import Past
 from runner.recording.scan import Report as BytesReport
 from runner.replay.tables import initially_held
 from runner.runs.provenance import provenance
-from runner.util.opening import open_regular
+from runner.util.files import open_regular
 
 NAMES_NOT_COMPARED: Final = (
     "how its environment is described: scene, names of actions, agents, events and landmarks, step limit; "

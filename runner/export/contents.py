@@ -6,10 +6,10 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from runner.environments.scene import is_whole
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.util.values import flatten, is_whole
 
 
 def shortcomings(recording: Recording) -> list[str]:
@@ -71,10 +71,5 @@ def whole_ranges(
 
 def flat_text(config: Mapping[str, Any]) -> dict[str, str]:
     """Return a resolved configuration as flat text: `evaluation.trials` is `100`; lists as JSON."""
-    flat: dict[str, str] = {}
-    for key, value in config.items():
-        if isinstance(value, Mapping) and value:
-            flat |= {f"{key}.{inner}": text for inner, text in flat_text(value).items()}
-        else:
-            flat[key] = value if isinstance(value, str) else json.dumps(value)
-    return flat
+    flat = flatten(config, keep_empty=True)
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in flat.items()}

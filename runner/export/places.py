@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fnmatch
-import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -12,6 +11,7 @@ from pathlib import Path
 
 from runner.errors import RunnerError, StorageError
 from runner.util.extras import require
+from runner.util.files import replacing, storage_errors
 
 
 def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
@@ -22,21 +22,13 @@ def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
         StorageError: it cannot be written.
     """
     require_new(path, force)
-    fresh = path.with_name(f".{secrets.token_hex(4)}.{path.name}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except FileExistsError as error:
-        raise StorageError(f"{path}: {path.parent} is a file, expected a folder.") from error
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
-    try:
-        write(fresh)
-        fresh.replace(path)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        if os.path.lexists(fresh):
-            fresh.unlink()
+    with storage_errors(path):
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except FileExistsError as error:
+            raise StorageError(f"{path}: {path.parent} is a file, expected a folder.") from error
+        with replacing(path) as fresh:
+            write(fresh)
 
 
 def require_new(path: Path, force: bool) -> None:
@@ -77,13 +69,12 @@ def new_folder(path: Path, force: bool, ours: Sequence[str]) -> Iterator[Path]:
     fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     old = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        fresh.mkdir(parents=True)
-        yield fresh
-        if path.exists():
-            path.rename(old)
-        fresh.rename(path)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
+        with storage_errors(path):
+            fresh.mkdir(parents=True)
+            yield fresh
+            if path.exists():
+                path.rename(old)
+            fresh.rename(path)
     finally:
         for folder in (fresh, old):
             shutil.rmtree(folder, ignore_errors=True)

@@ -39,6 +39,7 @@ from runner.recording.writer import create_recording
 from runner.runs import run as runs
 from runner.runs.provenance import provenance
 from runner.runs.run import RECORDING_FILE, Run, new_run, recordings_folder, unless_empty
+from runner.util.values import is_utf8
 
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
 MAX_INFO_BYTES: Final = 1 << 20
@@ -296,7 +297,7 @@ class Loop(Generic[R]):
 
     def _log_text(self, name: str, text: str) -> None:
         _check_name(name, text)
-        if not _is_text(text):
+        if not isinstance(text, str) or not is_utf8(text):
             raise ConfigError(f"log: found {text!r} for {name!r}, expected text that is valid Unicode")
         if len(text) > MAX_ARRAY_BYTES // 4:
             raise ConfigError(
@@ -570,7 +571,7 @@ def _number(name: str, value: Any) -> float:
 
 
 def _check_name(name: Any, value: Any) -> None:
-    if not _is_text(name) or not name:
+    if not isinstance(name, str) or not is_utf8(name) or not name:
         raise ConfigError(f"log: found the name {name!r} for {value!r}, expected text that is valid Unicode")
 
 
@@ -580,7 +581,7 @@ def _arrays(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
     Raises:
         ConfigError: there is something else than numbers, or too many.
     """
-    if not _is_text(name):
+    if not isinstance(name, str) or not is_utf8(name):
         raise ConfigError(f"snapshot: found the name {name!r}, expected an array of numbers and a name.")
     if (inside := as_mapping(value)) is not None:
         for key, part in inside.items():
@@ -612,8 +613,3 @@ def _as_array(value: Any) -> NDArray[Any]:
     if values.dtype.name.startswith(("bfloat16", "float8")):
         return values.astype(np.float32)
     return values
-
-
-def _is_text(value: Any) -> bool:
-    """Return whether a value is text that UTF-8 can hold: without lone surrogates."""
-    return isinstance(value, str) and value == value.encode("utf-8", "ignore").decode()

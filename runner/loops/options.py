@@ -12,9 +12,9 @@ import numpy as np
 
 from runner.config.loading import packing_from
 from runner.config.sections import Recording
-from runner.environments.scene import is_whole
 from runner.errors import ConfigError
 from runner.loops.spaces import Described, as_json, as_mapping
+from runner.util.values import is_whole
 
 MADE_BY: Final = "runner.record"
 ALL_INFO: Final = "*"
@@ -64,7 +64,7 @@ class Plan:
         return settings
 
     def _check(self) -> None:
-        from runner.util.names import checked_run_name
+        from runner.util.values import checked_run_name
 
         expectations = (
             ("name", "text", self.name is None or isinstance(self.name, str)),

@@ -18,9 +18,9 @@ from gymnasium import spaces
 
 from runner.environments.loading import mdp_of
 from runner.environments.mdp import Mdp
-from runner.environments.scene import is_text
 from runner.errors import EnvironmentNotUsable
 from runner.recording.spaces import MAX_VALUE_BYTES
+from runner.util.values import is_text
 
 Keys = tuple[str | int, ...]
 _STATES: Final = 2**32

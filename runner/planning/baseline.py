@@ -13,8 +13,8 @@ from blake3 import blake3
 
 from runner.environments.mdp import Mdp
 from runner.planning.evaluation import evaluate_stochastic_policy, random_policy
-from runner.util.cache import cache_folder
-from runner.util.files import finite, read_object, write_whole
+from runner.util.files import cache_folder, read_object, write_object
+from runner.util.values import finite
 
 MAX_WORK: Final = 1_000_000_000
 """Outcomes of joint actions times the step limit; DualTaxi has a third of it, and takes about a second."""
@@ -88,5 +88,5 @@ def _cached(path: Path, mdp: Mdp) -> RandomBaseline:
     )
     with contextlib.suppress(OSError):  # a cache that cannot be written costs time only
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, finite(asdict(baseline)))
+        write_object(path, finite(asdict(baseline)))
     return baseline

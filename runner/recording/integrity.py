@@ -23,7 +23,7 @@ from runner.recording.blocks import HEADER, HEADER_BYTES, RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head, message_index
 from runner.recording.scan import Contents, Report, read_chunk, survey
 from runner.recording.writer import RecordingFile, schema_and_channel_bytes
-from runner.util.opening import open_regular
+from runner.util.files import open_regular
 
 Times = NDArray[np.uint64]
 

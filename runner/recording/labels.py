@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import RunnerError, StorageError
-from runner.util.files import read_object, write_whole
-from runner.util.opening import is_utf8
+from runner.util.files import read_object, storage_errors, write_object
+from runner.util.values import is_utf8
 
 LABELS_FILE: Final = "labels.json"
 LOCK_FILE: Final = "labels.lock"
@@ -85,20 +85,19 @@ def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
     """
     from filelock import FileLock, Timeout
 
-    try:
-        with FileLock(folder / LOCK_FILE, timeout=LOCK_SECONDS):
-            before = read_labels(folder)
-            after = change(before)
-            _check(after)
-            if after != before:
-                write_whole(folder / LABELS_FILE, as_json(after))
-            return after
-    except Timeout as error:
-        raise StorageError(
-            f"{folder / LOCK_FILE}: another process has held it for {LOCK_SECONDS:.0f} s; try again."
-        ) from error
-    except OSError as error:
-        raise StorageError(f"{folder / LABELS_FILE}: cannot be written ({error.strerror}).") from error
+    with storage_errors(folder / LABELS_FILE):
+        try:
+            with FileLock(folder / LOCK_FILE, timeout=LOCK_SECONDS):
+                before = read_labels(folder)
+                after = change(before)
+                _check(after)
+                if after != before:
+                    write_object(folder / LABELS_FILE, as_json(after))
+                return after
+        except Timeout as error:
+            raise StorageError(
+                f"{folder / LOCK_FILE}: another process has held it for {LOCK_SECONDS:.0f} s; try again."
+            ) from error
 
 
 def is_tag(text: Any) -> bool:

@@ -18,7 +18,7 @@ from runner.recording.run_file import MAX_DEPTH, is_too_deep
 from runner.recording.scan import MAX_METADATA_BYTES
 from runner.recording.schema import Topic
 from runner.recording.spaces import dtype_of, leaves_of
-from runner.util.files import with_plain_texts
+from runner.util.values import without_surrogates
 
 _FACTS: Final = {
     **dict.fromkeys(("run_id", "name", "job", "created", "agents")),
@@ -137,7 +137,7 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, Any]:
     try:
         if text is None or len(text) > MAX_METADATA_BYTES:
             raise ValueError("none, or too long")
-        found = dict(with_plain_texts(json.loads(text), text))
+        found = dict(without_surrogates(json.loads(text), text))
         if is_too_deep(found):
             raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
         return found

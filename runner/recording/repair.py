@@ -18,7 +18,6 @@ from typing import Final
 import numpy as np
 from mcap.opcode import Opcode
 
-from runner.environments.scene import is_whole
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
@@ -30,7 +29,8 @@ from runner.recording.salvage import DamagedFile
 from runner.recording.scan import Report, asks_for_indexes, attachment_of, metadata_of, read_chunk
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
-from runner.util.opening import open_regular
+from runner.util.files import open_regular
+from runner.util.values import is_whole
 
 _CHUNK_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
 _MOST_MESSAGES: Final = 2**62

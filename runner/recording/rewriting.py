@@ -30,7 +30,7 @@ from runner.recording.scan import (
 )
 from runner.recording.schema import KINDS, STEP, TOPIC_OF, TOPICS, Topic
 from runner.recording.writer import RecordingFile
-from runner.util.opening import open_regular
+from runner.util.files import open_regular
 
 Times = NDArray[np.uint64]
 Change = Callable[[str, dict[str, str]], dict[str, str] | None]

@@ -25,7 +25,7 @@ from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head, unpack_chunk
 from runner.recording.index import MAX_NAME_BYTES, MAX_NAMED, refuse_exhausting
-from runner.util.opening import open_regular
+from runner.util.files import open_regular
 
 MAX_METADATA_BYTES: Final = 4 << 20
 """The largest metadata record that is read, config and provenance among them."""

@@ -22,8 +22,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from runner.environments.scene import is_text, is_whole
 from runner.errors import RecordingError
+from runner.util.values import is_text, is_whole
 
 MAX_VALUE_BYTES: Final = 16 << 20
 """The most that one value of a space of fixed width may take."""

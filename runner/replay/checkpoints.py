@@ -11,7 +11,6 @@ import contextlib
 import math
 import os
 import re
-import tempfile
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 import runner.learning
 from runner.recording.reader import Recording
-from runner.util.cache import TABLES, cache_folder
+from runner.util.files import TABLES, cache_folder, replacing
 
 CHECKPOINT_STEPS: Final = 1 << 20
 """Training steps between checkpoints: replayed in well under half a second."""
@@ -66,9 +65,8 @@ class Checkpoints:
         data = b"".join(np.ascontiguousarray(table, "<f8").tobytes() for table in tables)
         with contextlib.suppress(OSError):  # a cache that cannot be written costs time only
             self._folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=self._folder, prefix=".", delete=False) as file:
-                file.write(zstandard.ZstdCompressor(level=1, write_checksum=True).compress(data))
-            Path(file.name).replace(path)
+            with replacing(path) as fresh:
+                fresh.write_bytes(zstandard.ZstdCompressor(level=1, write_checksum=True).compress(data))
             self._saved = True
 
     def prune(self) -> None:

@@ -25,8 +25,8 @@ from runner.recording.run_file import parse_run_file
 from runner.runs.catalogue.lookup import with_id
 from runner.runs.locking import locked
 from runner.runs.run import MADE_BY, RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at, runs_in
-from runner.util.files import sync, write_whole
-from runner.util.names import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN
+from runner.util.files import storage_errors, sync, write_object
+from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN
 
 EXPORT_RECORD: Final = "export"
 """The metadata record of an exported recording: what `run.json` and the labels say, as JSON."""
@@ -111,7 +111,7 @@ def import_recording(
         _place(recording, folder / RECORDING_FILE, facts, rewritten=as_new or bool(exported))
         (folder / RUN_FILE).write_bytes(facts_bytes(facts))
         if labels != Labels():
-            write_whole(folder / LABELS_FILE, as_json(labels))
+            write_object(folder / LABELS_FILE, as_json(labels))
         for path in (*folder.iterdir(), folder):
             sync(path)
         folder.rename(recordings / run_id)
@@ -230,13 +230,11 @@ def _continue_or_keep(
         if run.status not in UNFINISHED or not continues(recording, run.recording):
             raise occupied
         change_labels(run.folder, lambda own: _merged(own, labels))
-        try:
+        with storage_errors(run.folder):
             sync(recording)
             recording.replace(run.recording)
             sync(run.folder)
             return _with_facts(run, facts), False
-        except OSError as error:
-            raise StorageError(f"{run.folder}: cannot be written ({error.strerror}).") from error
 
 
 def _finish(run: Run, facts: Mapping[str, Any]) -> Run:
@@ -250,7 +248,7 @@ def _finish(run: Run, facts: Mapping[str, Any]) -> Run:
 def _with_facts(run: Run, facts: Mapping[str, Any]) -> Run:
     """Replace what `run.json` says of the recording; keep what it says of its folder."""
     kept = {key: value for key, value in run.facts.items() if key not in ("owner", "proof", "summary")}
-    write_whole(run.folder / RUN_FILE, kept | dict(facts))
+    write_object(run.folder / RUN_FILE, kept | dict(facts))
     return run_at(run.folder)
 
 

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from runner.errors import RunnerError, StorageError
+from runner.errors import RunnerError
 from runner.runs.run import Run, run_at
+from runner.util.files import storage_errors
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -61,10 +62,9 @@ def acquired(path: Path, busy: RunnerError) -> FileLock:
     from filelock import FileLock, Timeout
 
     lock = FileLock(path, thread_local=False)
-    try:
-        lock.acquire(blocking=False)
-    except Timeout as error:
-        raise busy from error
-    except OSError as error:
-        raise StorageError(f"{path.parent}: cannot be written ({error.strerror}).") from error
+    with storage_errors(path.parent):
+        try:
+            lock.acquire(blocking=False)
+        except Timeout as error:
+            raise busy from error
     return lock

@@ -12,7 +12,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from runner.util.opening import as_utf8
+from runner.util.values import as_utf8
 from runner.util.version import __version__
 
 PACKAGES = ("numpy", "numba", "llvmlite", "gymnasium", "mcap", "protobuf", "zstandard", "blake3", "pydantic")

@@ -11,7 +11,7 @@ from typing import Final, Protocol, TypeVar
 
 from runner.errors import RunNotFound, nearest
 from runner.runs.run import Run, list_runs, recordings_folder, run_at, run_of_id
-from runner.util.names import RUN_NAME_PATTERN
+from runner.util.values import RUN_NAME_PATTERN
 
 LATEST: Final = "@latest"
 """What stands for the newest run, after a name for the newest of that name."""

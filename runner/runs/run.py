@@ -26,8 +26,8 @@ from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.recording.labels import Labels, change_labels, read_labels
 from runner.recording.liveness import lives, owner
 from runner.recording.run_file import RUN_ID, ArchiveReference, RunFile, Summary, parse_run_file, run_title
-from runner.util.files import read_object, write_whole
-from runner.util.opening import as_utf8, is_utf8
+from runner.util.files import read_object, storage_errors, write_object
+from runner.util.values import as_utf8, is_utf8
 
 if TYPE_CHECKING:  # listing runs is to be quick
     from runner.config import ExperimentConfig
@@ -185,12 +185,8 @@ class Run:
             StorageError: the file cannot be written; it is as before.
         """
         changed = Run(self.folder, self.facts | facts)
-        try:
-            write_whole(self.folder / RUN_FILE, changed.facts)
-        except OSError as error:
-            raise StorageError(
-                f"{self.folder / RUN_FILE}: cannot be written ({error.strerror}); free some disk."
-            ) from error
+        with storage_errors(self.folder / RUN_FILE, "free some disk"):
+            write_object(self.folder / RUN_FILE, changed.facts)
         return changed
 
 
@@ -250,7 +246,7 @@ def new_run(
                 **more,
             },
         )
-        write_whole(folder / RUN_FILE, run.facts)
+        write_object(folder / RUN_FILE, run.facts)
     except OSError as error:
         raise StorageError(
             f"{recordings}: cannot be written ({error.strerror}); "

@@ -18,7 +18,7 @@ from runner.analysis.frames import Phase, episode_columns, evaluation_records, s
 from runner.errors import RunnerError
 from runner.recording.reader import open_recording
 from runner.service.errors import Refused
-from runner.util.files import finite
+from runner.util.values import finite
 
 if TYPE_CHECKING:
     from runner.analysis.series import RunSeries

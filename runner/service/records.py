@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from runner.errors import StorageError
-from runner.util.files import read_object, write_whole
+from runner.util.files import read_object, storage_errors, write_object
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -61,13 +61,11 @@ class RecordsFile(Generic[Record]):
         """
         from filelock import FileLock
 
-        try:
+        with storage_errors(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             with FileLock(self.path.with_suffix(".lock"), timeout=LOCK_SECONDS):
                 kept = [dataclasses.asdict(record) for record in change(self.all())]
-                write_whole(self.path, {self._key: kept}, mode=0o600)
-        except OSError as error:
-            raise StorageError(f"{self.path}: cannot be written ({error.strerror}).") from error
+                write_object(self.path, {self._key: kept}, mode=0o600)
 
     def _read(self) -> tuple[Record, ...]:
         try:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import RunnerError
-from runner.util.cache import cache_folder
+from runner.util.files import cache_folder
 
 CONFIG_VARIABLE: Final = "XDG_CONFIG_HOME"
 MB: Final = 1_000_000

@@ -7,7 +7,6 @@ recordings/k3v9m2xq/labels.json      a run of it: the tag sweep=NAME
 from __future__ import annotations
 
 import contextlib
-import secrets
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -15,13 +14,14 @@ from typing import Any, Final
 from runner.config.document import read_yaml, write_yaml
 from runner.config.job import identity_of
 from runner.config.loading import read_text
-from runner.errors import ConfigError, RunnerError, StorageError, nearest
+from runner.errors import ConfigError, RunnerError, nearest
 from runner.runs.locking import acquired
 from runner.runs.run import Run, list_runs
 from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep
 from runner.sweep.names import FILE, folder_of, sweeps_in, tag_of
-from runner.util.files import read_object, write_whole
+from runner.util.files import read_object, replacing, storage_errors, write_object
+from runner.util.values import flatten
 
 FAILED: Final = "failed.json"
 MAX_FAILED_BYTES: Final = 8 << 20
@@ -112,7 +112,7 @@ def _require_same_makers(name: str, recordings: Path) -> None:
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Return what differs between two sweeps: path, value before, value now."""
-    ours, theirs = (dict(_flat({k: v for k, v in each.items() if k not in FREE})) for each in (before, now))
+    ours, theirs = (flatten({k: v for k, v in each.items() if k not in FREE}) for each in (before, now))
     missing = "nothing"
     return [
         (key, str(ours.get(key, missing)), str(theirs.get(key, missing)))
@@ -169,10 +169,8 @@ def note_failures(name: str, recordings: Path, failures: dict[str, str]) -> None
         StorageError: the folder cannot be written.
     """
     path = folder_of(name, recordings) / FAILED
-    try:
-        write_whole(path, failures)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror}).") from error
+    with storage_errors(path):
+        write_object(path, failures)
 
 
 def forget_failures(name: str, recordings: Path) -> None:
@@ -181,20 +179,7 @@ def forget_failures(name: str, recordings: Path) -> None:
 
 
 def _write(folder: Path, text: str) -> None:
-    fresh = folder / f"{FILE}.{secrets.token_hex(4)}.tmp"
-    try:
+    with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        fresh.write_text(text, encoding="utf-8")
-        fresh.replace(folder / FILE)
-    except OSError as error:
-        raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
-    finally:
-        fresh.unlink(missing_ok=True)
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+        with replacing(folder / FILE) as fresh:
+            fresh.write_text(text, encoding="utf-8")

@@ -1,104 +1,140 @@
-"""JSON: values that it can hold; small files of it beside a recording, read within bounds, replaced whole."""
+"""Files: opened only if regular, read within bounds, replaced atomically; the user's cache."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import hashlib
 import json
-import math
 import os
 import secrets
-from collections.abc import Mapping
+import stat
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
-from runner.util.opening import open_regular
+from blake3 import blake3
 
+from runner.errors import StorageError
+from runner.util.values import without_surrogates
+
+CACHE_VARIABLE: Final = "XDG_CACHE_HOME"
+EXPORTS: Final = "rerun"
+"""The folder of the cache with exports for the Rerun viewer; their names begin with the ids of their runs."""
+RUN_SEPARATOR: Final = "+"
+"""Separates the ids of several runs in the name of an export; no id contains it."""
+RESTORED: Final = "restored"
+"""The folder of the cache with recordings restored from archives; their names begin with the run's id."""
+TABLES: Final = "tables"
+"""The folder of the cache with Q-tables along long runs; their names begin with the run's id."""
 _BINARY: Final = getattr(os, "O_BINARY", 0)
-"""What Windows needs to leave line ends as they are."""
+"""On Windows, leaves line ends as they are."""
 
 
-def finite(value: Any) -> Any:
-    """Return a value as JSON can hold it: NaN and infinity, for which it has no word, as None."""
-    if isinstance(value, Mapping):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value
+def cache_folder() -> Path:
+    """Return the project's folder in the user's cache; it need not exist."""
+    base = os.environ.get(CACHE_VARIABLE)
+    return (Path(base) if base else Path.home() / ".cache") / "dualtaxi"
 
 
-def read_object(path: str | os.PathLike[str], most: int) -> dict[str, Any]:
-    """Return the JSON object in a file; what JSON has no word for (NaN) as None.
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+    """Return a regular file, opened for reading; a link is followed.
 
-    Args:
-        path: the file; a link is followed.
-        most: the most bytes that are read.
+    Anything else is refused: opening a pipe would wait for its writer, and a device never ends.
+
+    Raises:
+        OSError: it cannot be read, or is not a regular file.
+    """
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | _BINARY)
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    raise OSError(errno.EINVAL, "it is not a regular file", os.fspath(path))
+
+
+def hash_of(path: Path) -> tuple[int, str]:
+    """Return size and BLAKE3 of a file; it is read, not mapped, so that little of it is in memory at a time.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is too long, or holds no JSON object.
     """
     with open_regular(path) as stream:
-        data = stream.read(most + 1)
-    if len(data) > most:
-        raise ValueError(f"it is longer than {most:,} bytes")
+        digest = hashlib.file_digest(stream, blake3)  # type: ignore[arg-type] # its update returns itself
+        return stream.tell(), digest.hexdigest()
+
+
+def read_object(path: str | os.PathLike[str], max_bytes: int) -> dict[str, Any]:
+    """Return the JSON object in a file; numbers that are not finite become None.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is longer than `max_bytes`, or holds no JSON object.
+    """
+    with open_regular(path) as stream:
+        data = stream.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise ValueError(f"it is longer than {max_bytes:,} bytes")
     try:
-        found = with_plain_texts(json.loads(data, parse_constant=lambda _: None), data)
+        value = without_surrogates(json.loads(data, parse_constant=lambda _: None), data)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-    if not isinstance(found, dict):
+    if not isinstance(value, dict):
         raise ValueError("it holds no JSON object")
-    return found
-
-
-def with_plain_texts(found: Any, data: str | bytes) -> Any:
-    r"""Return what was parsed from JSON, with texts that UTF-8 can hold.
-
-    An escape such as `\ud800` gives half a character, which no page, file or terminal can show; it is
-    replaced by a question mark.
-
-    Args:
-        found: what was parsed.
-        data: what from.
-    """
-    escape = b"\\ud" if isinstance(data, bytes) else "\\ud"
-    return _replaced(found) if escape in data.lower() else found  # type: ignore[operator]
-
-
-def _replaced(value: Any) -> Any:
-    if isinstance(value, str):
-        return value.encode(errors="replace").decode()
-    if isinstance(value, list):
-        return [_replaced(item) for item in value]
-    if isinstance(value, dict):
-        return {_replaced(key): _replaced(item) for key, item in value.items()}
     return value
 
 
-def write_whole(path: Path, value: dict[str, Any], mode: int = 0o666) -> None:
-    """Replace a file whole: a reader sees the old one or the new one.
-
-    Args:
-        path: the file.
-        value: what it will hold.
-        mode: who may read and write it, less what the process's mask takes away.
+def write_object(path: Path, value: Mapping[str, Any], mode: int = 0o666) -> None:
+    """Replace a file by one with this JSON object; `mode` is its permissions, less the process's mask.
 
     Raises:
         OSError: it cannot be written; it is as before.
     """
-    data = (json.dumps(value, indent=1, ensure_ascii=False) + "\n").encode()
-    fresh = path.with_suffix(f".{secrets.token_hex(4)}.tmp")
+    with replacing(path) as fresh:
+        descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, mode)
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write((json.dumps(value, indent=1, ensure_ascii=False) + "\n").encode())
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a free, hidden path in the same folder; the file written there then replaces the one at `path`.
+
+    A reader sees the old file or the new one. If the block fails, the old one stays.
+
+    Raises:
+        OSError: the file cannot be replaced.
+    """
+    fresh = path.with_name(f".{secrets.token_hex(4)}.{path.name}")
     try:
-        with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, mode), "wb") as stream:
-            stream.write(data)
+        yield fresh
         fresh.replace(path)
-    except BaseException:
-        fresh.unlink(missing_ok=True)
-        raise
+    finally:
+        if os.path.lexists(fresh):
+            fresh.unlink()
+
+
+@contextlib.contextmanager
+def storage_errors(path: str | os.PathLike[str], advice: str = "") -> Iterator[None]:
+    """Raise an `OSError` of the block as a `StorageError` that says what to do next.
+
+    The `Timeout` of a `FileLock` is an `OSError` too: catch it within the block.
+
+    Args:
+        path: the file or folder that is written.
+        advice: the end of the message, such as `free some disk`.
+
+    Raises:
+        StorageError: there was one.
+    """
+    try:
+        yield
+    except OSError as error:
+        reason = f"{os.fspath(path)}: cannot be written ({error.strerror or error})"
+        raise StorageError(f"{reason}; {advice}." if advice else f"{reason}.") from error
 
 
 def sync(path: Path) -> None:
-    """Ask the system to put a file, or the names in a folder, on disk.
+    """Write a file, or the names in a folder, to disk.
 
     Raises:
         OSError: it could not.

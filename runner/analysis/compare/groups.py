@@ -44,7 +44,7 @@ def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Gr
         return groups, notes
     firsts = list(once.values())
     names = [" / ".join(dict.fromkeys(run.name for run in runs)) for runs in firsts]
-    flat = [dict(flat_config(runs[0].config)) for runs in firsts]
+    flat = [flat_config(runs[0].config) for runs in firsts]
     labels = [label_of(i, names, flat) for i in range(len(names))]
     return [Group(label, tuple(runs)) for label, runs in zip(labels, firsts, strict=True)], notes
 

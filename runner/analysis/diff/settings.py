@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
+from runner.util.values import flatten
 
 EXAMPLES = 10
 """How many differing transitions are spelled out."""
@@ -56,7 +57,7 @@ class EnvironmentDiff:
 
 def changes_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Change]:
     """Return the differences of two nested mappings, by dotted path."""
-    left, right = dict(_flat("", a)), dict(_flat("", b))
+    left, right = flatten(a, keep_empty=True), flatten(b, keep_empty=True)
     paths = dict.fromkeys([*left, *right])
 
     def filled(path: str) -> bool:
@@ -72,8 +73,8 @@ def changes_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Change]:
 
 def alike_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
     """Return what two nested mappings have alike, by dotted path."""
-    other = dict(_flat("", b))
-    return {path: value for path, value in _flat("", a) if path in other and other[path] == value}
+    left, right = flatten(a, keep_empty=True), flatten(b, keep_empty=True)
+    return {path: value for path, value in left.items() if path in right and right[path] == value}
 
 
 def environment_diff(a: Mdp, b: Mdp) -> EnvironmentDiff:
@@ -91,14 +92,6 @@ def environment_diff(a: Mdp, b: Mdp) -> EnvironmentDiff:
         examples=_examples(a, b, pairs[:: max(1, len(pairs) // EXAMPLES)][:EXAMPLES]),
         other_starts=not np.array_equal(a.start, b.start),
     )
-
-
-def _flat(path: str, value: Any) -> list[tuple[str, Any]]:
-    if not isinstance(value, Mapping) or not value:
-        return [(path, value)]
-    return [
-        pair for key, below in value.items() for pair in _flat(f"{path}.{key}" if path else str(key), below)
-    ]
 
 
 def _pairs_that_differ(a: Mdp, b: Mdp) -> NDArray[np.bool_]:

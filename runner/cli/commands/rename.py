@@ -29,7 +29,7 @@ def command(run_name: str, name: str | None, original: bool, recordings: Path | 
       dualtaxi rename patient --original
     """  # noqa: D301 - Click wants the backspace itself
     from runner.runs.run import relabel
-    from runner.util.names import checked_run_name
+    from runner.util.values import checked_run_name
 
     if original == (name is not None):
         raise click.UsageError("expected a NAME, or --original.")

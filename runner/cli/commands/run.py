@@ -96,7 +96,7 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import experiment_of, jobs_in
     from runner.runs.run import recordings_folder
-    from runner.util.names import checked_name
+    from runner.util.values import checked_name
 
     experiment = experiment_of(config, overrides, seed)
     called, folder = checked_name(name), recordings_folder(recordings)

@@ -125,7 +125,7 @@ def start(
     from runner.sweep.plan import plan_of, require_disk, room
     from runner.sweep.search import require_optuna
     from runner.sweep.trials import run_sweep
-    from runner.util.names import checked_name
+    from runner.util.values import checked_name
 
     require_optuna()
     folder = recordings_folder(recordings)

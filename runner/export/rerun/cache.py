@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from runner.errors import StorageError
 from runner.export.rerun.selection import Request, Selection, select
 from runner.export.rerun.writing import Source, export
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
-from runner.util.cache import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR
-from runner.util.cache import cache_folder as users_cache
+from runner.util.files import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR, storage_errors
+from runner.util.files import cache_folder as users_cache
 from runner.util.version import __version__
 
 KEPT: Final = 20
@@ -74,12 +73,8 @@ def _key(runs: Sequence[Run], request: Request) -> str:
 
 def _make_room() -> None:
     folder = cache_folder()
-    try:
+    with storage_errors(folder, f"set {CACHE_VARIABLE} to another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         kept = sorted(folder.glob("*.rrd"), key=lambda path: path.stat().st_mtime, reverse=True)
         for old in kept[KEPT - 1 :]:
             old.unlink(missing_ok=True)
-    except OSError as error:
-        raise StorageError(
-            f"{folder}: cannot be written ({error.strerror}); set {CACHE_VARIABLE} to another folder."
-        ) from error

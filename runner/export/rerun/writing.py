@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from runner.analysis.frames import agents_of
-from runner.errors import RecordingError, StorageError
+from runner.errors import RecordingError
 from runner.export.rerun.ahead import ahead
 from runner.export.rerun.classes import Vocabulary, vocabulary_of
 from runner.export.rerun.columns import Batch, Sender, StepValues, ink, instances, new_stream, place, texts
@@ -28,6 +27,7 @@ from runner.export.rerun.steps import StepWriter
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.checks import check_steps
+from runner.util.files import replacing, storage_errors
 
 BATCH: Final = 8_192
 """Rows sent at a time: larger columns are dropped by the web viewer."""
@@ -99,21 +99,15 @@ def _saved(
     stream: rr.RecordingStream, sources: Sequence[Source], path: Path, shown: rrb.Blueprint | None = None
 ) -> Iterator[None]:
     """Save what is sent to a stream as a file, which is there whole or not at all."""
-    fresh = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        fresh.touch()  # where no file can be, Rerun would raise what is no OSError
-        stream.save(fresh, default_blueprint=shown)
-        stream.send_recording_name(" and ".join(source.title for source in sources))
-        yield
-        stream.flush()
-        stream.disconnect()
-        fresh.replace(path)
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be written ({error.strerror or error}).") from error
-    finally:
-        if os.path.lexists(fresh):
-            fresh.unlink()
+        with replacing(path) as fresh:
+            fresh.touch()  # where no file can be written, Rerun would not raise an OSError
+            stream.save(fresh, default_blueprint=shown)
+            stream.send_recording_name(" and ".join(source.title for source in sources))
+            yield
+            stream.flush()
+            stream.disconnect()
 
 
 class RunExporter:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any, Final, NamedTuple
 from peewee import SchemaManager, SqliteDatabase
 
 from runner.runs.catalogue.rows import Row
-from runner.util.cache import cache_folder
+from runner.util.files import cache_folder, replacing
 
 Tell = Callable[[str], None]
 
@@ -77,10 +76,9 @@ def renew() -> None:
     with FileLock(path.with_suffix(".lock"), timeout=_BUSY_SECONDS):
         if _identity(path) != before:
             return
-        fresh = path.with_suffix(f".{secrets.token_hex(4)}.tmp")
-        made(os.fspath(fresh)).close()
-        path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
-        fresh.replace(path)
+        with replacing(path) as fresh:
+            made(os.fspath(fresh)).close()
+            path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

@@ -27,7 +27,7 @@ from runner.errors import RunnerError, nearest
 from runner.runs.catalogue.fields import FIELDS, SETTING, STATUSES, Field, Kind, field_of
 from runner.runs.catalogue.rows import Row
 from runner.runs.catalogue.values import Span, date_span, number_of, size_of, span_seconds, whole_of
-from runner.util.opening import is_utf8
+from runner.util.values import is_utf8
 
 if TYPE_CHECKING:
     from luqum.tree import Item

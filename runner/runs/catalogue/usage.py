@@ -22,14 +22,15 @@ from runner.runs.catalogue.index import Index
 from runner.runs.catalogue.rows import Row
 from runner.runs.locking import RUN_LOCK
 from runner.runs.run import RECORDING_FILE, RUN_FILE
-from runner.util.cache import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
+from runner.util.files import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
 
 REMOVED: Final = ".removed-"
 """What the folder of a run is called from the moment it is removed until its files are."""
 
 _OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, RUN_LOCK))
 _LEFT_OVER: Final = re.compile(
-    r"recording\.(anew|repairing|rerecording|restoring)|recording\.damaged-\d+\.mcap|(run|labels)\.[0-9a-f]{8}\.tmp"
+    r"recording\.(anew|repairing|rerecording|restoring)|recording\.damaged-\d+\.mcap"
+    r"|\.[0-9a-f]{8}\.(run|labels)\.json|(run|labels)\.[0-9a-f]{8}\.tmp"
 )
 _KEY: Final = re.compile(r"-[0-9a-f]+(\.\w+)+$")
 """What follows the ids in the name of a cached file."""

@@ -22,7 +22,7 @@ from runner.service.computed import as_json
 from runner.service.dependencies import CatalogueOf, FoundRun, KeptOf, SettingsOf
 from runner.service.errors import Refused
 from runner.service.problems import answers
-from runner.util.names import checked_run_name
+from runner.util.values import checked_run_name
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index

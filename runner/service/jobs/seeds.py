@@ -17,7 +17,7 @@ from runner.service.jobs.spec import (
     Order,
     wait_for_others,
 )
-from runner.util.files import write_whole
+from runner.util.files import write_object
 
 if TYPE_CHECKING:
     from runner.config import ExperimentConfig
@@ -71,7 +71,7 @@ def _intended(order: Order, seed: int) -> str:
 
 def _note_run(order: Order, seed: int, run_id: str) -> None:
     noted = runs_in(order.folder) | {seed: run_id}
-    write_whole(order.folder / RUNS_FILE, {str(key): value for key, value in noted.items()})
+    write_object(order.folder / RUNS_FILE, {str(key): value for key, value in noted.items()})
 
 
 class Telling:

@@ -173,7 +173,7 @@ def _letter(number: int) -> str:
 
 
 def _flat(run: Run) -> dict[str, str]:
-    return {key: str(value) for key, value in flat_config(run.file.config)}
+    return {key: str(value) for key, value in flat_config(run.file.config).items()}
 
 
 def _results(found: list[Run]) -> list[tuple[str, list[str]]]:

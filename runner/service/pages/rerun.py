@@ -17,7 +17,6 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 
 from runner.analysis.step_reference import parse_step_reference
-from runner.errors import StorageError
 from runner.service import played
 from runner.service.api.replay import LONG
 from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
@@ -25,7 +24,7 @@ from runner.service.guard import POLICY
 from runner.service.pages.frame import framed
 from runner.service.pages.rendering import link, page
 from runner.service.pages.step_address import episode_in_words, replay_address
-from runner.util.cache import cache_folder
+from runner.util.files import cache_folder, replacing, storage_errors
 
 router = APIRouter(include_in_schema=False)
 
@@ -116,13 +115,11 @@ def viewer_files() -> Path:
     folder = cache_folder() / "viewer" / version()
     if _is_whole(folder):
         return folder
-    try:
+    with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(folder / "lock", timeout=_SECONDS):
             if not _is_whole(folder):
                 _take(folder)
-    except OSError as error:
-        raise StorageError(f"{folder}: cannot be written ({error.strerror}).") from error
     return folder
 
 
@@ -141,9 +138,8 @@ def _take(folder: Path) -> None:
         with viewer.viewer(data, *options, log=log) as process:
             viewer.wait_for(process, port, log)
             for name in FILES:
-                fresh = folder / f"{name}.tmp"
-                fresh.write_bytes(_fetched(port, name))
-                fresh.replace(folder / name)
+                with replacing(folder / name) as fresh:
+                    fresh.write_bytes(_fetched(port, name))
 
 
 def _fetched(port: int, name: str) -> bytes:

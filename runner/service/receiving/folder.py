@@ -21,7 +21,7 @@ from runner.errors import StorageError
 from runner.service.jobs.folder_lock import hold
 from runner.service.receiving.appending import on_disk
 from runner.service.receiving.model import BODY_FILE, STATE_FILE, Upload, read_upload
-from runner.util.files import sync, write_whole
+from runner.util.files import sync, write_object
 
 FOLDER: Final = ".uploads"
 LOCK_FILE: Final = "lock"
@@ -82,7 +82,7 @@ class UploadFolder:
             StorageError: the disk cannot be written; what it says is as before.
         """
         with on_disk():
-            write_whole(self.of(upload.upload_id) / STATE_FILE, upload.model_dump(mode="json"))
+            write_object(self.of(upload.upload_id) / STATE_FILE, upload.model_dump(mode="json"))
 
     def remove(self, upload_id: str) -> None:
         """Remove all that there is of an upload."""

@@ -24,7 +24,7 @@ from runner.errors import RunnerError, StorageError
 from runner.recording.labels import labels_from
 from runner.service.receiving.model import BODY_FILE, Completion, Told, ToldLabels, read_upload
 from runner.service.settings import without_folders
-from runner.util.hashing import hash_of
+from runner.util.files import hash_of
 
 PATIENCE_SECONDS: Final = 120.0
 """A verification may last so long,"""

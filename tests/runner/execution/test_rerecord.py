@@ -16,7 +16,7 @@ from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 from runner.runs.resolve import find_run
 from runner.runs.run import RUN_FILE, create_run, list_runs
-from runner.util.files import write_whole
+from runner.util.files import write_object
 from tests.runner.recording.making import TAXIS, experiment, make_run
 
 
@@ -77,7 +77,7 @@ def test_what_is_not_finished_is_finished_first(tmp_path):
     with pytest.raises(RunnerError, match="`dualtaxi resume"):
         rerecord(run)
     facts = {key: value for key, value in run.facts.items() if key != "config"}
-    write_whole(run.folder / RUN_FILE, facts | {"status": "interrupted"})
+    write_object(run.folder / RUN_FILE, facts | {"status": "interrupted"})
     with pytest.raises(RunnerError):
         rerecord(find_run(run.run_id, tmp_path))
 

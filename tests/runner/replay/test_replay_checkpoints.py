@@ -13,7 +13,7 @@ from runner.recording.reader import open_recording
 from runner.replay import checkpoints, tables
 from runner.replay.tables import TableReplay, tables_at
 from runner.runs.catalogue.usage import cached
-from runner.util.cache import TABLES, cache_folder
+from runner.util.files import TABLES, cache_folder
 from tests.runner.altering import without_chunk
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 

@@ -27,7 +27,7 @@ from runner.runs.catalogue.folders import Depth, Folders
 from runner.runs.catalogue.index import look
 from runner.runs.catalogue.lookup import find_run
 from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
-from runner.util.cache import EXPORTS, RESTORED
+from runner.util.files import EXPORTS, RESTORED
 
 CONFIG = from_mapping({"name": "some", "episodes": 5})
 ALL = Filter(None)

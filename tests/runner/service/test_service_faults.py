@@ -149,7 +149,7 @@ def test_a_full_disk_is_said(client, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("runner.recording.labels.write_whole", full)
+    monkeypatch.setattr("runner.recording.labels.write_object", full)
     answer = client.patch("/api/v1/runs/first", json={"note": "x"})
     assert answer.status_code == 507
     assert "No space left" in answer.json()["error"]["message"]

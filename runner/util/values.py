@@ -1,0 +1,118 @@
+"""Checks and conversions of plain values: texts, names of runs, whole numbers, JSON."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+from runner.errors import ConfigError
+
+MAX_TEXT: Final = 200
+"""The most characters of a short text."""
+NAME_PATTERN: Final = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$"
+NAME_EXPECTED: Final = "1 to 100 letters, digits, '_', '.' or '-', not starting with '.' or '-'"
+RUN_NAME_PATTERN: Final = r"^[A-Za-z0-9_][A-Za-z0-9_.+/-]{0,99}$"
+"""Names of runs; a configuration's name, from which folders are named, has no `+` and no `/`."""
+RUN_NAME_EXPECTED: Final = (
+    "1 to 100 letters, digits, '_', '.', '-', '+' or '/', not starting with one of the last four"
+)
+
+
+def checked_name(name: str | None) -> str | None:
+    """Return the name if a configuration can have it.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    if name is not None and not re.fullmatch(NAME_PATTERN, name):
+        raise ConfigError(f"name: found {name!r}, expected {NAME_EXPECTED}")
+    return name
+
+
+def checked_run_name(name: str | None) -> str | None:
+    """Return the name if a recorded loop, or a renamed run, can have it, such as `ALE/Pong-v5__ppo+1`.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    if name is not None and not re.fullmatch(RUN_NAME_PATTERN, name):
+        raise ConfigError(f"name: found {name!r}, expected {RUN_NAME_EXPECTED}")
+    return name
+
+
+def is_text(value: Any) -> bool:
+    """Return whether this is a short, printable text."""
+    return isinstance(value, str) and 0 < len(value) <= MAX_TEXT and value.isprintable()
+
+
+def is_whole(value: Any, low: int, high: int) -> bool:
+    """Return whether this is an integer from `low` to `high`."""
+    return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
+
+
+def is_utf8(text: str) -> bool:
+    """Return whether a text can be encoded in UTF-8; one decoded from Latin-1, for example, cannot."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def as_utf8(text: str) -> str:
+    r"""Return a text that can be encoded in UTF-8; other bytes become escapes such as `\\xe9`."""
+    return text.encode(errors="surrogateescape").decode(errors="backslashreplace")
+
+
+def flatten(values: Mapping[str, Any], keep_empty: bool = False, prefix: str = "") -> dict[str, Any]:
+    """Return the values in nested mappings by dotted key, such as `evaluation.trials`.
+
+    Args:
+        values: the mapping.
+        keep_empty: whether an empty mapping counts as a value.
+        prefix: what each key begins with.
+    """
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping) and (value or not keep_empty):
+            flat |= flatten(value, keep_empty, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def finite(value: Any) -> Any:
+    """Return a value as JSON can hold it: NaN and infinities become None."""
+    if isinstance(value, Mapping):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value
+
+
+def without_surrogates(value: Any, source: str | bytes) -> Any:
+    r"""Return a parsed JSON value with texts that can be encoded in UTF-8.
+
+    An escape such as `\ud800` gives half a character, which cannot be written to a page, file or terminal; it
+    is replaced by a question mark.
+
+    Args:
+        value: the parsed value.
+        source: the JSON it was parsed from, in which such an escape is looked for first.
+    """
+    escape = b"\\ud" if isinstance(source, bytes) else "\\ud"
+    return _replaced(value) if escape in source.lower() else value  # type: ignore[operator]
+
+
+def _replaced(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode(errors="replace").decode()
+    if isinstance(value, list):
+        return [_replaced(item) for item in value]
+    if isinstance(value, dict):
+        return {_replaced(key): _replaced(item) for key, item in value.items()}
+    return value
