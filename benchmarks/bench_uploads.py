@@ -24,7 +24,7 @@ from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
 from benchmarks.serving import Service, serving
 from runner.client.client import Client
-from runner.client.upload_source import Parcel
+from runner.client.upload_source import UploadSource
 from runner.execution.verify import verify
 from runner.runs.resolve import find_run
 
@@ -53,27 +53,27 @@ def measure(quick: bool) -> list[Figure]:
             return [*figures, *_memory(recording, folder, service, steps)]
 
 
-def _large_recording(folder: Path, megabytes: int) -> Parcel:
+def _large_recording(folder: Path, megabytes: int) -> UploadSource:
     """Return a run that takes so much on disk: uncompressed, of steps at random."""
     sets = ["recording.compression=none", f"episodes={megabytes * 13}", "epsilon=1"]
     sets += ["evaluation.every=1000000", "snapshots.every=1000000"]
     run(run_command("quick", str(folder), *sets))
-    return Parcel.of(find_run("@latest", folder))
+    return UploadSource.of(find_run("@latest", folder))
 
 
-def _speed(parcel: Parcel, folder: Path, url: str, repetitions: int) -> list[Figure]:
-    size, uploaded, copied = parcel.path.stat().st_size, [], []
-    digest, begin = _digest(parcel.path), 0.0
+def _speed(source: UploadSource, folder: Path, url: str, repetitions: int) -> list[Figure]:
+    size, uploaded, copied = source.path.stat().st_size, [], []
+    digest, begin = _digest(source.path), 0.0
     with Client(url) as client:
         for number in range(repetitions):
-            copied.append(size / seconds(lambda: _copy(parcel.path, folder / "copy")) / 1e6)
+            copied.append(size / seconds(lambda: _copy(source.path, folder / "copy")) / 1e6)
             (folder / "copy").unlink()
             begin = time.perf_counter()
             sent = client.begin(size=size)
             while sent.offset < size:
-                sent = client.append(sent, parcel.path, size)
+                sent = client.append(sent, source.path, size)
             last = number == repetitions - 1
-            sent = client.complete(sent, parcel, size, digest if last else "0" * 64)
+            sent = client.complete(sent, source, size, digest if last else "0" * 64)
             uploaded.append(size / (time.perf_counter() - begin) / 1e6)
             begin = time.perf_counter()
             while sent.state == "verifying":
@@ -104,9 +104,9 @@ def _digest(path: Path) -> str:
     return blake3().update_mmap(path).hexdigest()
 
 
-def _memory(parcel: Parcel, folder: Path, service: Service, steps: int) -> list[Figure]:
+def _memory(source: UploadSource, folder: Path, service: Service, steps: int) -> list[Figure]:
     """Return the server's memory while much is asked of it, and see that nothing was lost."""
-    shutil.rmtree(folder / "theirs" / parcel.run_id)
+    shutil.rmtree(folder / "theirs" / source.run_id)
     own, children, over = [], [], threading.Event()
     server = psutil.Process(service.process)
 
@@ -119,7 +119,7 @@ def _memory(parcel: Parcel, folder: Path, service: Service, steps: int) -> list[
     watcher = threading.Thread(target=watch)
     watcher.start()
     begin = time.perf_counter()
-    told = _load(parcel, folder, service.url, steps)
+    told = _load(source, folder, service.url, steps)
     took = time.perf_counter() - begin
     over.set()
     watcher.join()
@@ -134,7 +134,7 @@ def _memory(parcel: Parcel, folder: Path, service: Service, steps: int) -> list[
             "MB",
             (400, 250),
             higher_is_better=False,
-            detail=f"with {parcel.path.stat().st_size / 1e6:,.0f} MB uploaded and read; {took:.0f} s; "
+            detail=f"with {source.path.stat().st_size / 1e6:,.0f} MB uploaded and read; {took:.0f} s; "
             f"at most {early:.0f} MB in the first half and {late:.0f} MB in the second; "
             f"its other processes at most {max(children):.0f} MB",
         ),
@@ -142,7 +142,7 @@ def _memory(parcel: Parcel, folder: Path, service: Service, steps: int) -> list[
     ]
 
 
-def _load(parcel: Parcel, folder: Path, url: str, steps: int) -> list[tuple[str, str]]:
+def _load(source: UploadSource, folder: Path, url: str, steps: int) -> list[tuple[str, str]]:
     """Record and push by many processes, upload and read a large recording; return the digests."""
     with contextlib.ExitStack() as stack:
         environment = os.environ | {"XDG_STATE_HOME": str(folder / "state")}
@@ -158,9 +158,9 @@ def _load(parcel: Parcel, folder: Path, url: str, steps: int) -> list[tuple[str,
             for seed in range(PROCESSES)
         ]
         with Client(url, patience=600) as client:
-            client.push(parcel)
-            pulled = client.pull(parcel.run_id, folder / "back")
-        assert pulled.content_digest == parcel.content_digest
+            client.push(source)
+            pulled = client.pull(source.run_id, folder / "back")
+        assert pulled.content_digest == source.content_digest
         told = [loop.communicate()[0].split() for loop in loops]
     assert not list((folder / "state").rglob("recording.mcap")), "a run was left in the outbox"
     return [(run_id, digest) for run_id, digest in told]

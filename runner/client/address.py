@@ -31,7 +31,7 @@ def checked_url(url: str) -> str:
     return url.rstrip("/")
 
 
-def found_token(said: str | None = None, file: Path | None = None) -> str | None:
+def find_token(said: str | None = None, file: Path | None = None) -> str | None:
     """Return a token: what is said, or in a file; else what the variables say; None if there is none.
 
     Raises:

@@ -36,11 +36,11 @@ class ServerError(RunnerError):
         self.status, self.retry_seconds = status, retry_seconds
 
 
-class ServerAway(ServerError):
+class ServerUnavailable(ServerError):
     """A server does not answer, or cannot do what was asked at present."""
 
 
-class Patience:
+class Backoff:
     """Waits ever longer while a server is away, as long as the server says, and has an end.
 
     Args:

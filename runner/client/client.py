@@ -15,11 +15,11 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
-from runner.client.backoff import ServerAway, ServerError
+from runner.client.backoff import ServerError, ServerUnavailable
 from runner.client.connection import READ_BYTES, Connection, Report
-from runner.client.jobs import Happened, JobThere, watch
+from runner.client.jobs import JobEvent, RemoteJob, watch
 from runner.client.pull import pull
-from runner.client.upload_source import Parcel, Sent
+from runner.client.upload_source import UploadSource, UploadStatus
 from runner.errors import RunnerError
 from runner.runs.run import Run
 from runner.util.files import hash_of
@@ -39,62 +39,66 @@ class Client(Connection):
 
     # --- jobs -----------------------------------------------------------------------------------------
 
-    def submit(self, text: str, source: str = "job.yaml") -> JobThere:
+    def submit(self, text: str, source: str = "job.yaml") -> RemoteJob:
         """Submit the text of a configuration or a sweep; `source` is the file's name, for messages.
 
         Raises:
             ServerError: it was refused, each mistake with its line; or the server is away.
         """
-        return JobThere.of(self.ask("POST", "/jobs", params={"source": source}, content=text.encode()).json())
+        return RemoteJob.of(
+            self.ask("POST", "/jobs", params={"source": source}, content=text.encode()).json()
+        )
 
-    def job(self, number: int) -> JobThere:
+    def job(self, number: int) -> RemoteJob:
         """Return how a job stands; errors as of `ask`."""
-        return JobThere.of(self.ask("GET", f"/jobs/{number}").json())
+        return RemoteJob.of(self.ask("GET", f"/jobs/{number}").json())
 
-    def jobs(self, limit: int = 50, offset: int = 0) -> list[JobThere]:
+    def jobs(self, limit: int = 50, offset: int = 0) -> list[RemoteJob]:
         """Return jobs, the newest first; errors as of `ask`."""
         told = self.ask("GET", "/jobs", params={"limit": limit, "offset": offset}).json()
-        return [JobThere.of(job) for job in told["jobs"]]
+        return [RemoteJob.of(job) for job in told["jobs"]]
 
-    def watch(self, number: int) -> Iterator[Happened]:
+    def watch(self, number: int) -> Iterator[JobEvent]:
         """Yield what happens to a job until it is over, as `jobs.watch` does; it says what is raised."""
         return watch(self, number)
 
-    def cancel(self, number: int) -> JobThere:
+    def cancel(self, number: int) -> RemoteJob:
         """Have a job not be done, or stopped; what it has recorded is kept. Errors as of `ask`."""
-        return JobThere.of(self.ask("POST", f"/jobs/{number}/cancel").json())
+        return RemoteJob.of(self.ask("POST", f"/jobs/{number}/cancel").json())
 
-    def resume(self, number: int, accept_changes: bool = False) -> JobThere:
+    def resume(self, number: int, accept_changes: bool = False) -> RemoteJob:
         """Have a job that failed or was cancelled go on; errors as of `ask`."""
         params = {"accept_changes": accept_changes}
-        return JobThere.of(self.ask("POST", f"/jobs/{number}/resume", params=params).json())
+        return RemoteJob.of(self.ask("POST", f"/jobs/{number}/resume", params=params).json())
 
     # --- pushing --------------------------------------------------------------------------------------
 
-    def push(self, parcel: Parcel | Run, report: Report = lambda *_: None, begun: Sent | None = None) -> Sent:
+    def push(
+        self, source: UploadSource | Run, report: Report = lambda *_: None, begun: UploadStatus | None = None
+    ) -> UploadStatus:
         """Send a run, and return what became of it when the server has verified and stored it.
 
         Args:
-            parcel: a run that is over, or a file with what is said of it.
+            source: a run that is over, or a file with what is said of it.
             report: told the progress.
             begun: the upload that has its beginning already.
 
         Raises:
             ServerError: it was refused, with the reason.
-            ServerAway: the server did not answer for too long; what it has, it keeps for the next time.
+            ServerUnavailable: the server did not answer in time; it keeps what it has received.
             RunnerError: the run cannot be sent.
         """
-        if isinstance(parcel, Run):
-            parcel = Parcel.of(parcel)
-        size, digest = _size_and_digest(parcel.path)
-        sent = _Delivery(self, parcel, size, digest, report, begun).done()
+        if isinstance(source, Run):
+            source = UploadSource.of(source)
+        size, digest = _size_and_digest(source.path)
+        sent = _Delivery(self, source, size, digest, report, begun).done()
         if sent.state == "refused" and begun is not None:  # the file has become another since it began
-            sent = _Delivery(self, parcel, size, digest, report, None).done()
+            sent = _Delivery(self, source, size, digest, report, None).done()
         if sent.state == "refused":
-            raise ServerError(f"{self.url}: refused the run {parcel.run_id}: {sent.problem}")
+            raise ServerError(f"{self.url}: refused the run {source.run_id}: {sent.problem}")
         return sent
 
-    def begin(self, **announced: Any) -> Sent:
+    def begin(self, **announced: Any) -> UploadStatus:
         """Begin an upload, or find the one of the same bytes.
 
         Raises:
@@ -103,7 +107,7 @@ class Client(Connection):
         told = {key: value for key, value in announced.items() if value not in (None, "")}
         return _sent(self.ask("POST", "/uploads", json=told))
 
-    def append(self, sent: Sent, path: Path, end: int) -> Sent:
+    def append(self, sent: UploadStatus, path: Path, end: int) -> UploadStatus:
         """Send what an upload lacks of a file up to some place, in one request; not more than a piece.
 
         Raises:
@@ -118,9 +122,9 @@ class Client(Connection):
                 content=_pieces(stream, size, path),
                 headers={"Upload-Offset": str(sent.offset), "Content-Length": str(size)},
             )
-        return Sent(sent.id, sent.state, int(answer.headers["Upload-Offset"]), sent.run_id)
+        return UploadStatus(sent.id, sent.state, int(answer.headers["Upload-Offset"]), sent.run_id)
 
-    def standing(self, sent: Sent, wait: float = 0) -> Sent:
+    def standing(self, sent: UploadStatus, wait: float = 0) -> UploadStatus:
         """Return how an upload stands now, or when it is verified.
 
         Raises:
@@ -128,16 +132,16 @@ class Client(Connection):
         """
         return _sent(self.ask("GET", f"/uploads/{sent.id}", params={"wait": wait}))
 
-    def complete(self, sent: Sent, parcel: Parcel, size: int, digest: str) -> Sent:
+    def complete(self, sent: UploadStatus, source: UploadSource, size: int, digest: str) -> UploadStatus:
         """Say that all is there.
 
         Raises:
             ServerError: the server refuses, or is away.
         """
-        told = {"digest": digest, "size": size, "run": dict(parcel.run), "labels": dict(parcel.labels)}
+        told = {"digest": digest, "size": size, "run": dict(source.run), "labels": dict(source.labels)}
         return _sent(self.ask("POST", f"/uploads/{sent.id}/complete", json=told))
 
-    def give_up(self, sent: Sent) -> None:
+    def give_up(self, sent: UploadStatus) -> None:
         """Have an upload forgotten.
 
         Raises:
@@ -156,14 +160,20 @@ class _Delivery:
     """A file on its way, step by step; a step that fails is taken again after a while."""
 
     def __init__(
-        self, client: Client, parcel: Parcel, size: int, digest: str, report: Report, begun: Sent | None
+        self,
+        client: Client,
+        source: UploadSource,
+        size: int,
+        digest: str,
+        report: Report,
+        begun: UploadStatus | None,
     ) -> None:
-        self._client, self._parcel, self._report = client, parcel, report
+        self._client, self._parcel, self._report = client, source, report
         self._size, self._digest = size, digest
         self._sent = begun
         self._is_stale = begun is not None
 
-    def done(self) -> Sent:
+    def done(self) -> UploadStatus:
         """Return the upload when it is stored or refused.
 
         Raises:
@@ -188,8 +198,8 @@ class _Delivery:
                 patience.moved()
             self._report(sent.offset, self._size)
 
-    def _step(self) -> Sent:
-        client, sent, parcel = self._client, self._sent, self._parcel
+    def _step(self) -> UploadStatus:
+        client, sent, source = self._client, self._sent, self._parcel
         if sent is None:
             return self._begun()
         if self._is_stale:
@@ -200,23 +210,23 @@ class _Delivery:
             client.give_up(sent)
             return self._begun()
         if sent.offset < self._size:
-            return client.append(sent, parcel.path, self._size)
-        return client.complete(sent, parcel, self._size, self._digest)
+            return client.append(sent, source.path, self._size)
+        return client.complete(sent, source, self._size, self._digest)
 
-    def _begun(self) -> Sent:
-        parcel = self._parcel
-        known = {"name": parcel.name, "run_id": parcel.run_id, "content_digest": parcel.content_digest}
+    def _begun(self) -> UploadStatus:
+        source = self._parcel
+        known = {"name": source.name, "run_id": source.run_id, "content_digest": source.content_digest}
         return self._client.begin(digest=self._digest, size=self._size, **known)
 
-    def _verified(self, sent: Sent) -> Sent:
+    def _verified(self, sent: UploadStatus) -> UploadStatus:
         """Return an upload unless it could not be verified for now."""
         if sent.state == "receiving" and sent.problem:
-            raise ServerAway(f"{self._client.url}: {sent.problem}")
+            raise ServerUnavailable(f"{self._client.url}: {sent.problem}")
         return sent
 
 
 def _may_pass(error: ServerError) -> bool:
-    return isinstance(error, ServerAway) or error.status in (HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
+    return isinstance(error, ServerUnavailable) or error.status in (HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
 
 
 def _size_and_digest(path: Path) -> tuple[int, str]:
@@ -240,7 +250,7 @@ def _pieces(stream: BinaryIO, size: int, path: Path) -> Iterator[bytes]:
         yield piece
 
 
-def _sent(answer: httpx2.Response) -> Sent:
+def _sent(answer: httpx2.Response) -> UploadStatus:
     """Return what an answer says of an upload.
 
     Raises:
@@ -248,7 +258,7 @@ def _sent(answer: httpx2.Response) -> Sent:
     """
     try:
         told = answer.json()
-        return Sent(*(told[key] for key in ("id", "state", "offset", "run_id", "already", "problem")))
+        return UploadStatus(*(told[key] for key in ("id", "state", "offset", "run_id", "already", "problem")))
     except (ValueError, KeyError, TypeError) as error:
         raise ServerError(
             f"{answer.url}: found another answer than a dualtaxi server gives; is the address right?"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import urlsplit
 
 from runner.client.address import checked_url
-from runner.client.backoff import Patience, ServerAway, ServerError
+from runner.client.backoff import Backoff, ServerError, ServerUnavailable
 from runner.util.extras import require
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ class Connection:
 
     Args:
         url: its address, such as `http://localhost:8000`.
-        token: the access token; `found_token()` looks where one is usually kept.
+        token: the access token; `find_token()` looks where one is usually kept.
         patience: how many seconds to keep retrying while the server is unavailable.
         tell: called with a message while it waits.
 
@@ -68,9 +68,9 @@ class Connection:
     def __exit__(self, *raised: object) -> None:
         self.close()
 
-    def patience(self) -> Patience:
+    def patience(self) -> Backoff:
         """Return what waits while the server is away."""
-        return Patience(self._patience, self._tell)
+        return Backoff(self._patience, self._tell)
 
     def ask(self, method: str, path: str, **request: Any) -> httpx2.Response:
         """Return the answer to a request, which is no error.
@@ -81,14 +81,16 @@ class Connection:
         try:
             answer = self._http.request(method, path, **request)
         except self._errors as error:
-            raise ServerAway(f"{self.url}: does not answer ({error or type(error).__name__}).") from error
+            raise ServerUnavailable(
+                f"{self.url}: does not answer ({error or type(error).__name__})."
+            ) from error
         self._check(answer)
         return answer
 
     def _check(self, answer: httpx2.Response) -> None:
         if answer.is_success:
             return
-        kind = ServerAway if answer.status_code in _TEMPORARY else ServerError
+        kind = ServerUnavailable if answer.status_code in _TEMPORARY else ServerError
         retry = answer.headers.get("retry-after", "")
         seconds = float(retry) if retry.isdecimal() else 0.0
         raise kind(f"{self.url}: {_message(answer)}", answer.status_code, seconds)
@@ -103,7 +105,9 @@ class Connection:
                 self._check(answer)
                 yield answer
         except self._errors as error:
-            raise ServerAway(f"{self.url}: does not answer ({error or type(error).__name__}).") from error
+            raise ServerUnavailable(
+                f"{self.url}: does not answer ({error or type(error).__name__})."
+            ) from error
 
     def download(self, path: str, tag: str, offset: int, size: int) -> Iterator[bytes]:
         """Yield what a file has behind an offset.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.client.backoff import FIRST_PAUSE, ServerAway
+from runner.client.backoff import FIRST_PAUSE, ServerUnavailable
 from runner.errors import RunnerError
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ OVER: Final = ("finished", "failed", "cancelled")
 
 
 @dataclass(frozen=True)
-class JobThere:
+class RemoteJob:
     """A job on a server."""
 
     number: int
@@ -41,7 +41,7 @@ class JobThere:
         return self.state in OVER
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> JobThere:
+    def of(cls, told: Mapping[str, Any]) -> RemoteJob:
         """Return the job that a server tells of.
 
         Raises:
@@ -56,7 +56,7 @@ class JobThere:
 
 
 @dataclass(frozen=True)
-class Happened:
+class JobEvent:
     """Something that happened to a job: its kind (`state`, `run`, `log`, `progress`), and more of it."""
 
     kind: str
@@ -65,7 +65,7 @@ class Happened:
     """What to come back to; empty for progress."""
 
 
-def watch(client: Connection, number: int) -> Iterator[Happened]:
+def watch(client: Connection, number: int) -> Iterator[JobEvent]:
     """Yield what happens to a job until it is over, whatever the connection does meanwhile.
 
     Args:
@@ -74,7 +74,7 @@ def watch(client: Connection, number: int) -> Iterator[Happened]:
 
     Raises:
         ServerError: there is no such job, or the server refuses.
-        ServerAway: the server did not answer for too long.
+        ServerUnavailable: the server did not answer for too long.
     """
     place, patience = "", client.patience()
     while True:
@@ -86,14 +86,14 @@ def watch(client: Connection, number: int) -> Iterator[Happened]:
                 for happened in events_in(answer.iter_lines()):
                     place = happened.place or place
                     yield happened
-            if JobThere.of(client.ask("GET", f"/jobs/{number}").json()).is_over:
+            if RemoteJob.of(client.ask("GET", f"/jobs/{number}").json()).is_over:
                 return
             time.sleep(FIRST_PAUSE)
-        except ServerAway as error:
+        except ServerUnavailable as error:
             patience.wait(error)
 
 
-def events_in(lines: Iterable[str]) -> Iterator[Happened]:
+def events_in(lines: Iterable[str]) -> Iterator[JobEvent]:
     """Yield the server-sent events of a stream's lines; one that was cut off is left out."""
     fields: dict[str, str] = {}
     for line in lines:
@@ -102,5 +102,5 @@ def events_in(lines: Iterable[str]) -> Iterator[Happened]:
             fields[key] = value.removeprefix(" ")
             continue
         if "data" in fields:
-            yield Happened(fields.get("event", ""), json.loads(fields["data"]), fields.get("id", ""))
+            yield JobEvent(fields.get("event", ""), json.loads(fields["data"]), fields.get("id", ""))
         fields = {}

@@ -17,11 +17,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from runner.client.address import found_token
-from runner.client.backoff import ServerAway
+from runner.client.address import find_token
+from runner.client.backoff import ServerUnavailable
 from runner.client.client import Client
 from runner.client.connection import Report
-from runner.client.upload_source import Sent
+from runner.client.upload_source import UploadStatus
 from runner.errors import RunnerError
 from runner.runs.locking import locked
 from runner.runs.run import Run, list_runs
@@ -64,7 +64,7 @@ def waiting(outbox: Path) -> list[tuple[Run, str]]:
     return [(run, server) for run, server in runs if server]
 
 
-def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Sent:
+def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> UploadStatus:
     """Push a run out of the outbox: when the server has stored it, it is removed here.
 
     Raises:
@@ -74,7 +74,7 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Sent:
     with locked(run) as own:
         known = _read(own)
         same = known.get("server") == client.url and known.get("upload")
-        sent = client.push(own, report, Sent(str(same), "receiving", 0) if same else None)
+        sent = client.push(own, report, UploadStatus(str(same), "receiving", 0) if same else None)
         gone = own.folder.with_name(f"{_SENT}{own.folder.name}")
         own.folder.rename(gone)
     shutil.rmtree(gone, ignore_errors=True)
@@ -93,7 +93,7 @@ class Follower:
     def __init__(self, client: Client, run: Run, size: Callable[[], int]) -> None:
         self._client, self._run, self._size = client, run, size
         self._over = threading.Event()
-        self._sent: Sent | None = None
+        self._sent: UploadStatus | None = None
         self._is_stale = False
         _note(run, client.url, None)
         self._thread = threading.Thread(target=self._follow, name="push", daemon=True)
@@ -126,7 +126,7 @@ class Follower:
             try:
                 self._send()
                 pause = FOLLOW_SECONDS
-            except ServerAway:
+            except ServerUnavailable:
                 pause = min(2 * pause, AWAY_SECONDS)
                 self._is_stale = True
             except RunnerError:
@@ -149,7 +149,7 @@ def connected(url: str) -> Client:
     Raises:
         RunnerError: it is no address, its token cannot be read, or HTTPX is not installed.
     """
-    return Client(url, found_token(), LAST_SECONDS)
+    return Client(url, find_token(), LAST_SECONDS)
 
 
 def _note(run: Run, server: str, upload: str | None) -> None:

@@ -11,7 +11,7 @@ from urllib.parse import quote
 from blake3 import blake3
 from filelock import FileLock, Timeout
 
-from runner.client.backoff import ServerAway, ServerError
+from runner.client.backoff import ServerError, ServerUnavailable
 from runner.client.connection import Connection, Report
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.labels import labels_from
@@ -116,5 +116,5 @@ def _fetch(client: Connection, place: str, tag: str, size: int, part: Path, repo
                     stream.write(piece)
                     patience.moved()
                     report(stream.tell(), size)
-            except ServerAway as error:
+            except ServerUnavailable as error:
                 patience.wait(error)

@@ -12,7 +12,7 @@ from runner.runs.run import Run
 
 
 @dataclass(frozen=True)
-class Parcel:
+class UploadSource:
     """What is sent: a file, and what its sender says of the run in it."""
 
     path: Path
@@ -23,7 +23,7 @@ class Parcel:
     labels: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, run: Run) -> Parcel:
+    def of(cls, run: Run) -> UploadSource:
         """Return a run that is over, to be sent.
 
         Raises:
@@ -49,7 +49,7 @@ class Parcel:
 
 
 @dataclass(frozen=True)
-class Sent:
+class UploadStatus:
     """An upload as the server says it stands."""
 
     id: str

@@ -20,11 +20,11 @@ from runner.service.guard import Guard
 from runner.service.jobs.scheduler import Jobs
 from runner.service.logs import LOG, AccessLog
 from runner.service.played import load_sweep_libraries
-from runner.service.problems import answer_errors, answers
+from runner.service.problems import add_error_handlers, answers
 from runner.service.processes import ProcessPool
 from runner.service.receiving.model import Upload, UploadLimits
 from runner.service.receiving.uploads import Uploads
-from runner.service.response_cache import Kept
+from runner.service.response_cache import ResponseCache
 from runner.service.security import Tokens
 from runner.service.sessions import Sessions
 from runner.service.settings import Settings
@@ -64,7 +64,7 @@ def create_app(settings: Settings) -> FastAPI:
     )
     app.state.settings = settings
     app.state.catalogue = Catalogue(settings.recordings, LOG.warning)
-    app.state.kept = Kept(settings.limits.cache_bytes)
+    app.state.cache = ResponseCache(settings.limits.cache_bytes)
     app.state.stopping = asyncio.Event()
     app.state.tokens = tokens
     app.state.sessions = Sessions(tokens)
@@ -72,8 +72,8 @@ def create_app(settings: Settings) -> FastAPI:
         Guard, settings=settings, tokens=tokens, sessions=app.state.sessions, refused=pages.refused
     )
     app.add_middleware(AccessLog)
-    answer_errors(app)
-    pages.answer_errors(app)
+    add_error_handlers(app)
+    pages.add_error_handlers(app)
     app.include_router(_api(), prefix=API)
     app.include_router(health.router)
     app.include_router(login.router)
@@ -124,7 +124,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
                 lambda upload: _uploaded(app, upload),
             )
         )
-        app.state.apart = stack.enter_context(
+        app.state.processes = stack.enter_context(
             ProcessPool(PROCESSES, settings.limits.work_seconds, settings.limits.work_bytes)
         )
         app.state.sweep_processes = stack.enter_context(

@@ -13,7 +13,7 @@ from runner.runs.run import Run
 from runner.service.catalogue import Catalogue
 from runner.service.jobs.scheduler import Jobs
 from runner.service.processes import ProcessPool
-from runner.service.response_cache import Kept
+from runner.service.response_cache import ResponseCache
 from runner.service.settings import Settings
 
 
@@ -29,9 +29,9 @@ def catalogue_of(request: Request) -> Catalogue:
     return found
 
 
-def kept_of(request: Request) -> Kept:
+def cache_of(request: Request) -> ResponseCache:
     """Return the answers that are kept."""
-    found: Kept = request.app.state.kept
+    found: ResponseCache = request.app.state.cache
     return found
 
 
@@ -41,9 +41,9 @@ def jobs_of(request: Request) -> Jobs:
     return found
 
 
-def apart_of(request: Request) -> ProcessPool:
+def processes_of(request: Request) -> ProcessPool:
     """Return what does work in processes of its own."""
-    found: ProcessPool = request.app.state.apart
+    found: ProcessPool = request.app.state.processes
     return found
 
 
@@ -55,9 +55,9 @@ def sweep_processes_of(request: Request) -> ProcessPool:
 
 SettingsOf = Annotated[Settings, Depends(settings_of)]
 CatalogueOf = Annotated[Catalogue, Depends(catalogue_of)]
-ApartOf = Annotated[ProcessPool, Depends(apart_of)]
+ProcessesOf = Annotated[ProcessPool, Depends(processes_of)]
 SweepProcesses = Annotated[ProcessPool, Depends(sweep_processes_of)]
-KeptOf = Annotated[Kept, Depends(kept_of)]
+CacheOf = Annotated[ResponseCache, Depends(cache_of)]
 JobsOf = Annotated[Jobs, Depends(jobs_of)]
 RunName = Annotated[
     str,
@@ -111,12 +111,12 @@ def opened_recording(run: RecordedRun) -> Iterator[Recording]:
 OpenRecording = Annotated[Recording, Depends(opened_recording)]
 
 
-def state_of(run: Run) -> tuple[str, int, int]:
+def recording_state(run: Run) -> tuple[str, int, int]:
     """Return what tells one state of a run's recording from another: its path, size and time."""
     facts = run.recording.stat()
     return str(run.recording), facts.st_size, facts.st_mtime_ns
 
 
-def timed_state_of(run: Run) -> tuple[str, int, int, str]:
+def timed_recording_state(run: Run) -> tuple[str, int, int, str]:
     """Return the same with how long the run took, which only `run.json` says, at times later."""
-    return *state_of(run), str(run.summary.seconds)
+    return *recording_state(run), str(run.summary.seconds)

@@ -25,7 +25,7 @@ from runner.errors import (
     StorageError,
 )
 from runner.service.errors import Refused
-from runner.service.jobs.queue import NoSuchJob, NotPossibleNow, QueueFull
+from runner.service.jobs.queue import JobNotFound, JobStateConflict, QueueFull
 from runner.service.logs import LOG
 from runner.service.receiving.model import Conflict, TooLarge, TooMany
 from runner.service.settings import Settings
@@ -36,8 +36,8 @@ _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
     Diverged: HTTPStatus.CONFLICT,
     EnvironmentNotUsable: HTTPStatus.UNPROCESSABLE_ENTITY,
     MissingExtra: HTTPStatus.NOT_IMPLEMENTED,
-    NoSuchJob: HTTPStatus.NOT_FOUND,
-    NotPossibleNow: HTTPStatus.CONFLICT,
+    JobNotFound: HTTPStatus.NOT_FOUND,
+    JobStateConflict: HTTPStatus.CONFLICT,
     QueueFull: HTTPStatus.TOO_MANY_REQUESTS,
     RecordingError: HTTPStatus.CONFLICT,
     RunNotFound: HTTPStatus.NOT_FOUND,
@@ -57,22 +57,22 @@ class Problem(BaseModel):
     message: str
 
 
-class Trouble(BaseModel):
+class ErrorBody(BaseModel):
     """What is wrong, and what to do."""
 
     message: str
     problems: list[Problem] = []
 
 
-class ErrorAnswer(BaseModel):
+class ErrorResponse(BaseModel):
     """The body of every answer that is an error."""
 
-    error: Trouble
+    error: ErrorBody
 
 
 def answers(*statuses: HTTPStatus) -> dict[int | str, dict[str, Any]]:
     """Return how a route's errors are documented."""
-    return {int(status): {"model": ErrorAnswer, "description": status.phrase} for status in statuses}
+    return {int(status): {"model": ErrorResponse, "description": status.phrase} for status in statuses}
 
 
 def content(*media: str) -> dict[int | str, dict[str, Any]]:
@@ -88,11 +88,11 @@ def status_of(error: RunnerError) -> HTTPStatus:
     return next((_STATUS[kind] for kind in kinds), HTTPStatus.BAD_REQUEST)
 
 
-def trouble_of(error: RunnerError, settings: Settings) -> Trouble:
+def error_body(error: RunnerError, settings: Settings) -> ErrorBody:
     """Return an error's message, and the problems of a configuration each with its line and key."""
     message = settings.without_folders("\n".join([str(error), *getattr(error, "__notes__", [])]))
     if not isinstance(error, ConfigError):
-        return Trouble(message=message)
+        return ErrorBody(message=message)
     problems = [
         Problem(
             path=found.path or None,
@@ -101,15 +101,15 @@ def trouble_of(error: RunnerError, settings: Settings) -> Trouble:
         )
         for found in error.problems
     ]
-    return Trouble(message=message, problems=problems)
+    return ErrorBody(message=message, problems=problems)
 
 
-def refusal(status: HTTPStatus, trouble: Trouble, headers: dict[str, str] | None = None) -> Response:
+def refusal(status: HTTPStatus, trouble: ErrorBody, headers: dict[str, str] | None = None) -> Response:
     """Return the answer that is an error."""
     return JSONResponse({"error": trouble.model_dump()}, status, headers)
 
 
-def answer_errors(app: FastAPI) -> None:
+def add_error_handlers(app: FastAPI) -> None:
     """Have every error of the application answered in the one form."""
     app.add_exception_handler(RunnerError, _runner_error)
     app.add_exception_handler(HTTPException, _http_error)
@@ -121,7 +121,7 @@ def answer_errors(app: FastAPI) -> None:
 def refused(request: Request, error: RunnerError) -> Response:
     """Return the answer to a request that ends in one of the project's errors."""
     headers = error.headers if isinstance(error, Refused) else None
-    return refusal(status_of(error), trouble_of(error, request.app.state.settings), headers)
+    return refusal(status_of(error), error_body(error, request.app.state.settings), headers)
 
 
 async def _runner_error(request: Request, error: Exception) -> Response:
@@ -137,7 +137,7 @@ async def _http_error(request: Request, error: Exception) -> Response:
         HTTPStatus.METHOD_NOT_ALLOWED: f"{request.method} cannot be done at {request.url.path}.",
     }
     message = told.get(status, str(error.detail))
-    return refusal(status, Trouble(message=message), dict(error.headers or {}))
+    return refusal(status, ErrorBody(message=message), dict(error.headers or {}))
 
 
 async def _invalid(request: Request, error: Exception) -> Response:  # noqa: ARG001
@@ -146,7 +146,7 @@ async def _invalid(request: Request, error: Exception) -> Response:  # noqa: ARG
         Problem(path=".".join(map(str, found["loc"])), message=str(found["msg"])) for found in error.errors()
     ]
     message = "; ".join(f"{problem.path}: {problem.message}" for problem in problems)
-    return refusal(HTTPStatus.UNPROCESSABLE_ENTITY, Trouble(message=message, problems=problems))
+    return refusal(HTTPStatus.UNPROCESSABLE_ENTITY, ErrorBody(message=message, problems=problems))
 
 
 async def _system_error(request: Request, error: Exception) -> Response:
@@ -155,11 +155,11 @@ async def _system_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, OSError)
     if error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None)):
         message = f"the disk is full ({error.strerror}); free some of it: `dualtaxi du` tells what uses it."
-        return refusal(HTTPStatus.INSUFFICIENT_STORAGE, Trouble(message=message))
+        return refusal(HTTPStatus.INSUFFICIENT_STORAGE, ErrorBody(message=message))
     return await _unexpected(request, error)
 
 
 async def _unexpected(request: Request, error: Exception) -> Response:
     LOG.error("error", exc_info=error, extra={"path": request.url.path, "method": request.method})
     message = "something unexpected went wrong; the service's log tells what."
-    return refusal(HTTPStatus.INTERNAL_SERVER_ERROR, Trouble(message=message))
+    return refusal(HTTPStatus.INTERNAL_SERVER_ERROR, ErrorBody(message=message))

@@ -1,4 +1,4 @@
-"""Answers that are kept for a while, for who asks the same next."""
+"""A short-lived cache of responses, which also merges equal requests that run at the same time."""
 
 from __future__ import annotations
 
@@ -6,73 +6,69 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Hashable
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from starlette.concurrency import run_in_threadpool
 
-SECONDS: Final = 5.0
-"""An answer is kept no longer: what it tells may depend on the time of day."""
+MAX_SECONDS: Final = 5.0
+"""The default age limit: a response may depend on the time of day."""
 ALWAYS: Final = float("inf")
-"""For answers that depend on nothing but their key."""
+"""The age limit of responses that depend on nothing but their key."""
 
 
-@dataclass(frozen=True)
-class _Answer:
+class _Response(NamedTuple):
     body: bytes
-    made: float
+    created: float
 
 
-class Kept:
-    """Answers by what they depend on, the most recently asked for; at most so many bytes."""
+class ResponseCache:
+    """Response bodies by key; the least recently used ones are dropped beyond a number of bytes."""
 
-    def __init__(self, most_bytes: int) -> None:
-        self._most, self._bytes = most_bytes, 0
-        self._answers: OrderedDict[Hashable, _Answer] = OrderedDict()
-        self._under_way: dict[Hashable, asyncio.Future[bytes]] = {}
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes, self._bytes = max_bytes, 0
+        self._responses: OrderedDict[Hashable, _Response] = OrderedDict()
+        self._pending: dict[Hashable, asyncio.Future[bytes]] = {}
 
-    async def answer(self, key: Hashable, make: Callable[[], bytes]) -> bytes:
-        """Return the answer of a key, made in a thread if it must be; see `awaited`."""
-        return await self.awaited(key, lambda: run_in_threadpool(make))
-
-    def found(self, key: Hashable) -> bytes | None:
-        """Return the answer of a key if it is kept, however old; None if it must be made."""
-        kept = self._answers.get(key)
-        if kept is None:
+    def get(self, key: Hashable, max_seconds: float = ALWAYS) -> bytes | None:
+        """Return the cached response of a key; None if there is none, or an older one only."""
+        response = self._responses.get(key)
+        if response is None or time.monotonic() - response.created >= max_seconds:
             return None
-        self._answers.move_to_end(key)
-        return kept.body
+        self._responses.move_to_end(key)
+        return response.body
 
-    async def awaited(
-        self, key: Hashable, make: Callable[[], Awaitable[bytes]], seconds: float = SECONDS
+    async def get_or_make(self, key: Hashable, make: Callable[[], bytes]) -> bytes:
+        """Return the response of a key, made in a thread if necessary; see `get_or_await`."""
+        return await self.get_or_await(key, lambda: run_in_threadpool(make))
+
+    async def get_or_await(
+        self, key: Hashable, make: Callable[[], Awaitable[bytes]], max_seconds: float = MAX_SECONDS
     ) -> bytes:
-        """Return the answer of a key: as it is kept, as it is being made for another request, or made now.
+        """Return the response of a key: cached, being made for another request, or made now.
 
         Args:
-            key: all that it depends on, as far as that is known.
-            make: begins the work.
-            seconds: it may be as old as this.
+            key: everything that the response depends on, as far as that is known.
+            make: starts the work.
+            max_seconds: the age limit of a cached response.
         """
-        kept = self._answers.get(key)
-        if kept is not None and time.monotonic() - kept.made < seconds:
-            self._answers.move_to_end(key)
-            return kept.body
-        if key not in self._under_way:
+        if (body := self.get(key, max_seconds)) is not None:
+            return body
+        if key not in self._pending:
             task = asyncio.ensure_future(make())
-            self._under_way[key] = task
-            task.add_done_callback(lambda done: self._done(key, done))
-        return await asyncio.shield(self._under_way[key])
+            self._pending[key] = task
+            task.add_done_callback(lambda done: self._store(key, done))
+        return await asyncio.shield(self._pending[key])
 
-    def _done(self, key: Hashable, done: asyncio.Future[Any]) -> None:
-        del self._under_way[key]
+    def _store(self, key: Hashable, done: asyncio.Future[Any]) -> None:
+        del self._pending[key]
         if done.cancelled() or done.exception() is not None:
             return
         self._drop(key)
-        self._answers[key] = _Answer(done.result(), time.monotonic())
+        self._responses[key] = _Response(done.result(), time.monotonic())
         self._bytes += len(done.result())
-        while self._bytes > self._most and self._answers:
-            self._drop(next(iter(self._answers)))
+        while self._bytes > self._max_bytes and self._responses:
+            self._drop(next(iter(self._responses)))
 
     def _drop(self, key: Hashable) -> None:
-        gone = self._answers.pop(key, None)
-        self._bytes -= len(gone.body) if gone else 0
+        dropped = self._responses.pop(key, None)
+        self._bytes -= len(dropped.body) if dropped else 0

@@ -44,12 +44,12 @@ def command(
     """  # noqa: D301 - Click wants the backspace itself
     from runner.cli.progress import bytes_line
     from runner.cli.working import tell_received
-    from runner.client.address import found_token
+    from runner.client.address import find_token
     from runner.client.client import Client
     from runner.runs.run import recordings_folder
 
     with (
-        Client(required(server), found_token(token, token_file), tell=say) as client,
+        Client(required(server), find_token(token, token_file), tell=say) as client,
         bytes_line(f"pulling {run_name}") as report,
     ):
         pulled = client.pull(run_name, recordings_folder(recordings), report)

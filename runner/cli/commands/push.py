@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from runner.client.connection import Report
-    from runner.client.upload_source import Sent
+    from runner.client.upload_source import UploadStatus
     from runner.runs.run import Run
 
-    Push = Callable[[Report], tuple[Sent, str, int]]
+    Push = Callable[[Report], tuple[UploadStatus, str, int]]
     """Pushes a run; returns what became of it, its name and its bytes."""
 
 
@@ -66,11 +66,11 @@ def command(
       dualtaxi push k3v9m2xq 7wd2qhmz --server https://runs.example.org --token-file ~/.dualtaxi-token
       dualtaxi push --outbox
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.client.address import found_token
+    from runner.client.address import find_token
 
     if bool(names) == outbox:
         raise click.UsageError("expected either runs or --outbox.")
-    secret = found_token(token, token_file)
+    secret = find_token(token, token_file)
     pushes = _outbox(server, secret) if outbox else _runs(names, required(server), secret, recordings)
     stored: list[dict[str, Any]] = []
     codes: list[int] = []
@@ -94,12 +94,12 @@ def _runs(
 ) -> Iterator[tuple[str, Push]]:
     """Yield what is to be pushed, and what pushes it."""
     from runner.client.client import Client
-    from runner.client.upload_source import Parcel
+    from runner.client.upload_source import UploadSource
 
-    def push(name: str, report: Report) -> tuple[Sent, str, int]:
-        parcel = Parcel.of(find_recorded(name, recordings))
-        sent = client.push(parcel, report)
-        return sent, parcel.name, parcel.path.stat().st_size
+    def push(name: str, report: Report) -> tuple[UploadStatus, str, int]:
+        source = UploadSource.of(find_recorded(name, recordings))
+        sent = client.push(source, report)
+        return sent, source.name, source.path.stat().st_size
 
     with Client(server, token, tell=say) as client:
         for name in names:
@@ -111,7 +111,7 @@ def _outbox(server: str | None, token: str | None) -> Iterator[tuple[str, Push]]
     from runner.client.client import Client
     from runner.client.outbox import deliver, outbox_folder, waiting
 
-    def push(run: Run, url: str, report: Report) -> tuple[Sent, str, int]:
+    def push(run: Run, url: str, report: Report) -> tuple[UploadStatus, str, int]:
         size = run.recording.stat().st_size
         with Client(url, token, tell=say) as client:
             return deliver(run, client, report), run.name, size

@@ -13,7 +13,7 @@ from runner.cli.output import draw, facts, print_json, say
 from runner.cli.parameters import ConfigName
 
 if TYPE_CHECKING:
-    from runner.client.jobs import Happened, JobThere
+    from runner.client.jobs import JobEvent, RemoteJob
 
 
 @click.command("submit")
@@ -45,11 +45,11 @@ def command(
       dualtaxi submit quick --server http://localhost:8000
       dualtaxi submit hyperparameters --server http://localhost:8000 --watch
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.client.address import found_token
+    from runner.client.address import find_token
     from runner.client.client import Client
     from runner.config.shipped import config_path
 
-    with Client(required(server), found_token(token, token_file), tell=say) as client:
+    with Client(required(server), find_token(token, token_file), tell=say) as client:
         file = config_path(file)
         job = client.submit(text_of(file), file.name)
         runs = "1 run" if job.runs == 1 else f"{job.runs:,} runs"
@@ -82,7 +82,7 @@ def text_of(file: Path) -> str:
     return text
 
 
-def _tell(happening: Iterable[Happened]) -> None:
+def _tell(happening: Iterable[JobEvent]) -> None:
     """Say on stderr what happens."""
     for happened in happening:
         data = happened.data
@@ -93,13 +93,13 @@ def _tell(happening: Iterable[Happened]) -> None:
             say(data["state"])
 
 
-def _as_json(job: JobThere) -> dict[str, object]:
+def _as_json(job: RemoteJob) -> dict[str, object]:
     runs = {str(seed): run_id for seed, run_id in job.begun.items()}
     known = {"number": job.number, "kind": job.kind, "name": job.name, "state": job.state}
     return known | {"runs": runs, "error": job.error}
 
 
-def _in_words(job: JobThere) -> dict[str, str]:
+def _in_words(job: RemoteJob) -> dict[str, str]:
     told = {"job": f"{job.number}  {job.name}, {job.state}"}
     if job.begun:
         told["runs"] = "\n".join(f"{run_id}  seed {seed}" for seed, run_id in job.begun.items())

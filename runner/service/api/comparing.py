@@ -10,7 +10,14 @@ from fastapi import APIRouter, Query, Request, Response
 from runner.runs.run import Run
 from runner.service import computed
 from runner.service.catalogue import Catalogue
-from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, recorded_run, state_of, timed_state_of
+from runner.service.dependencies import (
+    CacheOf,
+    CatalogueOf,
+    ProcessesOf,
+    recorded_run,
+    recording_state,
+    timed_recording_state,
+)
 from runner.service.problems import answers
 from runner.service.response_cache import ALWAYS
 
@@ -32,8 +39,8 @@ Name = Annotated[str, Query(max_length=200, description="A run, named as anywher
 async def diff(
     request: Request,
     catalogue: CatalogueOf,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     a: Name,
     b: Name,
     ignore: Annotated[list[str] | None, Query(max_length=100, description="Paths, with * and ?.")] = None,
@@ -42,9 +49,9 @@ async def diff(
 ) -> dict[str, Any]:
     """Return what `dualtaxi diff --json` prints."""
     left, right = await found_runs(catalogue, [a, b])
-    key = ("diff", *map(timed_state_of, (left, right)), request.url.query)
+    key = ("diff", *map(timed_recording_state, (left, right)), request.url.query)
     asked = (left, right, ignore or [], first, target or [])
-    body = await kept.awaited(key, lambda: apart(computed.difference, *asked), ALWAYS)
+    body = await cache.get_or_await(key, lambda: processes(computed.difference, *asked), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 
 
@@ -52,8 +59,8 @@ async def diff(
 async def compare(
     request: Request,
     catalogue: CatalogueOf,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     run: Annotated[
         list[str], Query(min_length=1, max_length=MOST_RUNS, description="Which; again for each.")
     ],
@@ -64,9 +71,9 @@ async def compare(
 ) -> dict[str, Any]:
     """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
     runs = await found_runs(catalogue, run, several=True)
-    key = ("compare", *map(state_of, runs), request.url.query)
+    key = ("compare", *map(recording_state, runs), request.url.query)
     asked = ([found.recording for found in runs], by, metric or [], at, target)
-    body = await kept.awaited(key, lambda: apart(computed.comparison, *asked), ALWAYS)
+    body = await cache.get_or_await(key, lambda: processes(computed.comparison, *asked), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 
 

@@ -12,7 +12,7 @@ from fastapi.responses import FileResponse
 
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
+from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.errors import Refused
 from runner.service.problems import answers
 
@@ -54,8 +54,8 @@ def recording(run: RecordedRun, if_none_match: IfNoneMatch = None) -> Response:
 )
 async def replay(
     run: RecordedRun,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     episodes: Annotated[
         str, Query(max_length=1000, description="Training episodes, such as `0:20,49980:`.")
     ] = "",
@@ -70,14 +70,14 @@ async def replay(
 
     Of the steps, unless told otherwise, those of 20 training episodes and of the last evaluation are in it.
     """
-    path = await replay_of([run], kept, apart, episodes, tuple(evaluations or ()), every)
+    path = await replay_of([run], cache, processes, episodes, tuple(evaluations or ()), every)
     return _file(path, f"{run.file_stem}.rrd", path.stem, if_none_match)
 
 
 async def replay_of(
     runs: list[Run],
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     episodes: str = "",
     evaluations: tuple[int, ...] = (),
     every: int = 0,
@@ -91,17 +91,19 @@ async def replay_of(
     from runner.export.rerun.selection import Request
 
     request = Request(_ranges(episodes), evaluations, every)
-    key = ("replay", *map(state_of, runs), request)
-    return Path((await kept.awaited(key, lambda: _made(apart, runs, request), seconds=0)).decode())
+    key = ("replay", *map(recording_state, runs), request)
+    return Path(
+        (await cache.get_or_await(key, lambda: _made(processes, runs, request), max_seconds=0)).decode()
+    )
 
 
-async def _made(apart: ApartOf, runs: list[Run], request: Any) -> bytes:
-    return bytes(await apart(computed.replay, runs, request))
+async def _made(processes: ProcessesOf, runs: list[Run], request: Any) -> bytes:
+    return bytes(await processes(computed.replay, runs, request))
 
 
 def tag_of(run: Run) -> str:
     """Return what tells one state of a recording from any other."""
-    _, size, changed = state_of(run)
+    _, size, changed = recording_state(run)
     return f"{run.summary.get('content_digest') or 'unfinished'}-{size:x}-{changed:x}"
 
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field
 
 from runner.service.dependencies import JobsOf
 from runner.service.errors import Refused
-from runner.service.jobs.queue import Job, Kind, NoSuchJob, State
+from runner.service.jobs.queue import Job, JobNotFound, Kind, State
 from runner.service.jobs.scheduler import SOURCE, Jobs, Standing
 from runner.service.problems import answers, content
 
@@ -38,7 +38,7 @@ class RunOfJob(BaseModel):
     run_id: str
 
 
-class JobTold(BaseModel):
+class JobResponse(BaseModel):
     """A job, and how far it is."""
 
     number: int
@@ -54,7 +54,7 @@ class JobTold(BaseModel):
     begun: list[RunOfJob] = Field(description="A sweep's are those with the tag sweep=NAME.")
 
 
-class QueueTold(BaseModel):
+class QueueResponse(BaseModel):
     """How the queue stands."""
 
     workers: int = Field(description="How many processes may learn at once.")
@@ -67,14 +67,14 @@ class QueueTold(BaseModel):
 class JobsPage(BaseModel):
     """Some of the jobs, the newest first."""
 
-    jobs: list[JobTold]
+    jobs: list[JobResponse]
     total: int = Field(description="How many fit.")
     offset: int
     limit: int
-    queue: QueueTold
+    queue: QueueResponse
 
 
-class CheckTold(BaseModel):
+class CheckResponse(BaseModel):
     """What a text means that was checked, but not submitted."""
 
     kind: Kind
@@ -124,18 +124,18 @@ Text = Annotated[str, Depends(text_of)]
 @router.post(
     "/jobs",
     status_code=HTTPStatus.CREATED,
-    response_model=JobTold,
+    response_model=JobResponse,
     responses=answers(HTTPStatus.CONFLICT),
     openapi_extra=_YAML,
     summary="Submit a configuration or a sweep.",
 )
 async def submit(
     jobs: JobsOf, text: Text, response: Response, request: Request, source: Source = SOURCE
-) -> JobTold:
+) -> JobResponse:
     """Check the text, and queue it; a mistake is told with its line and key."""
     checked = await jobs.check(text, source)  # may take long, so no thread of the server waits for it
 
-    def add() -> JobTold:
+    def add() -> JobResponse:
         return told(jobs.add(text, checked), jobs)
 
     answer = await run_sync(add)
@@ -144,12 +144,15 @@ async def submit(
 
 
 @router.post(
-    "/jobs/check", response_model=CheckTold, openapi_extra=_YAML, summary="Check a configuration or a sweep."
+    "/jobs/check",
+    response_model=CheckResponse,
+    openapi_extra=_YAML,
+    summary="Check a configuration or a sweep.",
 )
-async def check(jobs: JobsOf, text: Text, source: Source = SOURCE) -> CheckTold:
+async def check(jobs: JobsOf, text: Text, source: Source = SOURCE) -> CheckResponse:
     """Check the text as submitting it does, without queueing it."""
     found = await jobs.check(text, source)
-    return CheckTold(kind=found.kind, name=found.name, runs=found.runs, bytes=found.bytes)
+    return CheckResponse(kind=found.kind, name=found.name, runs=found.runs, bytes=found.bytes)
 
 
 @router.get("/jobs", response_model=JobsPage, summary="List the jobs, the newest first.")
@@ -166,14 +169,14 @@ def list_jobs(
         total=len(found),
         offset=offset,
         limit=limit,
-        queue=queue_told(jobs.standing()),
+        queue=queue_response(jobs.standing()),
     )
 
 
 @router.get(
-    "/jobs/{number}", response_model=JobTold, responses=answers(HTTPStatus.NOT_FOUND), summary="One job."
+    "/jobs/{number}", response_model=JobResponse, responses=answers(HTTPStatus.NOT_FOUND), summary="One job."
 )
-def one(jobs: JobsOf, number: Number) -> JobTold:
+def one(jobs: JobsOf, number: Number) -> JobResponse:
     """Tell of a job."""
     return told(jobs.queue.job(number), jobs)
 
@@ -191,18 +194,18 @@ def submitted(jobs: JobsOf, number: Number) -> Response:
 
 @router.post(
     "/jobs/{number}/cancel",
-    response_model=JobTold,
+    response_model=JobResponse,
     responses=answers(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Cancel a job; what it has recorded is kept.",
 )
-def cancel(jobs: JobsOf, number: Number) -> JobTold:
+def cancel(jobs: JobsOf, number: Number) -> JobResponse:
     """Have a job not be done, or its worker close its recording."""
     return told(jobs.cancel(number), jobs)
 
 
 @router.post(
     "/jobs/{number}/resume",
-    response_model=JobTold,
+    response_model=JobResponse,
     responses=answers(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Go on with a job that failed or was cancelled.",
 )
@@ -210,7 +213,7 @@ def resume(
     jobs: JobsOf,
     number: Number,
     accept_changes: Annotated[bool, Query(description="Go on with runs that other code began.")] = False,
-) -> JobTold:
+) -> JobResponse:
     """Queue a job again: it goes on where it was, and ends as if it had never stopped."""
     return told(jobs.resume(number, accept_changes), jobs)
 
@@ -273,7 +276,7 @@ async def _events(jobs: Jobs, number: int, place: int, stopping: asyncio.Event) 
                 yield ": still here\n\n"
             spoken = time.monotonic()
             await asyncio.sleep(0 if found else LOOK_SECONDS)
-    except NoSuchJob:  # it was forgotten meanwhile
+    except JobNotFound:  # it was forgotten meanwhile
         return
     finally:
         jobs.watchers -= 1
@@ -285,10 +288,10 @@ def _event(kind: str, data: Mapping[str, Any], place: int | None = None) -> str:
     return f"{head}event: {kind}\ndata: {json.dumps(data, ensure_ascii=False)}\n\n"
 
 
-def told(job: Job, jobs: Jobs) -> JobTold:
+def told(job: Job, jobs: Jobs) -> JobResponse:
     """Return what is told of a job."""
     begun = jobs.queue.runs_of(job.number)
-    return JobTold(
+    return JobResponse(
         number=job.number,
         kind=job.kind,
         name=job.name,
@@ -303,9 +306,9 @@ def told(job: Job, jobs: Jobs) -> JobTold:
     )
 
 
-def queue_told(standing: Standing) -> QueueTold:
+def queue_response(standing: Standing) -> QueueResponse:
     """Return what is told of the queue."""
-    return QueueTold(
+    return QueueResponse(
         workers=standing.workers,
         running=standing.running,
         queued=standing.queued,

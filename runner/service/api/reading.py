@@ -12,7 +12,14 @@ from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.recording.reader import Recording
 from runner.service import computed
 from runner.service.computed import too_many
-from runner.service.dependencies import ApartOf, KeptOf, OpenRecording, RecordedRun, SettingsOf, state_of
+from runner.service.dependencies import (
+    CacheOf,
+    OpenRecording,
+    ProcessesOf,
+    RecordedRun,
+    SettingsOf,
+    recording_state,
+)
 from runner.service.errors import Refused
 from runner.service.problems import answers, content
 from runner.service.response_cache import ALWAYS
@@ -22,7 +29,7 @@ if TYPE_CHECKING:
 
     from runner.runs.run import Run
     from runner.service.processes import ProcessPool
-    from runner.service.response_cache import Kept
+    from runner.service.response_cache import ResponseCache
     from runner.service.settings import Settings
 
 router = APIRouter(
@@ -95,8 +102,8 @@ class Columns(BaseModel):
 async def metrics(
     run: RecordedRun,
     request: Request,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     metric: Annotated[list[str] | None, Query(max_length=100, description="Which; else all.")] = None,
     start: Number = 0,
     stop: Annotated[
@@ -109,10 +116,10 @@ async def metrics(
     With `points`, of longer curves the lowest and the highest value of each stretch are given, and
     `thinned` says so; ask again with `start` and `stop` for a part at full resolution.
     """
-    key = ("metrics", state_of(run), request.url.query)
+    key = ("metrics", recording_state(run), request.url.query)
     wanted = tuple(metric or ())
-    body = await kept.awaited(
-        key, lambda: apart(computed.curves, run.recording, wanted, start, stop, points), ALWAYS
+    body = await cache.get_or_await(
+        key, lambda: processes(computed.curves, run.recording, wanted, start, stop, points), ALWAYS
     )
     return Response(body, media_type="application/json")
 
@@ -125,27 +132,27 @@ async def metrics(
 )
 async def evaluations(
     run: RecordedRun,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     settings: SettingsOf,
     start: Start = 0,
     stop: Stop = None,
 ) -> Response:
     """Return evaluations as `dualtaxi show --json` has them under `eval`."""
-    return await _records(run, kept, apart, settings, "evaluations", start, stop)
+    return await _records(run, cache, processes, settings, "evaluations", start, stop)
 
 
 @router.get("/training", response_model=Records, responses=BUSY, summary="The reports of training.")
 async def training(
     run: RecordedRun,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     settings: SettingsOf,
     start: Start = 0,
     stop: Stop = None,
 ) -> Response:
     """Return reports of training as `dualtaxi show --json` has them under `train`."""
-    return await _records(run, kept, apart, settings, "training", start, stop)
+    return await _records(run, cache, processes, settings, "training", start, stop)
 
 
 @router.get(
@@ -153,14 +160,14 @@ async def training(
 )
 async def optimality(
     run: RecordedRun,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     settings: SettingsOf,
     start: Start = 0,
     stop: Stop = None,
 ) -> Response:
     """Return what evaluations know exactly; nothing unless `evaluation.exact` was set."""
-    return await _records(run, kept, apart, settings, "optimality", start, stop)
+    return await _records(run, cache, processes, settings, "optimality", start, stop)
 
 
 @router.get(
@@ -171,7 +178,7 @@ async def optimality(
 )
 async def arrow(
     run: RecordedRun,
-    apart: ApartOf,
+    processes: ProcessesOf,
     settings: SettingsOf,
     table: Literal["steps", "episodes"],
     phase: InPhase,
@@ -183,7 +190,7 @@ async def arrow(
     stop = start + FEW if stop is None else stop
     if stop - start > most:
         raise too_many(stop - start, most)
-    body = await apart(computed.arrow, run.recording, table, phase, start, stop)
+    body = await processes(computed.arrow, run.recording, table, phase, start, stop)
     return Response(body, media_type=ARROW)
 
 
@@ -222,8 +229,8 @@ def steps(
 async def q_table(
     run: RecordedRun,
     request: Request,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     step: Step = None,
     episode: Episode = None,
     state: Annotated[
@@ -231,7 +238,7 @@ async def q_table(
     ] = None,
 ) -> dict[str, Any]:
     """Return size, fill and range of each learner's exact table, as `dualtaxi qtable --json` tells it."""
-    body = await _q_table(run, request, kept, apart, step, episode, state, "json")
+    body = await _q_table(run, request, cache, processes, step, episode, state, "json")
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 
 
@@ -244,13 +251,13 @@ async def q_table(
 async def q_table_whole(
     run: RecordedRun,
     request: Request,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     step: Step = None,
     episode: Episode = None,
 ) -> Response:
     """Return the exact table as a NumPy file: float64 [states, actions], of several [learners, ...]."""
-    body = await _q_table(run, request, kept, apart, step, episode, None, "npy")
+    body = await _q_table(run, request, cache, processes, step, episode, None, "npy")
     return Response(body, media_type="application/octet-stream")
 
 
@@ -261,19 +268,19 @@ async def q_table_whole(
     summary="Every metric in one figure.",
 )
 async def plot(
-    run: RecordedRun, kept: KeptOf, apart: ApartOf, form: Literal["svg", "png", "pdf"]
+    run: RecordedRun, cache: CacheOf, processes: ProcessesOf, form: Literal["svg", "png", "pdf"]
 ) -> Response:
     """Return the figure that `dualtaxi plot` draws."""
-    key = ("plot", state_of(run), form)
-    body = await kept.awaited(key, lambda: apart(computed.plot, [run.recording], form), ALWAYS)
+    key = ("plot", recording_state(run), form)
+    body = await cache.get_or_await(key, lambda: processes(computed.plot, [run.recording], form), ALWAYS)
     return Response(body, media_type=MEDIA[form])
 
 
 async def _q_table(
     run: Run,
     request: Request,
-    kept: Kept,
-    apart: ProcessPool,
+    cache: ResponseCache,
+    processes: ProcessPool,
     step: int | None,
     episode: int | None,
     state: int | None,
@@ -281,9 +288,9 @@ async def _q_table(
 ) -> bytes:
     if step is not None and episode is not None:
         raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "query: found step and episode, expected one of them.")
-    key = ("qtable", state_of(run), request.url.query, form)
-    return await kept.awaited(
-        key, lambda: apart(computed.q_table, run.recording, step, episode, state, form), ALWAYS
+    key = ("qtable", recording_state(run), request.url.query, form)
+    return await cache.get_or_await(
+        key, lambda: processes(computed.q_table, run.recording, step, episode, state, form), ALWAYS
     )
 
 
@@ -301,8 +308,8 @@ def _bounded(start: int, stop: int | None, total: int, most: int) -> int:
 
 async def _records(
     run: Run,
-    kept: Kept,
-    apart: ProcessPool,
+    cache: ResponseCache,
+    processes: ProcessPool,
     settings: Settings,
     which: computed.Which,
     start: int,
@@ -310,10 +317,10 @@ async def _records(
 ) -> Response:
     """Return some records; found in a process of its own, as all of them are read for it."""
     stop = start + FEW if stop is None else stop
-    key = ("records", state_of(run), which, start, stop)
+    key = ("records", recording_state(run), which, start, stop)
     most = settings.limits.page_records
-    body = await kept.awaited(
-        key, lambda: apart(computed.records, run.recording, which, start, stop, most), ALWAYS
+    body = await cache.get_or_await(
+        key, lambda: processes(computed.records, run.recording, which, start, stop, most), ALWAYS
     )
     return Response(body, media_type="application/json")
 

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel
 
 from runner.service import played
-from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
+from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.problems import answers
 
 if TYPE_CHECKING:
@@ -79,35 +79,40 @@ class Part(BaseModel):
 
 @router.get("/train/{episode}", response_model=Part, summary="A part of a training episode, to be played.")
 async def training(
-    run: RecordedRun, kept: KeptOf, apart: ApartOf, episode: Number, start: Start = 0, steps: Steps = STEPS
+    run: RecordedRun,
+    cache: CacheOf,
+    processes: ProcessesOf,
+    episode: Number,
+    start: Start = 0,
+    steps: Steps = STEPS,
 ) -> Response:
     """Return steps of a training episode with the states, places, rewards, events and Q-values at each."""
-    return _json(await part_of(run, kept, apart, (episode,), start, steps))
+    return _json(await part_of(run, cache, processes, (episode,), start, steps))
 
 
 @router.get("/eval/{after}/{trial}", response_model=Part, summary="A part of a trial, to be played.")
 async def trial(
     run: RecordedRun,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     after: After,
     trial: Number,
     start: Start = 0,
     steps: Steps = STEPS,
 ) -> Response:
     """Return steps of a trial of an evaluation, as those of training."""
-    return _json(await part_of(run, kept, apart, (after, trial), start, steps))
+    return _json(await part_of(run, cache, processes, (after, trial), start, steps))
 
 
 async def part_of(
-    run: Run, kept: KeptOf, apart: ApartOf, which: tuple[int, ...], start: int, steps: int = STEPS
+    run: Run, cache: CacheOf, processes: ProcessesOf, which: tuple[int, ...], start: int, steps: int = STEPS
 ) -> bytes:
     """Return a part of an episode as JSON.
 
     Args:
         run: whose, its recording at hand.
-        kept: answers that are kept.
-        apart: does the work.
+        cache: the cached responses.
+        processes: the pool that does the work.
         which: (episode,) of training, or (training episodes before, trial) of an evaluation.
         start: the first step.
         steps: at most so many.
@@ -115,8 +120,10 @@ async def part_of(
     Raises:
         RecordingError: there is no such episode or step.
     """
-    key = ("replay part", state_of(run), which, start, steps)
-    return await kept.awaited(key, lambda: apart(played.part, run.recording, which, start, steps), LONG)
+    key = ("replay part", recording_state(run), which, start, steps)
+    return await cache.get_or_await(
+        key, lambda: processes(played.part, run.recording, which, start, steps), LONG
+    )
 
 
 def _json(body: bytes) -> Response:

@@ -19,7 +19,7 @@ from runner.runs.catalogue.index import order_of
 from runner.runs.run import Run, relabel
 from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json
-from runner.service.dependencies import CatalogueOf, FoundRun, KeptOf, SettingsOf
+from runner.service.dependencies import CacheOf, CatalogueOf, FoundRun, SettingsOf
 from runner.service.errors import Refused
 from runner.service.problems import answers
 from runner.util.values import checked_run_name
@@ -51,7 +51,7 @@ class RunsPage(BaseModel):
 async def list_runs(
     request: Request,
     catalogue: CatalogueOf,
-    kept: KeptOf,
+    cache: CacheOf,
     settings: SettingsOf,
     filter: Annotated[str, Query(max_length=3000, description="As `dualtaxi ls` takes it.")] = "",  # noqa: A002
     sort: Annotated[str, Query(max_length=500, description="Fields; `-FIELD`: the largest first.")] = "",
@@ -78,7 +78,7 @@ async def list_runs(
         return json.dumps(catalogue.read(work), ensure_ascii=False).encode()
 
     key = ("runs", catalogue.state(), request.url.query)
-    return Response(await kept.answer(key, make), media_type="application/json")
+    return Response(await cache.get_or_make(key, make), media_type="application/json")
 
 
 class Labels(BaseModel):

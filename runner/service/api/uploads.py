@@ -34,7 +34,7 @@ _LOOKS_A_SECOND: Final = 10
 OCTETS: Final = "application/octet-stream"
 
 
-class UploadAnswer(BaseModel):
+class UploadResponse(BaseModel):
     """An upload as it stands."""
 
     id: str
@@ -54,10 +54,10 @@ class UploadAnswer(BaseModel):
     created: str
 
 
-class UploadsAnswer(BaseModel):
+class UploadsResponse(BaseModel):
     """The uploads there are."""
 
-    uploads: list[UploadAnswer]
+    uploads: list[UploadResponse]
 
 
 def uploads_of(request: Request) -> Uploads:
@@ -88,24 +88,24 @@ def list_uploads(
     uploads: UploadsOf,
     owner: OwnerOf,
     state: Annotated[Literal["receiving", "verifying", "stored", "refused"] | None, Query()] = None,
-) -> UploadsAnswer:
+) -> UploadsResponse:
     """List uploads, the newest first; of others' ones the id is left out, and why they were refused."""
     chosen = [upload for upload in uploads.all() if state in (None, upload.state)]
-    return UploadsAnswer(uploads=[_answer(uploads, upload, owner) for upload in chosen])
+    return UploadsResponse(uploads=[_answer(uploads, upload, owner) for upload in chosen])
 
 
 @router.post(
     "/uploads",
     status_code=HTTPStatus.CREATED,
-    response_model=UploadAnswer,
+    response_model=UploadResponse,
     responses={
-        200: {"model": UploadAnswer, "description": "It had begun before, or the run is there already."}
+        200: {"model": UploadResponse, "description": "It had begun before, or the run is there already."}
     },
     summary="Begin an upload, or find the one that had begun of the same bytes.",
 )
 def begin(
     uploads: UploadsOf, owner: OwnerOf, announced: Announcement, request: Request, response: Response
-) -> UploadAnswer:
+) -> UploadResponse:
     """Announce a recording, as far as is known: all of it may be unknown yet."""
     upload, new = uploads.begin(owner, announced)
     if not new or upload.state == "stored":
@@ -123,7 +123,7 @@ async def tell(
     upload_id: UploadId,
     request: Request,
     wait: Annotated[float, Query(ge=0, le=MOST_WAIT, description="Seconds.")] = 0.0,
-) -> UploadAnswer:
+) -> UploadResponse:
     """Tell how an upload stands, at the latest after some seconds, at once if it is not being verified."""
     end, stopping = time.monotonic() + wait, request.app.state.stopping
     upload = uploads.get(upload_id, owner)
@@ -187,11 +187,11 @@ async def append(
 )
 async def complete(
     uploads: UploadsOf, owner: OwnerOf, upload_id: UploadId, completion: Completion, request: Request
-) -> UploadAnswer:
+) -> UploadResponse:
     """Have an upload put on disk and verified; it is a run when that has passed."""
     writers = request.app.state.writers
 
-    def completed() -> UploadAnswer:
+    def completed() -> UploadResponse:
         return _answer(uploads, uploads.complete(upload_id, owner, completion), owner)
 
     return await run_sync(completed, limiter=writers)
@@ -229,9 +229,9 @@ def _position(uploads: Uploads, upload: Upload) -> dict[str, str]:
     return {"Upload-Offset": str(uploads.offset(upload)), "Cache-Control": "no-store"} | length
 
 
-def _answer(uploads: Uploads, upload: Upload, owner: str) -> UploadAnswer:
+def _answer(uploads: Uploads, upload: Upload, owner: str) -> UploadResponse:
     own = upload.owner == owner
-    return UploadAnswer(
+    return UploadResponse(
         id=upload.upload_id if own else "",
         state=upload.state,
         offset=uploads.offset(upload),

@@ -50,11 +50,11 @@ class QueueFull(RunnerError):
     """There are as many unfinished jobs as there may be."""
 
 
-class NoSuchJob(RunnerError):
+class JobNotFound(RunnerError):
     """No job has this number."""
 
 
-class NotPossibleNow(RunnerError):
+class JobStateConflict(RunnerError):
     """What is asked of a job does not go with the state that it is in."""
 
 
@@ -142,11 +142,11 @@ class Queue:
         """Return a job.
 
         Raises:
-            NoSuchJob: there is none.
+            JobNotFound: there is none.
         """
         with self._lock:
             if number not in self._jobs:
-                raise NoSuchJob(f"no job {number}; `GET /jobs` lists those there are.")
+                raise JobNotFound(f"no job {number}; `GET /jobs` lists those there are.")
             return self._jobs[number]
 
     def add(
@@ -229,7 +229,7 @@ class Queue:
             place: 0, or one that this function or an event told; any other is taken as 0.
 
         Raises:
-            NoSuchJob: there is none.
+            JobNotFound: there is none.
         """
         self.job(number)
         try:
@@ -258,7 +258,7 @@ class Queue:
             most: how many events are returned; fewer if they are longer than `MAX_READ_BYTES`.
 
         Raises:
-            NoSuchJob: there is none.
+            JobNotFound: there is none.
         """
         self.job(number)
         try:
@@ -280,13 +280,13 @@ class Queue:
         """Return the text of a job as it came.
 
         Raises:
-            NoSuchJob: there is none, or its files were removed.
+            JobNotFound: there is none, or its files were removed.
         """
         self.job(number)
         try:
             return (self.folder_of(number) / SUBMITTED_FILE).read_text(encoding="utf-8")
         except OSError as error:
-            raise NoSuchJob(f"the files of job {number} cannot be read ({error.strerror}).") from error
+            raise JobNotFound(f"the files of job {number} cannot be read ({error.strerror}).") from error
 
     def _save(self, job: Job) -> None:
         fresh = self.folder_of(job.number) / f"{JOB_FILE}.tmp"

@@ -22,7 +22,7 @@ from typing import Any, Final, Self
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.service.jobs.checking import Checked, Checker
-from runner.service.jobs.queue import Job, NotPossibleNow, Queue, now
+from runner.service.jobs.queue import Job, JobStateConflict, Queue, now
 from runner.service.jobs.spec import Order, Outcome
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
@@ -166,7 +166,7 @@ class Jobs:
         Raises:
             QueueFull: there are too many jobs already.
             StorageError: the disk would not hold its recordings.
-            NotPossibleNow: a sweep of this name is being done.
+            JobStateConflict: a sweep of this name is being done.
         """
         free = free_bytes(self.recordings)
         if checked.bytes > free:
@@ -185,13 +185,13 @@ class Jobs:
         """Have a job not be done, or its worker close its recording; what is recorded is kept.
 
         Raises:
-            NoSuchJob: there is none.
-            NotPossibleNow: it is over.
+            JobNotFound: there is none.
+            JobStateConflict: it is over.
         """
         with self._lock:
             job = self.queue.job(number)
             if job.is_over:
-                raise NotPossibleNow(f"job {number} is {job.state} already; there is nothing to cancel.")
+                raise JobStateConflict(f"job {number} is {job.state} already; there is nothing to cancel.")
             job = self._change(number, state="cancelled", ended=now())
             if number in self._busy:
                 self._tell_to_stop(self._busy[number])
@@ -205,14 +205,14 @@ class Jobs:
             accept_changes: go on with runs that other code began.
 
         Raises:
-            NoSuchJob: there is none.
-            NotPossibleNow: it is finished, or not over yet.
+            JobNotFound: there is none.
+            JobStateConflict: it is finished, or not over yet.
         """
         with self._lock:
             job = self.queue.job(number)
             if job.state not in ("failed", "cancelled"):
                 hint = "there is nothing to do" if job.state == "finished" else "let it"
-                raise NotPossibleNow(f"job {number} is {job.state}; {hint}.")
+                raise JobStateConflict(f"job {number} is {job.state}; {hint}.")
             if job.kind == "sweep":
                 self._sweep_is_free(job.name)
             asked = {"accept_changes": accept_changes, "retry": True}
@@ -244,7 +244,7 @@ class Jobs:
     def _sweep_is_free(self, name: str) -> None:
         for job in self.queue.jobs():
             if job.kind == "sweep" and job.name == name and not job.is_over:
-                raise NotPossibleNow(f"job {job.number} does the sweep {name!r} already.")
+                raise JobStateConflict(f"job {job.number} does the sweep {name!r} already.")
 
     def _run(self) -> None:
         """Start workers and hear them, until the server stops."""

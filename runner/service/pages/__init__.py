@@ -17,9 +17,9 @@ from runner.service.pages import (
     submit,
     sweeps,
 )
-from runner.service.pages.problems import answer_errors, refused
+from runner.service.pages.problems import add_error_handlers, refused
 
-__all__ = ["answer_errors", "refused", "router"]
+__all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
 for _part in (runs, rerun, run, replay, episodes, compare, submit, jobs, sweeps, disk, static):

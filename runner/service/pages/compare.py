@@ -15,7 +15,7 @@ from runner.runs.run import Run
 from runner.service import played
 from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
-from runner.service.dependencies import ApartOf, CatalogueOf, KeptOf, timed_state_of
+from runner.service.dependencies import CacheOf, CatalogueOf, ProcessesOf, timed_recording_state
 from runner.service.pages.frame import head_of, is_loop, last_evaluation
 from runner.service.pages.rendering import link, page, picture_address
 from runner.service.pages.step_address import (
@@ -60,11 +60,11 @@ def _overview(request: Request, found: list[Run]) -> Response:
 
 @router.get("/divergence")
 async def divergence(
-    request: Request, catalogue: CatalogueOf, kept: KeptOf, apart: ApartOf, run: Names = None
+    request: Request, catalogue: CatalogueOf, cache: CacheOf, processes: ProcessesOf, run: Names = None
 ) -> Response:
     """Show the first step at which two runs differ, and why."""
     found = _two(await _chosen(catalogue, run))
-    told = await _difference(found, kept, apart)
+    told = await _difference(found, cache, processes)
     return await run_in_threadpool(
         page,
         request,
@@ -78,11 +78,11 @@ async def divergence(
 
 @router.get("/tables")
 async def tables(
-    request: Request, catalogue: CatalogueOf, kept: KeptOf, apart: ApartOf, run: Names = None
+    request: Request, catalogue: CatalogueOf, cache: CacheOf, processes: ProcessesOf, run: Names = None
 ) -> Response:
     """Show how far the Q-tables of two runs are apart."""
     found = _two(await _chosen(catalogue, run))
-    told = (await _difference(found, kept, apart))["tables"]
+    told = (await _difference(found, cache, processes))["tables"]
     for figure in told["figures"]:
         if "high" not in figure:  # Matplotlib writes styles into its elements, which the policy forbids here
             figure["address"] = picture_address(figure["svg"])
@@ -93,8 +93,8 @@ async def tables(
 async def replay(
     request: Request,
     catalogue: CatalogueOf,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     run: Names = None,
     at: Annotated[str, Query(max_length=60)] = "",
 ) -> Response:
@@ -102,7 +102,7 @@ async def replay(
     found = _two(await _chosen(catalogue, run))
     spot = parse_step_reference(at) if at else ()
     if not spot:
-        partings = (await _difference(found, kept, apart))["partings"]
+        partings = (await _difference(found, cache, processes))["partings"]
         spot = after_step(partings[0]["spot"]) if partings else (0, 0)
     return await run_in_threadpool(_replays, request, found, spot)
 
@@ -146,10 +146,10 @@ def _two(found: list[Run]) -> list[Run]:
     return found
 
 
-async def _difference(found: list[Run], kept: KeptOf, apart: ApartOf) -> dict[str, Any]:
+async def _difference(found: list[Run], cache: CacheOf, processes: ProcessesOf) -> dict[str, Any]:
     """Return in what two runs differ, as `played.difference` has it."""
-    key = ("difference", *map(timed_state_of, found))
-    body = await kept.awaited(key, lambda: apart(played.difference, *found), LONG)
+    key = ("difference", *map(timed_recording_state, found))
+    body = await cache.get_or_await(key, lambda: processes(played.difference, *found), LONG)
     told: dict[str, Any] = await run_in_threadpool(json.loads, body)
     return told
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
-from runner.service.api.jobs import Number, queue_told, told
+from runner.service.api.jobs import Number, queue_response, told
 from runner.service.api.uploads import OwnerOf, UploadsOf, list_uploads
 from runner.service.dependencies import JobsOf
 from runner.service.pages.rendering import link, page
@@ -90,7 +90,7 @@ def _queue(jobs: Jobs, number: int) -> dict[str, Any]:
     shown = found[(number - 1) * ROWS : number * ROWS]
     return {
         "jobs": [shown_job(job, jobs) for job in shown],
-        "standing": queue_told(jobs.standing()),
+        "standing": queue_response(jobs.standing()),
         "active": any(job.state in ("queued", "running") for job in found),
         "page": number,
         "pages": max(1, math.ceil(len(found) / ROWS)),

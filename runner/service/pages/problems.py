@@ -12,12 +12,12 @@ from fastapi import FastAPI, Request, Response
 from runner.errors import RunnerError
 from runner.service import problems
 from runner.service.pages.rendering import page
-from runner.service.problems import trouble_of
+from runner.service.problems import error_body
 
 Handler = Callable[[Request, Exception], Awaitable[Response]]
 
 
-def answer_errors(app: FastAPI) -> None:
+def add_error_handlers(app: FastAPI) -> None:
     """Have errors outside of the API answered by a page that says the same."""
     for kind, handler in list(app.exception_handlers.items()):
         app.add_exception_handler(kind, _as_page(handler))
@@ -25,7 +25,7 @@ def answer_errors(app: FastAPI) -> None:
 
 def message_of(error: RunnerError, request: Request) -> str:
     """Return what a page says of an error: what the API would."""
-    return trouble_of(error, request.app.state.settings).message
+    return error_body(error, request.app.state.settings).message
 
 
 def refused(request: Request, error: RunnerError) -> Response:

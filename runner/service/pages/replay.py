@@ -16,7 +16,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service import played
 from runner.service.api.replay import part_of
-from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
+from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.pages.frame import framed
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page
@@ -36,8 +36,8 @@ T = Annotated[int, Query(ge=0, lt=2**62)]
 @router.get("")
 async def replay_chosen(
     run: RecordedRun,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     phase: Literal["train", "eval"] | None = None,
     episode: str = "",
     after: str = "",
@@ -49,37 +49,43 @@ async def replay_chosen(
     elif phase == "eval" and after:
         place = f"eval/{_whole(after)}/{_whole(trial)}"
     else:
-        key = ("typical", state_of(run))
-        place = (await kept.awaited(key, lambda: apart(played.typical, run.recording))).decode()
+        key = ("typical", recording_state(run))
+        place = (await cache.get_or_await(key, lambda: processes(played.typical, run.recording))).decode()
     return RedirectResponse(f"/runs/{run.run_id}/replay/{place}", HTTPStatus.FOUND)
 
 
 @router.get("/train/{episode}")
 async def replay_training(
-    request: Request, run: RecordedRun, kept: KeptOf, apart: ApartOf, episode: Number, t: T = 0
+    request: Request, run: RecordedRun, cache: CacheOf, processes: ProcessesOf, episode: Number, t: T = 0
 ) -> Response:
     """Show a step of a training episode."""
-    return await _replay(request, run, kept, apart, (episode,), t)
+    return await _replay(request, run, cache, processes, (episode,), t)
 
 
 @router.get("/eval/{after}/{trial}")
 async def replay_trial(
-    request: Request, run: RecordedRun, kept: KeptOf, apart: ApartOf, after: Number, trial: Number, t: T = 0
+    request: Request,
+    run: RecordedRun,
+    cache: CacheOf,
+    processes: ProcessesOf,
+    after: Number,
+    trial: Number,
+    t: T = 0,
 ) -> Response:
     """Show a step of a trial of an evaluation."""
-    return await _replay(request, run, kept, apart, (after, trial), t)
+    return await _replay(request, run, cache, processes, (after, trial), t)
 
 
 # --- inside -------------------------------------------------------------------------------------------
 
 
 async def _replay(
-    request: Request, run: Run, kept: KeptOf, apart: ApartOf, which: tuple[int, ...], t: int
+    request: Request, run: Run, cache: CacheOf, processes: ProcessesOf, which: tuple[int, ...], t: int
 ) -> Response:
     """Return the page of a step of an episode, rendered by a thread: it reads the recording."""
     part: bytes | RunnerError
     try:
-        part = await part_of(run, kept, apart, which, max(0, t - BEFORE))
+        part = await part_of(run, cache, processes, which, max(0, t - BEFORE))
     except RunnerError as error:
         part = error
     return await run_in_threadpool(_rendered, request, run, which, t, part)

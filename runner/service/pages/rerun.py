@@ -19,7 +19,7 @@ from fastapi.responses import FileResponse
 from runner.analysis.step_reference import parse_step_reference
 from runner.service import played
 from runner.service.api.replay import LONG
-from runner.service.dependencies import ApartOf, KeptOf, RecordedRun, state_of
+from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.guard import POLICY
 from runner.service.pages.frame import framed
 from runner.service.pages.rendering import link, page
@@ -57,14 +57,14 @@ def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_leng
 async def frame(
     request: Request,
     run: RecordedRun,
-    kept: KeptOf,
-    apart: ApartOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
     at: Annotated[str, Query(max_length=60)] = "",
 ) -> Response:
     """Show nothing but the viewer, at a step."""
     spot = parse_step_reference(at) if at else ()
-    key = ("spot", state_of(run), spot)
-    step = await kept.awaited(key, lambda: apart(played.spot, run, spot), LONG)
+    key = ("spot", recording_state(run), spot)
+    step = await cache.get_or_await(key, lambda: processes(played.spot, run, spot), LONG)
     asked: dict[str, Any] = {"episodes": spot[0]} if len(spot) == 2 else {"evaluations": list(spot[:1])}
     found = page(
         request,

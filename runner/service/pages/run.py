@@ -25,15 +25,15 @@ from runner.service import played
 from runner.service.api.replay import LONG
 from runner.service.api.runs import Labels, relabelled
 from runner.service.dependencies import (
-    ApartOf,
+    CacheOf,
     CatalogueOf,
     FoundRun,
     JobsOf,
-    KeptOf,
     OpenRecording,
+    ProcessesOf,
     RecordedRun,
     SettingsOf,
-    state_of,
+    recording_state,
 )
 from runner.service.pages.forms import Form
 from runner.service.pages.frame import framed, is_loop, loop_results
@@ -44,7 +44,7 @@ from runner.util import humanize
 if TYPE_CHECKING:
     from runner.service.jobs.scheduler import Jobs
     from runner.service.processes import ProcessPool
-    from runner.service.response_cache import Kept
+    from runner.service.response_cache import ResponseCache
     from runner.service.settings import Settings
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
@@ -61,10 +61,15 @@ _LEVELS: Final = {1: "debug", 2: "info", 3: "warning", 4: "error", 5: "fatal"}
 
 @router.get("")
 async def overview(
-    request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf, kept: KeptOf, apart: ApartOf
+    request: Request,
+    run: FoundRun,
+    jobs: JobsOf,
+    settings: SettingsOf,
+    cache: CacheOf,
+    processes: ProcessesOf,
 ) -> Response:
     """Show how a run stands, and its metrics."""
-    random = await _random_policy(run, kept, apart)
+    random = await _random_policy(run, cache, processes)
     return await run_in_threadpool(_overview, request, run, jobs, settings, random=random)
 
 
@@ -130,10 +135,10 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
 
 
 @router.get("/learned")
-async def learned(request: Request, run: RecordedRun, kept: KeptOf, apart: ApartOf) -> Response:
+async def learned(request: Request, run: RecordedRun, cache: CacheOf, processes: ProcessesOf) -> Response:
     """Show policy and values at stages of learning."""
-    key = ("learned", state_of(run))
-    maps = json.loads(await kept.awaited(key, lambda: apart(played.learned, run.recording), LONG))
+    key = ("learned", recording_state(run))
+    maps = json.loads(await cache.get_or_await(key, lambda: processes(played.learned, run.recording), LONG))
     broad = any(len(row["svgs"][0][1]) > BROAD for row in maps if row["svgs"])
     return page(request, "run_learned.html", **framed(run, "learned"), maps=maps, broad=broad)
 
@@ -158,11 +163,11 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
 # --- inside -------------------------------------------------------------------------------------------
 
 
-async def _random_policy(run: Run, kept: Kept, apart: ProcessPool) -> str:
+async def _random_policy(run: Run, cache: ResponseCache, processes: ProcessPool) -> str:
     """Return what a random policy gets in a run's environment, as a sentence; empty if that is unknown."""
     try:
-        key = ("random_policy", await run_in_threadpool(state_of, run))
-        sentence = await kept.awaited(key, lambda: apart(played.random_policy, run.recording), LONG)
+        key = ("random_policy", await run_in_threadpool(recording_state, run))
+        sentence = await cache.get_or_await(key, lambda: processes(played.random_policy, run.recording), LONG)
     except (OSError, RunnerError):
         return ""  # the page itself says what is wrong with the recording
     return sentence.decode()

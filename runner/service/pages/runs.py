@@ -15,7 +15,7 @@ from runner.runs.catalogue.columns import HEADINGS, columns_of, in_words, with_o
 from runner.runs.catalogue.fields import FIELDS, SETTING, Kind, field_of
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.index import order_of
-from runner.service.dependencies import CatalogueOf, KeptOf
+from runner.service.dependencies import CacheOf, CatalogueOf
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import Viewer, link, render, viewer_of
 
@@ -55,7 +55,7 @@ def home() -> Response:
 async def runs(
     request: Request,
     catalogue: CatalogueOf,
-    kept: KeptOf,
+    cache: CacheOf,
     filter: Annotated[str, Query(max_length=3000)] = "",  # noqa: A002
     sort: Annotated[str, Query(max_length=1000)] = "",
     columns: Annotated[list[str] | None, Query(max_length=100)] = None,
@@ -70,7 +70,7 @@ async def runs(
         return _page(catalogue, filter, sort, ",".join(columns or ()), page, viewer)
 
     try:
-        body = await kept.answer(("runs page", catalogue.state(), request.url.query, viewer), make)
+        body = await cache.get_or_make(("runs page", catalogue.state(), request.url.query, viewer), make)
     except RunnerError as error:
         status = HTTPStatus.BAD_REQUEST
         told = _frame(filter, "", USUAL) | {"problem": message_of(error, request), "rows": [], "total": None}

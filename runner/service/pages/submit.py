@@ -20,7 +20,7 @@ from runner.service.errors import Refused
 from runner.service.jobs.checking import SWEEP_KEYS, Checked
 from runner.service.pages.forms import Form
 from runner.service.pages.rendering import page, viewer_of
-from runner.service.problems import trouble_of
+from runner.service.problems import error_body
 
 router = APIRouter(prefix="/submit", include_in_schema=False)
 
@@ -86,7 +86,7 @@ async def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
 
 def _refused(request: Request, text: str, error: RunnerError) -> Response:
     """Return the form with what is wrong, each mistake with its line."""
-    trouble = trouble_of(error, request.app.state.settings)
+    trouble = error_body(error, request.app.state.settings)
     lines = text.splitlines()
     problems = [
         {"line": p.line, "path": p.path, "message": p.message, "text": _line(lines, p.line)}

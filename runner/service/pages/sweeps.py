@@ -18,12 +18,12 @@ from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.filters import parse
 from runner.service import played
 from runner.service.catalogue import Catalogue
-from runner.service.dependencies import CatalogueOf, JobsOf, KeptOf, SettingsOf, SweepProcesses
+from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
 from runner.service.pages.jobs import shown_job
 from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page, picture_address, templates
 from runner.service.processes import ProcessPool
-from runner.service.response_cache import ALWAYS, Kept
+from runner.service.response_cache import ALWAYS, ResponseCache
 from runner.sweep.names import folder_of, sweeps_in, tag_of
 from runner.sweep.state import read_sweep
 
@@ -64,8 +64,8 @@ async def sweep(
     name: Name,
     settings: SettingsOf,
     catalogue: CatalogueOf,
-    kept: KeptOf,
-    apart: SweepProcesses,
+    cache: CacheOf,
+    processes: SweepProcesses,
     jobs: JobsOf,
     whole: Annotated[bool, Query(description="Wait for results and pictures.")] = False,
 ) -> Response:
@@ -73,7 +73,7 @@ async def sweep(
     seen = await run_in_threadpool(_look, name, settings.recordings, catalogue)
     parts: dict[str, str | None] = {}
     for part, render in _RENDERERS.items():
-        body = await _made(seen, part, kept, apart) if whole else kept.found((f"sweep {part}", seen))
+        body = await _made(seen, part, cache, processes) if whole else cache.get((f"sweep {part}", seen))
         parts[part] = await run_in_threadpool(render, body) if body else None
 
     def shown() -> Response:
@@ -94,11 +94,16 @@ async def sweep(
 
 @router.get("/{name}/{part}")
 async def sweep_part(
-    name: Name, part: Part, settings: SettingsOf, catalogue: CatalogueOf, kept: KeptOf, apart: SweepProcesses
+    name: Name,
+    part: Part,
+    settings: SettingsOf,
+    catalogue: CatalogueOf,
+    cache: CacheOf,
+    processes: SweepProcesses,
 ) -> Response:
     """Return a part of a sweep's page: the ranking, what mattered, or the pictures."""
     seen = await run_in_threadpool(_look, name, settings.recordings, catalogue)
-    body = await _made(seen, part, kept, apart)
+    body = await _made(seen, part, cache, processes)
     return HTMLResponse(await run_in_threadpool(_RENDERERS[part], body))
 
 
@@ -135,11 +140,11 @@ def _look(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _Seen:
     return _Seen(name, folder, len(rows), digest)
 
 
-async def _made(seen: _Seen, part: str, kept: Kept, apart: ProcessPool) -> bytes:
+async def _made(seen: _Seen, part: str, cache: ResponseCache, processes: ProcessPool) -> bytes:
     """Return a part of a sweep's page as data, made by a child process unless it is kept."""
     make = _MAKERS[part]
-    return await kept.awaited(
-        (f"sweep {part}", seen), lambda: apart(make, seen.name, seen.folder, seen.digest), ALWAYS
+    return await cache.get_or_await(
+        (f"sweep {part}", seen), lambda: processes(make, seen.name, seen.folder, seen.digest), ALWAYS
     )
 
 

@@ -26,11 +26,11 @@ from served import Served
 import runner
 from runner.cli import cli
 from runner.client import client as client_module
-from runner.client.address import checked_url, found_token
-from runner.client.backoff import Patience, ServerAway, ServerError
+from runner.client.address import checked_url, find_token
+from runner.client.backoff import Backoff, ServerError, ServerUnavailable
 from runner.client.client import Client
 from runner.client.outbox import outbox_folder
-from runner.client.upload_source import Parcel, Sent
+from runner.client.upload_source import UploadSource, UploadStatus
 from runner.export.mcap import export_mcap
 from runner.recording.labels import change_labels
 from runner.runs.resolve import find_run
@@ -88,7 +88,7 @@ def copies(run, folder, count):
     """Return runs of the same content, each with an id of its own."""
     paths = {f"copy{number}": folder / f"{number}.mcap" for number in range(count)}
     return [
-        Parcel(with_id(run_id, run.recording, path), "copy", run_id, run={"status": "finished"})
+        UploadSource(with_id(run_id, run.recording, path), "copy", run_id, run={"status": "finished"})
         for run_id, path in paths.items()
     ]
 
@@ -140,7 +140,7 @@ def test_a_refused_run_is_said_to_be(server, run, tmp_path):
     data[len(data) // 2] ^= 1
     (tmp_path / "bad.mcap").write_bytes(data)
     with Client(server.url) as client, pytest.raises(ServerError, match="refused the run"):
-        client.push(Parcel(tmp_path / "bad.mcap"))
+        client.push(UploadSource(tmp_path / "bad.mcap"))
 
 
 def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recordings, tmp_path, monkeypatch):
@@ -166,19 +166,19 @@ def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recor
 def test_what_is_waited_for_is_told_and_for_as_long_as_the_server_says(monkeypatch):
     slept, told = [], []
     monkeypatch.setattr("runner.client.backoff.time.sleep", slept.append)
-    locked = ServerAway("token: too many wrong ones; try again in 40 s.", 429, 40)
-    patience = Patience(60, told.append)
+    locked = ServerUnavailable("token: too many wrong ones; try again in 40 s.", 429, 40)
+    patience = Backoff(60, told.append)
     patience.wait(locked)
     assert (slept, told) == ([40], [f"{locked} Trying again, for 60 s at most."])
-    with pytest.raises(ServerAway, match="too many"):
-        Patience(30, told.append).wait(locked)
+    with pytest.raises(ServerUnavailable, match="too many"):
+        Backoff(30, told.append).wait(locked)
     slept.clear(), told.clear()
     patience.moved()
     for _ in range(3):
-        patience.wait(ServerAway("does not answer"))
+        patience.wait(ServerUnavailable("does not answer"))
     assert (slept, told) == ([0.2, 0.4, 0.8], []), "what is over at once is not told"
     for _ in range(2):
-        patience.wait(ServerAway("does not answer"))
+        patience.wait(ServerUnavailable("does not answer"))
     assert (slept[3:], len(told)) == ([1.6, 3.2], 1)
 
 
@@ -186,7 +186,7 @@ def test_how_long_a_server_has_one_wait_is_heard():
     answer = httpx2.Response(429, headers={"retry-after": "40"}, json={"error": {"message": "too many"}})
     with Client("http://localhost:8000") as client:
         client._http = httpx2.Client(transport=httpx2.MockTransport(lambda _: answer), base_url=client.url)
-        with pytest.raises(ServerAway, match="too many") as raised:
+        with pytest.raises(ServerUnavailable, match="too many") as raised:
             client.ask("GET", "/runs")
     assert (raised.value.status, raised.value.retry_seconds) == (429, 40)
 
@@ -194,13 +194,13 @@ def test_how_long_a_server_has_one_wait_is_heard():
 def test_tokens_and_addresses_are_checked(tmp_path, monkeypatch):
     monkeypatch.setenv("DUALTAXI_TOKEN_FILE", str(tmp_path / "token"))
     with pytest.raises(runner.RunnerError, match="file with a token"):
-        found_token()
+        find_token()
     (tmp_path / "token").write_text("abc\n")
-    assert (found_token(), found_token("said")) == ("abc", "said")
+    assert (find_token(), find_token("said")) == ("abc", "said")
     monkeypatch.setenv("DUALTAXI_TOKEN", "variable")
-    assert found_token() == "variable"
+    assert find_token() == "variable"
     with pytest.raises(runner.RunnerError, match="one line"):
-        found_token("two words")
+        find_token("two words")
     assert checked_url("https://runs.example.org/them/") == "https://runs.example.org/them"
     for wrong in ("localhost:8000", "http://", "file:///etc", "http://a:b@c", "http://c/?x=1"):
         with pytest.raises(runner.RunnerError, match="server: found"):
@@ -212,16 +212,16 @@ def test_tokens_and_addresses_are_checked(tmp_path, monkeypatch):
 
 def test_a_server_killed_in_the_middle_of_twenty_uploads_loses_none(own_server, run, tmp_path, monkeypatch):
     monkeypatch.setattr(client_module, "PIECE", 8 << 10)
-    parcels = copies(run, tmp_path, 20)
+    sources = copies(run, tmp_path, 20)
     own_server.start()
     some, begun = threading.Semaphore(0), time.monotonic()
 
-    def push(parcel):
+    def push(source):
         with Client(own_server.url, patience=120) as client:
-            return client.push(parcel, lambda done, total: some.release() if 0 < done < total else None)
+            return client.push(source, lambda done, total: some.release() if 0 < done < total else None)
 
     with ThreadPoolExecutor(20) as pool:
-        sent = [pool.submit(push, parcel) for parcel in parcels]
+        sent = [pool.submit(push, source) for source in sources]
         for _ in range(40):
             assert some.acquire(timeout=60)
         own_server.kill()
@@ -233,9 +233,9 @@ def test_a_server_killed_in_the_middle_of_twenty_uploads_loses_none(own_server, 
         states = [future.result(120) for future in sent]
     assert {state.state for state in states} == {"stored"}
     assert len(list_runs(own_server.recordings)) == 20, time.monotonic() - begun
-    for parcel in parcels:
-        stored = find_run(parcel.run_id, own_server.recordings)
-        assert stored.recording.read_bytes() == parcel.path.read_bytes()
+    for source in sources:
+        stored = find_run(source.run_id, own_server.recordings)
+        assert stored.recording.read_bytes() == source.path.read_bytes()
     assert not list(own_server.recordings.glob(".uploads/*/body"))
 
 
@@ -256,7 +256,7 @@ def test_a_connection_that_lies_or_is_cut_leaves_what_came(server, run):
         now = until(lambda now: now.offset, lambda: client.standing(sent))
         assert now.offset == 1000
         with pytest.raises(ServerError, match="expected the"):
-            client.complete(now, Parcel(run.recording), len(data), "0" * 64)
+            client.complete(now, UploadSource(run.recording), len(data), "0" * 64)
         client.give_up(now)
         with pytest.raises(ServerError, match="no such upload"):
             client.standing(now)
@@ -270,7 +270,7 @@ def test_a_pull_goes_on_where_it_was_cut_off(server, recordings, tmp_path, monke
         begun.append(offset)
         for piece in real(self, path, tag, offset, size):
             yield piece[: size // 3]
-            raise ServerAway("cut off")
+            raise ServerUnavailable("cut off")
 
     with Client(server.url) as client:
         client.push(run)
@@ -289,7 +289,7 @@ def test_a_recording_made_to_exhaust_memory_is_refused(server, tmp_path, run):
     bomb = zstandard.compress(bytes(1 << 28), 19)
     (tmp_path / "bomb.mcap").write_bytes(data[:at] + bomb + data[at + len(bomb) :])
     with Client(server.url) as client, pytest.raises(ServerError, match="refused"):
-        client.push(Parcel(tmp_path / "bomb.mcap"))
+        client.push(UploadSource(tmp_path / "bomb.mcap"))
 
 
 # --- loops ------------------------------------------------------------------------------------------------
@@ -410,5 +410,5 @@ def test_an_upload_begun_with_other_bytes_is_sent_anew(server, run):
         wrong = client.append(begun, run.recording, 5_000)
         assert wrong.offset == 5_000
         other = list_runs(run.folder.parent)[0 if list_runs(run.folder.parent)[0].name == "second" else 1]
-        sent = client.push(other, begun=Sent(begun.id, "receiving", 0))
+        sent = client.push(other, begun=UploadStatus(begun.id, "receiving", 0))
     assert (sent.state, sent.run_id) == ("stored", other.run_id)

@@ -8,7 +8,7 @@ import pytest
 
 from runner.errors import RunnerError, StorageError
 from runner.service.jobs import queue as queues
-from runner.service.jobs.queue import NoSuchJob, Queue, QueueFull
+from runner.service.jobs.queue import JobNotFound, Queue, QueueFull
 
 CONFIG = {"episodes": 3}
 
@@ -61,7 +61,7 @@ def test_the_oldest_that_are_over_are_forgotten_but_no_number_is_given_twice(tmp
         waiting = added(queue)
         assert [job.number for job in queue.jobs()] == [3, 4, 5]
         assert not queue.folder_of(1).exists()
-        with pytest.raises(NoSuchJob, match="no job 1;"):
+        with pytest.raises(JobNotFound, match="no job 1;"):
             queue.job(1)
     with Queue(tmp_path) as queue:
         assert [job.number for job in queue.jobs()] == [3, 4, waiting.number]
@@ -160,5 +160,5 @@ def test_the_last_events_are_read_from_the_end_of_the_file(queue, monkeypatch):
     assert [event.data["text"] for event in found] == [f"line {number}" for number in range(90, 100)]
     assert queue.events(job.number, place) == ([], place)
     assert 10 < len(queue.last_events(job.number, 100)[0]) < 30, "no more than are read at once"
-    with pytest.raises(NoSuchJob):
+    with pytest.raises(JobNotFound):
         queue.last_events(9, 10)

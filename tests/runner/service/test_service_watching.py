@@ -11,7 +11,7 @@ from submitted import ENDLESS, ICY
 
 from runner.client.backoff import ServerError
 from runner.client.client import Client
-from runner.client.jobs import Happened, JobThere, events_in
+from runner.client.jobs import JobEvent, RemoteJob, events_in
 from runner.errors import RunnerError
 from runner.runs.run import list_runs
 
@@ -55,7 +55,7 @@ def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
         assert [job.number for job in client.jobs()] == [second.number, first.number]
         assert client.cancel(first.number).is_over
         *_, last = client.watch(second.number)
-        assert last == Happened("state", last.data, last.place)
+        assert last == JobEvent("state", last.data, last.place)
         assert last.data["state"] == "finished"
         done = client.job(second.number)
         assert sorted(done.begun.values()) == sorted(
@@ -71,9 +71,9 @@ def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
 def test_events_are_read_and_one_that_was_cut_off_is_left_out():
     lines = ["retry: 1000", "", ": still here", "", "id: 7", "event: log", 'data: {"text": "a: b"}', ""]
     cut_off = ["id: 9", "event: state", 'data: {"sta']
-    assert list(events_in([*lines, *cut_off])) == [Happened("log", {"text": "a: b"}, "7")]
+    assert list(events_in([*lines, *cut_off])) == [JobEvent("log", {"text": "a: b"}, "7")]
 
 
 def test_another_answer_than_that_of_a_job_is_told():
     with pytest.raises(RunnerError, match="found another answer"):
-        JobThere.of({"number": 1})
+        RemoteJob.of({"number": 1})
