@@ -8,7 +8,7 @@ without a traceback and exits with `exit_code`.
     ├── EnvironmentNotUsable an environment is unknown, or has no transition table
     ├── RecordingError       a recording is damaged, foreign, or of an unknown version
     ├── Diverged             a recording differs from what its job gives
-    ├── RunNotFound          no run, or more than one, answers to a name
+    ├── RunNotFound          no run, or more than one, matches a name
     ├── StorageError         a file or folder cannot be written, or the disk is full
     └── MissingExtra         an optional package is needed that is not installed
 """
@@ -79,7 +79,7 @@ class Diverged(RunnerError):
 
 
 class RunNotFound(RunnerError):
-    """A name answers to no run, or to several."""
+    """A name matches no run, or several."""
 
 
 class StorageError(RunnerError):

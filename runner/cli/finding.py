@@ -17,10 +17,9 @@ if TYPE_CHECKING:
 def find(name: str, recordings: Path | None) -> Run:
     """Return the run of a name, or of a path, in the chosen folder."""
     from runner.cli.output import say
-    from runner.runs.catalogue.lookup import find_run
-    from runner.runs.run import recordings_folder
+    from runner.runs.resolve import find_run
 
-    return find_run(name, recordings_folder(recordings), say)
+    return find_run(name, recordings, report=say)
 
 
 def find_recorded(name: str, recordings: Path | None) -> Run:
@@ -34,12 +33,12 @@ def find_all_recorded(names: Iterable[str], recordings: Path | None) -> list[Run
     A name stands for all runs of that name.
     """
     from runner.cli.output import say
-    from runner.runs.catalogue.lookup import find_all
+    from runner.runs.resolve import find_runs
     from runner.runs.run import recordings_folder
 
     found: dict[Path, Run] = {}
     for name in names:
-        for run in find_all(name, recordings_folder(recordings), say):
+        for run in find_runs(name, recordings_folder(recordings), say):
             found.setdefault(run.recording.absolute(), run)
     return [recorded(run) for run in found.values()]
 

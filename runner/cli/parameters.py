@@ -23,7 +23,7 @@ class RunName(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # gener
         incomplete: str,
     ) -> list[CompletionItem]:
         """Return ids and names that begin so, the newest first; paths, once there is a slash."""
-        from runner.runs.catalogue.lookup import completions
+        from runner.runs.resolve import completions
         from runner.runs.run import recordings_folder
 
         if "/" in incomplete or "\\" in incomplete:

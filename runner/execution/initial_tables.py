@@ -28,19 +28,19 @@ def settle(job: Job, run: Run) -> tuple[Job, Run]:
     Raises:
         RunnerError: `initial_q` names no run, or its folder cannot be written.
     """
-    config = settled(job.config, run.folder.parent, but=run.run_id)
+    config = settled(job.config, run.folder.parent, exclude=run.run_id)
     if config == job.config:
         return job, run
     return Job(config, job.seed), run.update(config=config.to_mapping())
 
 
-def settled(config: ExperimentConfig, recordings: Path, but: str = "") -> ExperimentConfig:
+def settled(config: ExperimentConfig, recordings: Path, exclude: str = "") -> ExperimentConfig:
     """Return a configuration that says by id and step which table it begins with, if it begins with a run's.
 
     Args:
         config: the configuration.
         recordings: the folder to find the run in.
-        but: the id of a run that is not meant: the one that is asking.
+        exclude: the id of the run that begins with the table, which is never meant.
 
     Raises:
         RunnerError: `initial_q` names no run, or one that cannot be read.
@@ -48,7 +48,7 @@ def settled(config: ExperimentConfig, recordings: Path, but: str = "") -> Experi
     start = config.initial_q
     if not isinstance(start, RunTable):
         return config
-    source, step = find_run(start.run, recordings, but), start.step
+    source, step = find_run(start.run, recordings, exclude), start.step
     if step is None:
         with open_recording(at_hand(source).recording) as recording:
             step = _last_step(recording)
@@ -72,7 +72,7 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
     start = job.config.initial_q
     if not isinstance(start, RunTable):
         return None
-    source = find_run(start.run, run.folder.parent, but=run.run_id)
+    source = find_run(start.run, run.folder.parent, exclude=run.run_id)
     with open_recording(at_hand(source).recording) as recording:
         held = held_at(recording, _last_step(recording) if start.step is None else start.step)
     joint = job.config.tables == "joint"

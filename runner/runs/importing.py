@@ -22,9 +22,9 @@ from runner.recording.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, chan
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of, continues, rewrite
 from runner.recording.run_file import parse_run_file
-from runner.runs.catalogue.lookup import with_id
 from runner.runs.locking import locked
-from runner.runs.run import MADE_BY, RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at, runs_in
+from runner.runs.resolve import run_with_id
+from runner.runs.run import MADE_BY, RECORDING_FILE, RUN_FILE, Run, new_run_id, run_at
 from runner.util.files import storage_errors, sync, write_object
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN
 
@@ -194,8 +194,7 @@ def _same_run(run_id: str, content_digest: str, recordings: Path) -> Run | None:
         Occupied: a run of this id has other content.
         StorageError: something that is not a run has its name.
     """
-    taken = with_id(run_id, recordings)
-    found = taken and next(runs_in(Path(taken.root, taken.entry)), None)
+    found = run_with_id(run_id, recordings)
     if found is None:
         if os.path.lexists(recordings / run_id):
             raise StorageError(f"{recordings / run_id}: exists and is not a run; move it away.")

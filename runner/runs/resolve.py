@@ -1,119 +1,206 @@
-"""The one run that an id, the beginning of one, a name, a path or `@latest` stands for."""
+"""Find runs by id, prefix of an id, name, path or `@latest`, alike for commands, Python and the service."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
-from datetime import datetime
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from runner.errors import RunNotFound, nearest
-from runner.runs.run import Run, list_runs, recordings_folder, run_at, run_of_id
+from runner.recording.run_file import run_title
+from runner.runs.run import Run, recordings_folder, run_at, run_of_id, runs_in
 from runner.util.values import RUN_NAME_PATTERN
 
+if TYPE_CHECKING:
+    from runner.runs.catalogue.index import Index
+
 LATEST: Final = "@latest"
-"""What stands for the newest run, after a name for the newest of that name."""
-_TOLD: Final = 20
-"""Runs that an error names."""
-_MAX_NEAR: Final = 1000
-"""Runs, the newest, whose names are compared with one that was not found."""
+"""Names the newest run; after a name, the newest run of that name."""
+_MAX_LISTED: Final = 20
+_MAX_SUGGESTED: Final = 1000
+"""The newest runs, whose names are compared with one that was not found."""
+
+Report = Callable[[str], None]
 
 
-class Named(Protocol):
-    """What a run can be named by."""
+class Candidate(NamedTuple):
+    """A run as the index has it."""
 
-    @property
-    def run_id(self) -> str:
-        """Its id."""
-
-    @property
-    def name(self) -> str:
-        """What it is called."""
-
-    @property
-    def title(self) -> str:
-        """Its name, and its seed if it has one."""
+    root: str
+    entry: str
+    run_id: str
+    name: str
+    seed: int | None
+    milliseconds: int
 
     @property
     def created(self) -> datetime:
-        """When it began."""
+        """When the run began, in UTC."""
+        return datetime.fromtimestamp(self.milliseconds / 1000, UTC)
+
+    def run(self) -> Run:
+        """Return the run.
+
+        Raises:
+            RunNotFound: it was removed in the meantime.
+        """
+        for run in runs_in(Path(self.root, self.entry)):
+            return run
+        raise RunNotFound(f"run {self.run_id} was removed just now.")
 
 
-AnyNamed = TypeVar("AnyNamed", bound=Named)
-
-
-def find_run(name: str, recordings: str | os.PathLike[str] | None = None, but: str = "") -> Run:
-    """Return the one run that answers to an id, a unique prefix of it, a name, a path or `@latest`.
+def find_run(
+    name: str,
+    recordings: str | os.PathLike[str] | None = None,
+    exclude: str = "",
+    report: Report = lambda _: None,
+) -> Run:
+    """Return the run with an id, a unique prefix of an id, a name, a path or `@latest`.
 
     `NAME@latest` is the newest run of that name.
 
     Args:
-        name: what it must answer to.
-        recordings: the folder to look in: $DUALTAXI_RECORDINGS, or ./recordings, unless given.
-        but: the id of a run that does not answer: the one that is asking.
+        name: the name.
+        recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, by default.
+        exclude: the id of a run that never matches.
+        report: called with messages about the index.
 
     Raises:
-        RunNotFound: none does, or several do.
+        RunNotFound: no run matches, or several do.
     """
     folder = recordings_folder(recordings)
-    known = run_at_once(name, folder)
-    if known is not None and known.run_id != but:
-        return known
-    return the_one(name, [run for run in list_runs(folder) if run.run_id != but], folder)
+    run = run_at(Path(name)) if _is_path(name) else run_of_id(name, folder)
+    if run is not None and run.run_id != exclude:
+        return run
+    from runner.runs.catalogue.folders import Depth
+    from runner.runs.catalogue.index import look
+
+    def matches(depth: Depth) -> list[Candidate]:
+        return look([folder], lambda index: matching(name, index, exclude), report, depth=depth)
+
+    candidates = matches(Depth.NAMES)
+    # Ids and ages never change, but a run may have been given or have lost a name since the last look.
+    if name != LATEST and not (len(candidates) == 1 and candidates[0].name != name):
+        candidates = matches(Depth.FOLDERS) or matches(Depth.FILES)
+    if not candidates:
+        raise look([folder], lambda index: not_found(name, index, folder), report, as_known=True)
+    return choose(name, candidates).run()
 
 
-def run_at_once(name: str, recordings: Path) -> Run | None:
-    """Return the run at a path, or in the folder called like its id; None if others must be looked at.
-
-    What looks like a path may also be a name with a slash, such as `ALE/Pong-v5`, if nothing is there.
-
-    Raises:
-        RunNotFound: it is a path, and there is no run.
-    """
-    if os.sep in name or name.endswith(".mcap") or (os.altsep and os.altsep in name):
-        stem = name.removesuffix(LATEST)
-        if re.fullmatch(RUN_NAME_PATTERN, stem) and not name.endswith(".mcap") and not os.path.lexists(name):
-            return None
-        return run_at(Path(name))
-    return run_of_id(name, recordings)
-
-
-def the_one(name: str, runs: Sequence[AnyNamed], recordings: Path) -> AnyNamed:
-    """Return the one of these runs, the newest first, that answers to a name, but no path.
+def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> list[Run]:
+    """Return all runs of a name, the oldest first; else the run that `find_run` returns.
 
     Raises:
-        RunNotFound: none does, or several do.
+        RunNotFound: no run matches, or the name is a prefix of several ids.
     """
+    from runner.runs.catalogue.folders import Depth
+    from runner.runs.catalogue.index import look
+
+    runs = look([recordings], lambda index: of_name(name, index), report, depth=Depth.FOLDERS)
+    return [found.run() for found in runs] or [find_run(name, recordings, report=report)]
+
+
+def run_with_id(run_id: str, recordings: Path) -> Run | None:
+    """Return the run with an id, whatever its folder is called; None if there is none.
+
+    Raises:
+        StorageError: the recordings folder cannot be read.
+    """
+    from runner.runs.catalogue.folders import Depth
+    from runner.runs.catalogue.index import look
+
+    found = look([recordings], lambda index: matching(run_id, index), depth=Depth.FOLDERS)
+    place = next((Path(run.root, run.entry) for run in found if run.run_id == run_id), None)
+    return next(runs_in(place), None) if place else None
+
+
+def matching(name: str, index: Index, exclude: str = "") -> list[Candidate]:
+    """Return the runs that a name, but no path, may stand for, the newest first; `choose` picks one."""
+    if not name:
+        return []
+    rows = []
+    if name.endswith(LATEST):
+        rows = index.newest(name.removesuffix(LATEST), 2 if exclude else 1)
+    found = [run for run in map(Candidate._make, rows or index.named(name)) if run.run_id != exclude]
+    return found[:1] if rows else found
+
+
+def of_name(name: str, index: Index) -> list[Candidate]:
+    """Return all runs of a name, the oldest first."""
+    return [run for run in reversed(matching(name, index)) if run.name == name]
+
+
+def choose(name: str, candidates: Sequence[Candidate]) -> Candidate:
+    """Return the run that a name stands for, of those that `matching` returned, which are not empty.
+
+    Raises:
+        RunNotFound: the name is ambiguous.
+    """
+    exact = [run for run in candidates if run.run_id == name]
+    if len(exact) == 1 or len(candidates) == 1:
+        return (exact or candidates)[0]
+    listed = [
+        f"  {run.run_id}  {run_title(run.name, run.seed)}  {run.created:%Y-%m-%d %H:%M}"
+        for run in candidates[:_MAX_LISTED]
+    ]
+    if len(candidates) > _MAX_LISTED:
+        listed.append(f"  and {len(candidates) - _MAX_LISTED:,} more")
+    is_name = any(run.name == name for run in candidates)
+    newest = f", or the newest of this name by {name}{LATEST}" if is_name else ""
+    raise RunNotFound(
+        "\n".join([f"{name!r} matches {len(candidates)} runs; name one by its id{newest}:", *listed])
+    )
+
+
+def not_found(name: str, index: Index, recordings: Path) -> RunNotFound:
+    """Return the error for a name that no run matches, with the most similar name."""
+    runs = [Candidate(*row) for row in index.newest(limit=_MAX_SUGGESTED)]
     if not runs:
-        raise RunNotFound(
+        return RunNotFound(
             f"no run {name!r}: there are no runs in {recordings} yet. `dualtaxi run` makes one."
         )
     if not name:
-        raise RunNotFound("found an empty name, expected an id, the beginning of one, a name or @latest.")
-    if name.endswith(LATEST):
-        stem = name.removesuffix(LATEST)
-        newest = next((run for run in runs if stem in ("", run.name)), None)
-        if newest is not None:
-            return newest
-    exact = [run for run in runs if run.run_id == name]
-    found = exact or [run for run in runs if run.name == name or run.run_id.startswith(name)]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        several = "\n".join(
-            f"  {run.run_id}  {run.title}  {run.created:%Y-%m-%d %H:%M}" for run in found[:_TOLD]
-        )
-        more = f"\n  and {len(found) - _TOLD:,} more" if len(found) > _TOLD else ""
-        or_newest = (
-            f", or the newest of this name by {name}@latest" if any(run.name == name for run in found) else ""
-        )
-        raise RunNotFound(
-            f"{name!r} answers to {len(found)} runs; name one by its id{or_newest}:\n{several}{more}"
-        )
-    newest_runs = runs[:_MAX_NEAR]
-    hint = nearest(name, {run.name for run in newest_runs} | {run.run_id for run in newest_runs})
-    raise RunNotFound(
-        f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {len(runs):,} there are."
+        return RunNotFound("found an empty name, expected an id, the beginning of one, a name or @latest.")
+    names = {run.name for run in runs}
+    if "@" in name:
+        names = {LATEST} | {f"{each}{LATEST}" for each in names}
+    hint = nearest(name, names | {run.run_id for run in runs})
+    return RunNotFound(
+        f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {index.count():,} there are."
     )
+
+
+def completions(beginning: str, recordings: Path) -> dict[str, str]:
+    """Return the ids and names of runs that begin with a text, and what each stands for.
+
+    Of very many only the newest are offered.
+
+    Raises:
+        StorageError: the recordings folder cannot be read.
+    """
+    from runner.runs.catalogue.folders import Depth
+    from runner.runs.catalogue.index import look
+
+    def work(index: Index) -> dict[str, str]:
+        found = {LATEST: "the newest run"} if index.newest() else {}
+        found |= {row[2]: run_title(*row[3:5]) for row in index.with_id_prefix(beginning)}
+        for name, count in index.names_from(beginning.rpartition("@")[0] or beginning):
+            if count == 1:
+                found[name] = "the run of this name"
+            else:
+                found[f"{name}{LATEST}"] = "the newest of this name"
+        return {text: meaning for text, meaning in found.items() if text.startswith(beginning)}
+
+    return look([recordings], work, depth=Depth.FOLDERS)
+
+
+def _is_path(name: str) -> bool:
+    """Return whether a name is a path; a missing one may be a name with a slash, such as `ALE/Pong-v5`."""
+    if name.endswith(".mcap"):
+        return True
+    if os.sep not in name and not (os.altsep and os.altsep in name):
+        return False
+    return os.path.lexists(name) or not re.fullmatch(RUN_NAME_PATTERN, name.removesuffix(LATEST))

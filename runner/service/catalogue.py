@@ -14,8 +14,7 @@ from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.database import Version, version
 from runner.runs.catalogue.folders import Depth
 from runner.runs.catalogue.index import look
-from runner.runs.catalogue.lookup import Candidate, all_of_name, answering, run_of
-from runner.runs.resolve import the_one
+from runner.runs.resolve import choose, matching, not_found, of_name
 from runner.runs.run import Run, run_of_id
 
 if TYPE_CHECKING:
@@ -102,35 +101,29 @@ class Catalogue:
         """Return the run that an id, the beginning of one, a name or `@latest` names; no path does.
 
         Raises:
-            RunNotFound: no run answers to the name, or several do.
+            RunNotFound: no run matches the name, or several do.
         """
         _refuse_path(name)
         for root in self.roots:
             known = run_of_id(name, root)
             if known is not None:
                 return known
-
-        def answer(index: Index) -> list[Candidate]:
-            return answering(name, index)
-
-        def answer_or_all(index: Index) -> list[Candidate]:
-            return answering(name, index) or answering("", index)
-
-        try:
-            found = the_one(name, self.read(answer), self.roots[0])
-        except RunNotFound:  # it may be newer than the last look
-            found = the_one(name, look(self.roots, answer_or_all, self._tell), self.roots[0])
-        return run_of(found, Path(found.root))
+        candidates = self.read(lambda index: matching(name, index))
+        if len(candidates) != 1:  # it may be newer than the last look
+            candidates = look(self.roots, lambda index: matching(name, index), self._tell)
+        if not candidates:
+            raise self.read(lambda index: not_found(name, index, self.roots[0]))
+        return choose(name, candidates).run()
 
     def find_all(self, name: str) -> list[Run]:
-        """Return all runs of a name, the oldest first; else the one that answers to it.
+        """Return all runs of a name, the oldest first; else the run that `find` returns.
 
         Raises:
             RunNotFound: none does, or it is the beginning of several ids.
         """
         _refuse_path(name)
-        alike = self.read(lambda index: all_of_name(name, index))
-        return [run_of(found, Path(found.root)) for found in alike] or [self.find(name)]
+        alike = self.read(lambda index: of_name(name, index))
+        return [found.run() for found in alike] or [self.find(name)]
 
     def _is_known(self, now: Version) -> bool:
         """Return whether a look not long ago saw to it that the index agrees with the folders."""

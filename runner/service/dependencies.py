@@ -73,7 +73,7 @@ def found_run(run: RunName, catalogue: CatalogueOf) -> Run:
     """Return the run that the path names.
 
     Raises:
-        RunNotFound: no run answers to the name, or several do.
+        RunNotFound: no run matches the name, or several do.
     """
     return catalogue.find(run)
 

@@ -24,6 +24,7 @@ from runner.runs.run import check_folder_name
 
 Found = TypeVar("Found")
 
+ANY_RUN: Final = Filter(None)
 _FEW: Final = 1000
 """Values that one query may name."""
 
@@ -63,7 +64,7 @@ class Index:
         found: Any = query.dicts().bind(self._database)
         return iter(found.iterator())
 
-    def count(self, chosen: Filter) -> int:
+    def count(self, chosen: Filter = ANY_RUN) -> int:
         """Return how many rows pass a filter."""
         self._check_settings(chosen)
         (counted,) = self._tuples(self._of(chosen, fn.COUNT(Row.entry)))
@@ -151,22 +152,22 @@ class Index:
     def named(self, name: str) -> list[tuple[Any, ...]]:
         """Return the runs that an id, the beginning of one or a name may stand for, the newest first.
 
-        Each is root, entry, id, name, seed and creation (ms). An empty name stands for all.
+        Each is root, entry, id, name, seed and creation (ms).
         """
-        return self._names((_begins(Row.id, name) | (Row.name == text(name))) if name else None)
+        return self._names(_begins(Row.id, name) | (Row.name == text(name)))
 
-    def ids_from(self, beginning: str) -> list[tuple[str, str, int]]:
-        """Return id, name and seed of runs whose ids begin so, at most the 1,000 newest."""
-        return [found[2:5] for found in self._names(_begins(Row.id, beginning), _FEW)]
+    def with_id_prefix(self, beginning: str) -> list[tuple[Any, ...]]:
+        """Return runs whose ids begin so, at most the 1,000 newest, as `named` does."""
+        return self._names(_begins(Row.id, beginning), _FEW)
 
     def names_from(self, beginning: str) -> list[tuple[str, int]]:
         """Return names that begin so, at most 1,000, and how many runs have each."""
         chosen = self._of(Filter(_begins(Row.name, beginning)), Row.name, fn.COUNT(Row.entry))
         return [(name, count) for name, count in self._tuples(chosen.group_by(Row.name).limit(_FEW))]
 
-    def newest(self, name: str = "") -> list[tuple[Any, ...]]:
-        """Return the newest run, of a name if one is given, as `named` does; none if there is none."""
-        return self._names(Row.name == text(name) if name else None, 1)
+    def newest(self, name: str = "", limit: int = 1) -> list[tuple[Any, ...]]:
+        """Return the newest runs, of a name if one is given, as `named` does."""
+        return self._names(Row.name == text(name) if name else None, limit)
 
     def _names(self, condition: Any, limit: int | None = None) -> list[tuple[Any, ...]]:
         columns = (Row.root, Row.entry, Row.id, Row.name, Row.seed, Row.created)

@@ -86,7 +86,7 @@ async def found_runs(catalogue: Catalogue, names: list[str], several: bool = Fal
         several: whether a name stands for all runs of that name, each once.
 
     Raises:
-        RunNotFound: one answers to no run, or to several and may not.
+        RunNotFound: a name matches no run, or several and may not.
         RecordingError: a run has no recording.
     """
     from starlette.concurrency import run_in_threadpool

@@ -13,7 +13,6 @@ from runner.analysis.readings import read_series
 from runner.errors import RunNotFound
 from runner.export.mlflow import _tags
 from runner.recording.reader import open_recording
-from runner.runs.catalogue.lookup import find_run as find_indexed
 from runner.runs.run import Run
 from tests.runner.loops.making import make, play
 
@@ -36,12 +35,11 @@ def test_a_recording_is_titled_by_its_seed_only_if_it_has_one(tmp_path):
             assert ("dualtaxi.seed" in tags) == (seed is not None)
 
 
-@pytest.mark.parametrize("find", [runner.find_run, find_indexed])
-def test_an_ambiguous_name_lists_no_seed_of_loops_without_one(tmp_path, find):
+def test_an_ambiguous_name_lists_no_seed_of_loops_without_one(tmp_path):
     loop(tmp_path, None)
     loop(tmp_path, None)
     with pytest.raises(RunNotFound, match="lake") as raised:
-        find("lake", tmp_path)
+        runner.find_run("lake", tmp_path)
     assert "seed" not in str(raised.value)
 
 

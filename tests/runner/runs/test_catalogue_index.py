@@ -25,7 +25,7 @@ from runner.runs.catalogue.database import index_path, opened
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.folders import Depth, Folders
 from runner.runs.catalogue.index import look
-from runner.runs.catalogue.lookup import find_run
+from runner.runs.resolve import find_run
 from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
 from runner.util.files import EXPORTS, RESTORED
 
@@ -321,7 +321,7 @@ def test_a_run_is_found_by_the_names_that_find_it_in_the_folder(folder):
     assert find_run(runs[0].run_id, folder) == find_run(runs[0].run_id[:7], folder) == runs[0]
     for name, told in (
         ("", "empty name"),
-        ("some", "answers to 2 runs"),
+        ("some", "matches 2 runs"),
         ("ptient", "Did you mean 'patient'"),
     ):
         with pytest.raises(RunNotFound, match=told):
@@ -382,7 +382,7 @@ def test_a_name_given_or_taken_away_just_now_is_known(folder):
     assert find_run("patient", folder).run_id == runs[1].run_id
     aged(folder)
     renamed(runs[2], "patient")
-    with pytest.raises(RunNotFound, match="answers to 2 runs"):
+    with pytest.raises(RunNotFound, match="matches 2 runs"):
         find_run("patient", folder)
     aged(folder)
     renamed(runs[1], "other")

@@ -114,13 +114,13 @@ def test_an_id_goes_before_a_prefix_and_a_name(folder):
     _renamed(create_run(folder, CONFIG, 2), "abcd")
     create_run(folder, CONFIG, 3, "abc")
     assert find_run("abc", folder).seed == 1
-    with pytest.raises(RunNotFound, match="answers to 2 runs"):
+    with pytest.raises(RunNotFound, match="matches 2 runs"):
         find_run("ab", folder)
 
 
 def test_several_runs_of_a_name_are_told(folder):
     made = [create_run(folder, CONFIG, seed) for seed in (1, 2)]
-    with pytest.raises(RunNotFound, match=r"'some' answers to 2 runs; .* by some@latest") as caught:
+    with pytest.raises(RunNotFound, match=r"'some' matches 2 runs; .* by some@latest") as caught:
         find_run("some", folder)
     assert all(f"{run.run_id}  some, seed {run.seed}" in str(caught.value) for run in made)
 
@@ -137,6 +137,9 @@ def test_a_wrong_name_gets_a_hint(folder):
         find_run("soem", folder)
     with pytest.raises(RunNotFound, match="no run 'other@latest'"):
         find_run("other@latest", folder)
+    for typo, name in (("@lates", "@latest"), ("some@lastest", "some@latest")):
+        with pytest.raises(RunNotFound, match=f"Did you mean '{name}'"):
+            find_run(typo, folder)
 
 
 def test_paths_that_are_no_runs(tmp_path):
