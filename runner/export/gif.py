@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from runner.analysis.frames import agents_of
-from runner.drawing import svg
+from runner.drawing import palette, svg
 from runner.environments.mdp import Mdp
 from runner.environments.naming import events_in_words, exploration_in_words, spoken, states_in_words
 from runner.errors import RecordingError
@@ -174,7 +174,7 @@ class Film:
         """Return what all frames have in common."""
         from PIL import Image, ImageDraw
 
-        still = Image.new("RGB", (width, height), "#ffffff")
+        still = Image.new("RGB", (width, height), palette.WHITE)
         _write(ImageDraw.Draw(still), heads, 4, _font(bold=True))
         if self._grid:
             grid = self._grid.still()
@@ -341,7 +341,7 @@ def _font(bold: bool) -> FreeTypeFont:
 def _write(pen: ImageDraw, lines: list[str], top: int, font: FreeTypeFont) -> None:
     for number, line in enumerate(lines):
         baseline = (_MARGIN, top + _LINE * (number + 1) - 7)
-        pen.text(baseline, line, fill="#1b1f24", font=font, anchor="ls")
+        pen.text(baseline, line, fill=palette.INK, font=font, anchor="ls")
 
 
 def _palette(frames: list[Image.Image]) -> Image.Image:

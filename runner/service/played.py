@@ -205,8 +205,9 @@ def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
 
 def _learning(results: Results, recordings: Path) -> dict[str, Any]:
     """Return how the best and the median trial of a sweep learned, or why that cannot be shown."""
+    from runner.drawing import palette
     from runner.errors import RunnerError
-    from runner.export.plots.figure import COLOURS, footnote
+    from runner.export.plots.figure import footnote
     from runner.export.plots.svg import panel_svgs
     from runner.sweep.plots import learning
 
@@ -214,5 +215,5 @@ def _learning(results: Results, recordings: Path) -> dict[str, Any]:
         groups, panels = learning(results, recordings)
     except RunnerError as error:
         return {"note": without_folders(str(error), recordings), "legend": [], "panels": []}
-    legend = [(number % len(COLOURS), group.described) for number, group in enumerate(groups)]
+    legend = [(number % len(palette.SERIES), group.described) for number, group in enumerate(groups)]
     return {"note": footnote(groups), "legend": legend, "panels": panel_svgs(panels, len(groups))}

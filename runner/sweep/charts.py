@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.drawing.svg_maps import LEVELS, colour_of
+from runner.drawing import palette
 from runner.export.plots.svg import SMALL, Chart, Scale, colour_of_line, labelled
 from runner.sweep.plots import Axis, Picture
 
@@ -62,9 +62,9 @@ def parallel_svg(picture: Picture) -> str:
     lines, places = np.array(columns).T, np.arange(len(columns), dtype=np.float64)
     x = Scale(-0.1, len(columns) - 0.75, 10.0, 580.0)
     chart = Chart(x, Scale(-0.05, 1.05, 186.0, 24.0), 590.0, 216.0, "The trials in parallel coordinates")
+    colours = palette.ramp_colours(len(lines))
     for number in range(len(lines) - 1, -1, -1):
-        colour = colour_of(round(number / max(len(lines) - 1, 1) * (LEVELS - 1)))
-        chart.line(places, lines[number], colour, stroke_width=0.9, opacity=0.7)
+        chart.line(places, lines[number], colours[number], stroke_width=0.9, opacity=0.7)
     chart.line(places, lines[0], _BEST, stroke_width=2.2)
     title = "Each trial a line, the best one thick; dark lines are better than light ones"
     chart.text(10.0, 14.0, title, font_size=9.5, font_weight="bold")

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.groups import Group
+from runner.drawing import palette
 from runner.export.plots.figure import (
-    COLOURS,
-    INK,
     STYLE,
     draw_panel,
     matplotlib_of,
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Values = NDArray[np.float64]
-BEST: Final = COLOURS[1]
+BEST: Final = palette.SERIES[1]
 _CHARACTERS: Final = 110
 """Of a line above or below the figure."""
 
@@ -51,7 +50,7 @@ def save_figure(path: Path, title: str, picture: Picture, groups: Sequence[Group
     columns = 2 if len(picture.axes) in (2, 4) else min(3, len(picture.axes))
     rows = math.ceil(len(picture.axes) / columns)
     told = [
-        (line, COLOURS[number])
+        (line, palette.SERIES[number])
         for number, group in enumerate(groups)
         for line in textwrap.wrap(group.label, _CHARACTERS, subsequent_indent="    ")
     ]
@@ -69,7 +68,7 @@ def save_figure(path: Path, title: str, picture: Picture, groups: Sequence[Group
         draw_parallel(figure.add_subplot(grid[rows, :]), picture)
         draw_panel(figure.add_subplot(grid[rows + 1, :]), panel, len(groups))
         figure.text(0.01, 1 - 0.1 / height, title, fontsize=13, weight="bold", va="top")
-        for number, (line, colour) in enumerate([(picture.footnote, INK), *told]):
+        for number, (line, colour) in enumerate([(picture.footnote, palette.INK), *told]):
             y = (foot - 0.12 - 0.16 * number) / height
             figure.text(0.01, y, line, color=colour, fontsize=7.5, va="top")
         stamp = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(path.suffix.lower(), {})
@@ -86,9 +85,9 @@ def draw_parameter(axes: Axes, picture: Picture, axis: Axis) -> None:
     values = np.array(picture.values)
     x = np.array(axis.values)
     for place, (low, high) in zip(axis.values, picture.ranges, strict=True):
-        axes.plot([place, place], [low, high], color=COLOURS[0], linewidth=0.8, alpha=0.25)
+        axes.plot([place, place], [low, high], color=palette.SERIES[0], linewidth=0.8, alpha=0.25)
     kept = np.array([trial.state == "finished" for trial in picture.trials[1:]], dtype=np.bool_)
-    dots: dict[str, Any] = {"color": COLOURS[0], "markersize": 3.5, "alpha": 0.6, "linestyle": ""}
+    dots: dict[str, Any] = {"color": palette.SERIES[0], "markersize": 3.5, "alpha": 0.6, "linestyle": ""}
     axes.plot(x[1:][kept], values[1:][kept], "o", markeredgewidth=0, **dots)
     axes.plot(x[1:][~kept], values[1:][~kept], "o", fillstyle="none", **dots)
     axes.plot(x[:1], values[:1], "D", color=BEST, markersize=6, label="best")
@@ -121,7 +120,7 @@ def draw_parallel(axes: Axes, picture: Picture) -> None:
         axes.plot(line, color=colour, linewidth=0.9, alpha=0.7)
     axes.plot(lines[0], color=BEST, linewidth=2.2)
     for column in range(len(columns)):
-        axes.axvline(column, color=INK, linewidth=0.7)
+        axes.axvline(column, color=palette.INK, linewidth=0.7)
     for column, axis in enumerate(picture.axes):
         _label_column(axes, column, axis.values, axis.log, axis.choices)
     _label_column(axes, len(columns) - 1, picture.values, picture.log, ())

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from runner.analysis.groups import Group
-from runner.export.plots.figure import COLOURS, footnote
+from runner.drawing import palette
+from runner.export.plots.figure import footnote
 from runner.export.plots.svg import panel_svgs
-from runner.export.reports.report import TEMPLATES, require_packages, templates
+from runner.export.reports.rendering import templates
+from runner.export.reports.report import require_packages
 from runner.sweep.charts import parallel_svg, parameter_svgs
 from runner.sweep.plots import learning, picture_of
 from runner.sweep.results import Results, sections
@@ -42,14 +44,10 @@ def render_sweep(results: Results, recordings: Path) -> str:
             parallel=parallel_svg(picture),
             note=picture.footnote,
             best=results.best_yaml,
-            legend=[
-                (i % len(COLOURS), COLOURS[i % len(COLOURS)], *_told(group)) for i, group in enumerate(groups)
-            ],
+            legend=[(i % len(palette.SERIES), *_told(group)) for i, group in enumerate(groups)],
             panels=panel_svgs(panels, len(groups)),
             footnote=footnote(groups),
             moment=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
-            style=(TEMPLATES / "report.css").read_text("utf-8"),
-            dark=(TEMPLATES / "report_dark.css").read_text("utf-8"),
         )
     )
 

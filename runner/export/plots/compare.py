@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from runner.analysis.compare import GroupResult, MetricResult
+from runner.drawing import palette
 from runner.export.plots.figure import (
-    COLOURS,
-    INK,
     MARKERS,
     STYLE,
     matplotlib_of,
@@ -58,7 +57,7 @@ def profile_svg(metric: MetricResult, labels: list[str]) -> str:
     def drawn(axes: Axes) -> None:
         for group in metric.groups:
             number = labels.index(group.label)
-            colour = COLOURS[number % len(COLOURS)]
+            colour = palette.SERIES[number % len(palette.SERIES)]
             axes.step(
                 metric.thresholds,
                 100 * np.array(group.profile),
@@ -80,20 +79,22 @@ def profile_svg(metric: MetricResult, labels: list[str]) -> str:
 
 
 def _draw_group(axes: Axes, group: GroupResult, row: int, number: int) -> None:
-    colour = COLOURS[number % len(COLOURS)]
+    colour = palette.SERIES[number % len(palette.SERIES)]
     values = [value for value in group.values if math.isfinite(value)]
     offsets = (
         row + _SPREAD * np.linspace(-1, 1, len(values)) if len(values) > 1 else np.full(len(values), row)
     )
     axes.plot(values, offsets, linestyle="", marker=".", markersize=4, color=colour, alpha=0.45)
     if math.isfinite(group.median):
-        axes.plot([group.median], [row], marker="|", markersize=15, markeredgewidth=1.6, color=INK)
+        axes.plot([group.median], [row], marker="|", markersize=15, markeredgewidth=1.6, color=palette.INK)
     if all(map(math.isfinite, (group.iqm.value, group.iqm.low, group.iqm.high))):
         axes.plot(
             [group.iqm.low, group.iqm.high], [row, row], color=colour, linewidth=3.4, solid_capstyle="butt"
         )
         marker = MARKERS[number % len(MARKERS)]
-        axes.plot([group.iqm.value], [row], marker=marker, markersize=6, color=colour, markeredgecolor=INK)
+        axes.plot(
+            [group.iqm.value], [row], marker=marker, markersize=6, color=colour, markeredgecolor=palette.INK
+        )
 
 
 def _svg(metric: MetricResult, title: str, kind: str, height: float, draw: Callable[[Axes], None]) -> str:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from runner.analysis.diff import TableDiff
+from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.export.plots.figure import (
-    COLOURS,
     DASHES,
     MARKERS,
     STYLE,
@@ -36,7 +36,7 @@ def tables_svg(tables: Sequence[TableDiff]) -> str:
                 axes.plot(
                     [table.episode for table in own],
                     values,
-                    color=COLOURS[2 + i % 3],
+                    color=palette.SERIES[2 + i % 3],
                     linestyle=DASHES[i % len(DASHES)],
                     marker=MARKERS[i % len(MARKERS)],
                     markersize=3.2,

@@ -20,6 +20,7 @@ import numpy as np
 
 from runner.analysis.groups import Group
 from runner.analysis.series import SHARES, is_loop, values_left_out
+from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.errors import RunnerError
 from runner.export.plots.metrics import Curve, Panel
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
 
 SUFFIXES: Final = (".png", ".svg", ".pdf")
 
-COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#777777")
 MARKERS: Final = ("o", "s", "^", "D", "v", "P", "X")
 DASHES: Final = ("-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (5, 1, 1, 1)))
 _PANEL: Final = 2.3
@@ -43,7 +43,6 @@ _BELOW: Final = 0.48
 _LETTERS_AN_INCH: Final = 17
 """Letters of a footnote that fit on an inch."""
 _BAND_OPACITY: Final = 0.2
-INK: Final = "#1b1f24"
 STYLE: Final = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
@@ -55,18 +54,18 @@ STYLE: Final = {
     "axes.labelsize": 8.5,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.edgecolor": INK,
-    "axes.labelcolor": INK,
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
+    "axes.edgecolor": palette.INK,
+    "axes.labelcolor": palette.INK,
+    "text.color": palette.INK,
+    "xtick.color": palette.INK,
+    "ytick.color": palette.INK,
     "xtick.labelsize": 8,
     "ytick.labelsize": 8,
     "legend.fontsize": 7.5,
     "legend.frameon": False,
     "lines.linewidth": 1.5,
     "grid.linewidth": 0.5,
-    "grid.color": INK,
+    "grid.color": palette.INK,
     "grid.alpha": 0.15,
     "svg.fonttype": "none",
     "svg.hashsalt": "dualtaxi",
@@ -181,7 +180,7 @@ def footnote(groups: Sequence[Group]) -> str:
 def _draw_curve(axes: Axes, panel: Panel, curve: Curve, groups: int) -> None:
     line = panel.lines.index(curve.line)
     by_line = groups == 1 and len(panel.lines) > 1
-    colour = COLOURS[(line if by_line else curve.group) % len(COLOURS)]
+    colour = palette.SERIES[(line if by_line else curve.group) % len(palette.SERIES)]
     marker = _marker(line if by_line else curve.group)
     axes.plot(
         curve.episodes,
@@ -201,7 +200,7 @@ def _draw_curve(axes: Axes, panel: Panel, curve: Curve, groups: int) -> None:
 
 def _marker(number: int) -> str:
     """Return the marker of a line; one that has the colour of an earlier line has another marker."""
-    return MARKERS[(number + number // len(COLOURS)) % len(MARKERS)]
+    return MARKERS[(number + number // len(palette.SERIES)) % len(MARKERS)]
 
 
 def _draw_shares(axes: Axes, panel: Panel) -> None:
@@ -250,7 +249,7 @@ def _honest_axes(axes: Axes, panel: Panel) -> None:
         top = max(float(np.max(curve.high)) for curve in panel.curves)
         axes.set_ylim(0, top * 1.06 or 1.0)
     else:
-        axes.axhline(0, color=INK, linewidth=0.6)
+        axes.axhline(0, color=palette.INK, linewidth=0.6)
 
 
 def number_on_axis(value: float, _: object = None) -> str:
@@ -280,7 +279,7 @@ def _legend(axes: Axes, panel: Panel, groups: int) -> None:
         Line2D(
             [],
             [],
-            color=COLOURS[number % len(COLOURS)] if groups == 1 else INK,
+            color=palette.SERIES[number % len(palette.SERIES)] if groups == 1 else palette.INK,
             linestyle=DASHES[number % len(DASHES)],
             marker=_marker(number) if groups == 1 else "",
             markersize=3.2,
@@ -304,7 +303,7 @@ def _heading(figure: Figure, groups: Sequence[Group], height: float) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
-        Line2D([], [], color=COLOURS[i % len(COLOURS)], marker=_marker(i), markersize=4)
+        Line2D([], [], color=palette.SERIES[i % len(palette.SERIES)], marker=_marker(i), markersize=4)
         for i in range(len(groups))
     ]
     figure.text(
@@ -333,8 +332,8 @@ def svg_for_page(figure: Figure, name: str, title: str) -> str:
     element = buffer.getvalue()
     element = element[element.index("<svg") :]
     element = re.sub(r"<metadata>.*?</metadata>", "", element, flags=re.DOTALL)
-    element = element.replace(INK, "currentColor")
-    for number, colour in enumerate(COLOURS):  # the page has lighter ones for the dark
+    element = element.replace(palette.INK, "currentColor")
+    for number, colour in enumerate(palette.SERIES):  # the page has lighter ones for the dark
         element = element.replace(colour.lower(), f"var(--line-{number}, {colour})")
     element = re.sub(r' width="[\d.]+pt" height="[\d.]+pt"', "", element, count=1)
     name = re.sub(r"\W+", "-", name)

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.series import SHARES
-from runner.drawing.svg_maps import LEVELS, colour_of
+from runner.drawing import palette
 from runner.environments.naming import spoken
-from runner.export.plots.figure import COLOURS, number_on_axis
+from runner.export.plots.figure import number_on_axis
 from runner.export.plots.metrics import Curve, Panel
 
 Values = NDArray[np.float64]
@@ -176,7 +176,7 @@ class Chart:
 
 def colour_of_line(number: int) -> str:
     """Return the colour of a line as pages have it: lighter in the dark."""
-    return f"var(--line-{number % len(COLOURS)}, {COLOURS[number % len(COLOURS)]})"
+    return f"var(--line-{number % len(palette.SERIES)}, {palette.SERIES[number % len(palette.SERIES)]})"
 
 
 def labelled(ticks: Sequence[float], shortened: bool = False) -> list[tuple[float, str]]:
@@ -254,7 +254,7 @@ def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int) -> None:
         chart.band(curve.episodes, curve.low, curve.high, colour, opacity=0.2)
     chart.line(curve.episodes, curve.median, colour, line)
     every = slice(None, None, max(len(curve.episodes) // 8, 1))
-    marker = number + number // len(COLOURS)
+    marker = number + number // len(palette.SERIES)
     chart.markers(curve.episodes[every], curve.median[every], colour, marker, 1.7)
 
 
@@ -272,8 +272,7 @@ def _draw_shares(chart: Chart, panel: Panel) -> None:
     """Draw shares of a whole on top of each other, the lowest reward darkest and at the bottom."""
     episodes = panel.curves[0].episodes
     bottom = np.zeros_like(panel.curves[0].median)
-    last = max(len(panel.curves) - 1, 1)
-    colours = [colour_of(round(i / last * (LEVELS - 1))) for i in range(len(panel.curves))]
+    colours = palette.ramp_colours(len(panel.curves))
     for curve, colour in zip(panel.curves, colours, strict=True):
         top = bottom + np.interp(episodes, curve.episodes, curve.median)
         chart.band(episodes, bottom, top, colour, stroke="#ffffff", stroke_width=0.3)

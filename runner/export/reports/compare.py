@@ -10,9 +10,11 @@ from runner.analysis.compare import Comparison, MetricResult
 from runner.analysis.compare.sections import EXPLANATION, in_short, metric_section
 from runner.analysis.groups import Group
 from runner.analysis.sections import Grid
+from runner.drawing import palette
 from runner.export.plots.compare import intervals_svg, letter, profile_svg
-from runner.export.plots.figure import COLOURS, footnote
-from runner.export.reports.report import TEMPLATES, curves, require_packages, templates
+from runner.export.plots.figure import footnote
+from runner.export.reports.rendering import templates
+from runner.export.reports.report import curves, require_packages
 from runner.util.humanize import UNKNOWN
 
 
@@ -36,7 +38,11 @@ def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
             lead=in_short(comparison),
             notes=comparison.notes,
             legend=[
-                (i % len(COLOURS), COLOURS[i % len(COLOURS)], letter(i), _described(group))
+                (
+                    i % len(palette.SERIES),
+                    letter(i),
+                    _described(group),
+                )
                 for i, group in enumerate(groups)
             ],
             metrics=[_metric(metric, labels) for metric in comparison.metrics],
@@ -45,8 +51,6 @@ def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
             runs=_runs(groups),
             explanation=EXPLANATION,
             moment=comparison.moment,
-            style=(TEMPLATES / "report.css").read_text("utf-8"),
-            dark=(TEMPLATES / "report_dark.css").read_text("utf-8"),
         )
     )
 

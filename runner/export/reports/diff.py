@@ -27,10 +27,10 @@ from runner.drawing import svg, svg_maps
 from runner.environments.mdp import Mdp
 from runner.environments.naming import exploration_in_words, spoken, states_in_words
 from runner.export.plots.diff import tables_svg
-from runner.export.plots.figure import COLOURS
 from runner.export.reports.episode import deeds_in_words
 from runner.export.reports.maps import situation, situation_in_words
-from runner.export.reports.report import BROAD, TEMPLATES, curves, require_packages, templates
+from runner.export.reports.rendering import templates
+from runner.export.reports.report import curves, require_packages
 from runner.recording.reader import Recording
 from runner.recording.run_file import run_title
 
@@ -57,9 +57,6 @@ def render_diff(difference: RunDiff, a: Recording, b: Recording) -> str:
         .render(
             told_of(difference, a, b),
             panels=_curves(a, b),
-            ramp=", ".join(svg_maps.RAMP),
-            style=(TEMPLATES / "report.css").read_text("utf-8") + svg.STYLE + svg_maps.STYLE,
-            dark=(TEMPLATES / "report_dark.css").read_text("utf-8"),
         )
     )
 
@@ -83,7 +80,7 @@ def told_of(difference: RunDiff, a: Recording, b: Recording) -> dict[str, Any]:
         "title": f"{difference.a['name']} against {difference.b['name']}",
         "lead": in_short(difference),
         "notes": difference.notes,
-        "legend": [(i, COLOURS[i], "AB"[i], name) for i, name in enumerate(names)],
+        "legend": [(i, "AB"[i], name) for i, name in enumerate(names)],
         "partings": [_parting(difference, *pair, a, b) for pair in _partings(difference)],
         "training": _overlap_told(told["Training"], difference) + _loops_told(told, difference),
         "visits": visits_grids(difference),
@@ -176,7 +173,12 @@ def _picture(recording: Recording, step: np.void, title: str, after: bool) -> di
     drawing = svg.Drawing(mdp.scene)
     places = drawing.places(mdp, np.array([step["state"], state]))
     picture = drawing.frame(places[1], f"{title}: {states_in_words(mdp)[state]}", places, style="")
-    return {"title": title, "svg": picture, "told": told, "broad": "broad" if drawing.width > BROAD else ""}
+    return {
+        "title": title,
+        "svg": picture,
+        "told": told,
+        "broad": "broad" if drawing.width > svg.BROAD else "",
+    }
 
 
 def _values(row: Row) -> Grid:

@@ -6,24 +6,20 @@ The page needs no network: styles, script, plots and data are in it. All of it i
 from __future__ import annotations
 
 import contextlib
-import json
-import math
-import re
 from collections.abc import Callable, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from runner.analysis.frames import agents_of, evaluation_records
 from runner.analysis.groups import Group, groups_of
 from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries, values_left_out
 from runner.analysis.summary import random_policy_sentence
-from runner.drawing import svg, svg_maps
+from runner.drawing import palette, svg
 from runner.environments.naming import event_in_words, spoken
 from runner.errors import RecordingError, RunnerError
 from runner.export.contents import flat_text, has_steps, shortcomings, why_no_steps
-from runner.export.plots.figure import COLOURS, footnote
+from runner.export.plots.figure import footnote
 from runner.export.plots.metrics import panels_of
 from runner.export.plots.svg import panel_svgs
 from runner.export.reports.episode import (
@@ -35,20 +31,15 @@ from runner.export.reports.episode import (
     trial,
 )
 from runner.export.reports.maps import MapRow, maps_of, stages_of
+from runner.export.reports.rendering import embedded, templates
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
-from runner.util.extras import require
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
-    from markupsafe import Markup
+    pass
 
 Choice = tuple[str, int, int]
 """An episode to show: ("train", number, 0), or ("eval", training episodes before it, trial)."""
-
-BROAD: Final = 8.5 * svg.CELL
-"""A grid wider than this is shown over the whole width of the page."""
-TEMPLATES: Final = files("runner.export") / "templates"
 
 
 def write_report(
@@ -106,10 +97,6 @@ def render_report(
             title=_title(runs),
             runs=runs,
             plots=_plots(series),
-            ramp=", ".join(svg_maps.RAMP),
-            style=(TEMPLATES / "report.css").read_text("utf-8") + svg.STYLE + svg_maps.STYLE,
-            dark=(TEMPLATES / "report_dark.css").read_text("utf-8"),
-            script=(TEMPLATES / "replay.js").read_text("utf-8"),
         )
     )
     return page, [*(sentence for run in runs for sentence in run["notes"]), *values_left_out(series)]
@@ -143,7 +130,7 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
         "steps": has_steps(recording),
         "evaluations": evaluations,
         "event_names": [_heading(name) for name in environment["event_names"]],
-        "broad": drawing is not None and drawing.width > BROAD,
+        "broad": drawing is not None and drawing.width > svg.BROAD,
         "config": flat_text(recording.config),
         "provenance": recording.provenance,
         "notes": _notes(recording),
@@ -269,7 +256,7 @@ def _replay(recording: Recording, episodes: list[Episode], drawing: svg.Drawing 
         first = drawing.places(mdp, episodes[0].states[:1])
         picture = drawing.frame(first[0], "The grid at the step shown below it", first, style="")
     return {
-        "data": _embedded(data | {"trail": svg.TRAIL}),
+        "data": embedded(data | {"trail": svg.TRAIL}),
         "picture": picture,
         "key": "" if drawing is None else drawing.key(),
         "episodes": data["episodes"],
@@ -295,7 +282,8 @@ def _plots(series: Sequence[RunSeries]) -> dict[str, Any]:
     return {
         "panels": panels,
         "groups": [
-            (i % len(COLOURS), COLOURS[i % len(COLOURS)], group.described) for i, group in enumerate(groups)
+            (i % len(palette.SERIES), palette.SERIES[i % len(palette.SERIES)], group.described)
+            for i, group in enumerate(groups)
         ],
         "footnote": footnote(groups),
     }
@@ -310,46 +298,8 @@ def curves(groups: Sequence[Group]) -> list[dict[str, Any]]:
     return panel_svgs(panels, len(groups))
 
 
-def templates() -> Environment:
-    """Return the templates of pages.
-
-    Raises:
-        MissingExtra: Jinja2 is not installed.
-    """
-    require("jinja2", extra="plots", purpose="a report")
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(lambda name: (TEMPLATES / name).read_text("utf-8")),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    environment.filters |= {"number": _number, "code": code}
-    return environment
-
-
-def code(text: str) -> Markup:
-    """Return a text as HTML in which what stands between backticks is set as code."""
-    from markupsafe import Markup, escape
-
-    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
-
-
-def _number(value: float | None, digits: int = 1) -> str:
-    """Return a number with digits after the point; a dash for what is unknown."""
-    return "–" if value is None or math.isnan(value) else f"{value:,.{digits}f}"
-
-
 def _heading(event: str) -> str:
     """Return an event as the heading of a column, the agent on a line of its own."""
     agent, dot, _ = event.rpartition(".")
     words = event_in_words(event)
     return f"{words[: len(agent)]}\n{words[len(agent) + 1 :]}" if dot else words
-
-
-def _embedded(data: Any) -> str:
-    """Return data as JSON that can stand inside a script element."""
-    text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
-    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from runner.drawing import palette
 from runner.export.rerun.selection import Request, Selection, select
 from runner.export.rerun.writing import Source, export
 from runner.recording.reader import open_recording
@@ -17,7 +18,6 @@ from runner.util.version import __version__
 
 KEPT: Final = 20
 """Exports in the cache; the ones that were not looked at for longest are removed."""
-TINTS: Final = ("#0072B2", "#E69F00")
 
 
 def exported(runs: Sequence[Run], request: Request) -> tuple[Path, list[Selection]]:
@@ -40,7 +40,7 @@ def exported(runs: Sequence[Run], request: Request) -> tuple[Path, list[Selectio
                 recording,
                 title,
                 f"/{run.run_id}" if several else "",
-                TINTS[i % len(TINTS)] if several else None,
+                palette.COMPARED[i % len(palette.COMPARED)] if several else None,
             )
             for i, (run, recording, title) in enumerate(zip(runs, recordings, titles, strict=True))
         ]

@@ -14,18 +14,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, numbered_actions, spoken
-from runner.export.rerun.scene import (
-    BAD_COLOUR,
-    GOOD_COLOUR,
-    INK,
-    MOVER_COLOURS,
-    PASSENGER_COLOUR,
-    Marks,
-    Scene,
-    rgb,
-)
+from runner.export.rerun.scene import Marks, Scene
 
 MOST_REWARDS: Final = 2_000
 MOST_T: Final = 10_000
@@ -39,7 +31,7 @@ class Classes:
     labels: list[str] = field(default_factory=list)
     colours: list[str] = field(default_factory=list)
 
-    def add(self, labels: Sequence[str], colours: str | Sequence[str] = INK) -> int:
+    def add(self, labels: Sequence[str], colours: str | Sequence[str] = palette.MIDTONE) -> int:
         """Take in labels; return the number of the first."""
         first = len(self.labels)
         self.labels += labels
@@ -49,7 +41,7 @@ class Classes:
     def context(self) -> list[tuple[int, str, tuple[int, int, int]]]:
         """Return (number, label, colour) of all."""
         return [
-            (number, label, rgb(colour))
+            (number, label, palette.rgb(colour))
             for number, (label, colour) in enumerate(zip(self.labels, self.colours, strict=True))
         ]
 
@@ -119,8 +111,8 @@ def vocabulary_of(
     mark = classes.add(marks.labels, marks.colours) if marks else 0
     things = scene.description["things"] if scene else []
     waiting = [things[thing]["label"] for thing in scene.passengers] if scene else []
-    passenger = classes.add(waiting, PASSENGER_COLOUR)
-    riding = classes.add([""], PASSENGER_COLOUR)
+    passenger = classes.add(waiting, palette.PASSENGER)
+    riding = classes.add([""], palette.PASSENGER)
     longest = min(mdp.step_limit or MOST_T, MOST_T)
     t = classes.add([f"t = {k}" for k in range(longest)] + [f"t ≥ {longest}"])
     rewards = mdp.rewards_of(len(learners))
@@ -129,9 +121,11 @@ def vocabulary_of(
         distinct = np.unique(rewards[..., i])
         whose = f" of {spoken(learner)}" if len(learners) > 1 else ""
         if len(distinct) <= MOST_REWARDS:
-            colour = MOVER_COLOURS[i % len(MOVER_COLOURS)] if whose else INK
+            colour = palette.agent(i) if whose else palette.MIDTONE
             told.append((classes.add([f"reward{whose} {_signed(r)}" for r in distinct], colour), distinct))
-    unmarked = classes.add(["", "●", "greedy", "explored"], [INK, INK, GOOD_COLOUR, BAD_COLOUR])
+    unmarked = classes.add(
+        ["", "●", "greedy", "explored"], [palette.MIDTONE, palette.MIDTONE, palette.GOOD, palette.BAD]
+    )
     stops = tuple(_stops(classes, scene, agent) for agent in range(len(mdp.agents))) if scene else ()
     levels = _levels(classes, value_range)
     return Vocabulary(
@@ -155,7 +149,7 @@ def _stops(classes: Classes, scene: Scene, agent: int) -> NDArray[np.int64]:
     numbers = np.full(len(names), -1)
     if action_names(scene.mdp) is None:
         return numbers
-    colour = MOVER_COLOURS[agent % len(MOVER_COLOURS)]
+    colour = palette.agent(agent)
     for own, action in enumerate(scene.description["actions"]):
         if not any(action.get("move") or ()):
             numbers[own] = classes.add([names[own][0].upper()], colour)

@@ -12,7 +12,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
-from runner.export.rerun.scene import INK, rgb
+from runner.drawing import palette
 
 APPLICATION: Final = "dualtaxi"
 _POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
@@ -204,10 +204,10 @@ def texts(words: Sequence[str]) -> NDArray[Any]:
 
 def ink(n: int) -> NDArray[np.uint32]:
     """Return the colour of writing for n rows, [n, 1]."""
-    red, green, blue, alpha = rgba(INK)
+    red, green, blue, alpha = rgba(palette.MIDTONE)
     return np.full((n, 1), red << 24 | green << 16 | blue << 8 | alpha, np.uint32)
 
 
 def rgba(colour: str, alpha: int = 255) -> tuple[int, int, int, int]:
     """Return the parts of a colour "#rrggbb"."""
-    return *rgb(colour), alpha
+    return *palette.rgb(colour), alpha

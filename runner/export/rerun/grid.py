@@ -9,15 +9,10 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.analysis.outcomes import events_of
+from runner.drawing import palette
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, ink, instances, place, rgba, strips, texts
-from runner.export.rerun.scene import (
-    GOAL_COLOUR,
-    MOVER_COLOURS,
-    TRAIL_STEPS,
-    Marks,
-    Scene,
-)
+from runner.export.rerun.scene import TRAIL_STEPS, Marks, Scene
 
 TITLE_Y: Final = -0.62
 FACTS_BELOW: Final = 0.35
@@ -51,7 +46,7 @@ class GridWriter(Sender):
     def dress(self) -> None:
         """Log sizes and colours."""
         movers = len(self._scene.movers)
-        colours = [MOVER_COLOURS[i % len(MOVER_COLOURS)] for i in range(movers)]
+        colours = [palette.agent(i) for i in range(movers)]
         shapes = self._scene.shapes
         self.static(
             "grid/things",
@@ -66,7 +61,7 @@ class GridWriter(Sender):
         )
         self.static("grid/title", rr.Points2D.from_fields(radii=0.0, show_labels=True))
         self.static(
-            "grid/goal", rr.Boxes2D.from_fields(colors=[rgba(GOAL_COLOUR)], radii=0.04, show_labels=True)
+            "grid/goal", rr.Boxes2D.from_fields(colors=[rgba(palette.GOAL)], radii=0.04, show_labels=True)
         )
 
     def write(self, batch: Batch, phase: str) -> None:

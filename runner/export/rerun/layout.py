@@ -9,10 +9,11 @@ from typing import Any, Final
 import rerun as rr
 import rerun.blueprint as rrb
 
+from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import spoken
 from runner.export.rerun.maps import draw_blocks
-from runner.export.rerun.scene import Scene, rgb
+from runner.export.rerun.scene import Scene
 from runner.export.rerun.values import TOP, WIDTH, bar_rows, draw_table
 
 FRAMES_A_SECOND: Final = 10.0
@@ -218,7 +219,7 @@ def _draw_scene(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
         static=True,
     )
     marks = scene.description.get("landmarks", [])
-    tints = [(*rgb(mark["colour"]), 110) for mark in marks]
+    tints = [(*palette.rgb(mark["colour"]), 110) for mark in marks]
     if marks:
         stream.log(
             f"{path}/landmarks",
@@ -232,7 +233,7 @@ def _draw_scene(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
             rr.Points2D(
                 [(c + 0.14, r + 0.72) for r, c in (mark["cell"] for mark in marks)],
                 labels=[mark["name"] for mark in marks],
-                colors=[rgb(mark["colour"]) for mark in marks],
+                colors=[palette.rgb(mark["colour"]) for mark in marks],
                 radii=0.0,
                 show_labels=True,
                 draw_order=26,

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 import rerun as rr
 
-from runner.export.rerun.scene import rgb
-
-# Okabe and Ito (2008): distinct with any common colour blindness.
-COLOURS: Final = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
+from runner.drawing import palette
 
 
-def palette(count: int, tint: str | None = None) -> list[tuple[int, int, int]]:
+def line_colours(count: int, tint: str | None = None) -> list[tuple[int, int, int]]:
     """Return colours for the lines of a view, no two alike.
 
     Args:
@@ -24,11 +20,11 @@ def palette(count: int, tint: str | None = None) -> list[tuple[int, int, int]]:
     """
     if tint is not None:
         if count == 1:
-            return [rgb(tint)]
-        hue, _, saturation = colorsys.rgb_to_hls(*(part / 255 for part in rgb(tint)))
+            return [palette.rgb(tint)]
+        hue, _, saturation = colorsys.rgb_to_hls(*(part / 255 for part in palette.rgb(tint)))
         return [_from_hls(hue, level, saturation) for level in np.linspace(0.3, 0.8, count)]
-    if count <= len(COLOURS):
-        return [rgb(colour) for colour in COLOURS[:count]]
+    if count <= len(palette.SERIES):
+        return [palette.rgb(colour) for colour in palette.SERIES[:count]]
     return [_from_hls(k / count, (0.4, 0.6)[k % 2], 0.75) for k in range(count)]
 
 
@@ -39,7 +35,7 @@ def _from_hls(hue: float, level: float, saturation: float) -> tuple[int, int, in
 
 def phase_colours(phase: str, count: int, tint: str | None = None) -> list[tuple[int, int, int]]:
     """Return the colours of the `count` lines that a phase has in a view of training and evaluation."""
-    colours = palette(2 * count, tint)
+    colours = line_colours(2 * count, tint)
     return colours[count:] if phase == "train" else colours[:count]
 
 
@@ -53,7 +49,7 @@ def series_lines(
     """
     return rr.SeriesLines(
         names=names,
-        colors=palette(len(names)) if colours is None else colours,
+        colors=line_colours(len(names)) if colours is None else colours,
         widths=[width] * len(names),
         aggregation_policy=rr.components.AggregationPolicy.MinMax,
     )

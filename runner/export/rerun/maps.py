@@ -12,6 +12,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from runner.drawing import palette
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import (
     Batch,
@@ -25,7 +26,7 @@ from runner.export.rerun.columns import (
     rgba,
     texts,
 )
-from runner.export.rerun.scene import BAD_COLOUR, MOVER_COLOURS, Placements, Scene, own_actions
+from runner.export.rerun.scene import Placements, Scene, own_actions
 
 LABEL_Y: Final = -2.6
 _LETTER_RISE: Final = 0.6
@@ -70,7 +71,7 @@ class MapWriter(Sender):
         for i, learner in enumerate(self._learners):
             shown = self._agents(i)
             origins = self._beside(len(shown)).reshape(-1, 2)
-            tints = [rgba(MOVER_COLOURS[k % len(MOVER_COLOURS)]) for k in shown for _ in middle]
+            tints = [rgba(palette.agent(k)) for k in shown for _ in middle]
             self.static(
                 f"map/{learner}",
                 rr.DepthImage.from_fields(format=shape, colormap=rr.components.Colormap.Viridis),
@@ -81,7 +82,7 @@ class MapWriter(Sender):
             )
             self.static(
                 f"map/{learner}/here",
-                rr.Boxes2D.from_fields(colors=[rgba(BAD_COLOUR)], radii=0.1, draw_order=50.0),
+                rr.Boxes2D.from_fields(colors=[rgba(palette.BAD)], radii=0.1, draw_order=50.0),
             )
             self.static(
                 f"map/{learner}/stops",

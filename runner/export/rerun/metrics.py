@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from runner.environments.naming import spoken
 from runner.export.rerun.events import evaluation_texts, send_text
-from runner.export.rerun.lines import palette, phase_colours, series_lines
+from runner.export.rerun.lines import line_colours, phase_colours, series_lines
 from runner.recording import schema
 from runner.recording.reader import Recording
 
@@ -170,9 +170,9 @@ class MetricWriter:
     def _style(self, path: str, names: Sequence[str]) -> Any:
         phase, name = path.split("/", maxsplit=1)[0], path.rsplit("/", maxsplit=1)[-1]
         if name in SCHEDULES:
-            colours = [palette(1 + len(SCHEDULES), self._tint)[1 + SCHEDULES.index(name)]]
+            colours = [line_colours(1 + len(SCHEDULES), self._tint)[1 + SCHEDULES.index(name)]]
         elif name in _ONE_PHASE and len(names) > 1:
-            colours = palette(len(names), self._tint)
+            colours = line_colours(len(names), self._tint)
         else:
             colours = phase_colours(phase, len(names), self._tint)
         width = 1.2 if phase == "train" else 2.2

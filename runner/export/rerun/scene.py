@@ -14,16 +14,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, spoken
-
-# Okabe and Ito (2008), told apart with any common colour blindness; mid-tones, for light and dark themes.
-MOVER_COLOURS: Final = ("#E69F00", "#56B4E9", "#009E73", "#CC79A7")
-PASSENGER_COLOUR: Final = "#CC79A7"
-GOAL_COLOUR: Final = "#CC79A7"
-BAD_COLOUR: Final = "#D55E00"
-GOOD_COLOUR: Final = "#009E73"
-INK: Final = "#808080"
 
 BAD_SIGN: Final = "✗"
 GOOD_SIGN: Final = "✓"
@@ -32,11 +25,6 @@ _APART: Final = 0.34
 """Between movers in one cell, so that both are seen."""
 _STUB: Final = 0.34
 """Length of the arrow of a move that led nowhere."""
-
-
-def rgb(colour: str) -> tuple[int, int, int]:
-    """Return red, green and blue of a colour such as `#E69F00`."""
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
 @dataclass(frozen=True)
@@ -56,13 +44,13 @@ DRIVEN: Final = ("taxi", "car", "bus", "truck")
 CAR: Final = (
     Shape((-0.02, -0.1), (0.07, 0.025), 0.05),
     Shape((0.0, 0.02), (0.15, 0.025), 0.055),
-    Shape((-0.1, 0.1), (0.01, 0.01), 0.04, INK),
-    Shape((0.1, 0.1), (0.01, 0.01), 0.04, INK),
+    Shape((-0.1, 0.1), (0.01, 0.01), 0.04, palette.MIDTONE),
+    Shape((0.1, 0.1), (0.01, 0.01), 0.04, palette.MIDTONE),
 )
 PAWN: Final = (Shape((0.0, -0.12), (0.02, 0.02), 0.07), Shape((0.0, 0.05), (0.05, 0.05), 0.06))
 PERSON: Final = (
-    Shape((0.0, -0.09), (0.01, 0.01), 0.04, PASSENGER_COLOUR),
-    Shape((0.0, 0.03), (0.02, 0.03), 0.045, PASSENGER_COLOUR),
+    Shape((0.0, -0.09), (0.01, 0.01), 0.04, palette.PASSENGER),
+    Shape((0.0, 0.03), (0.02, 0.03), 0.045, palette.PASSENGER),
 )
 """A car, any other mover, and a passenger, by their boxes."""
 
@@ -101,7 +89,7 @@ class Scene:
         """The boxes that the drawn points are made of: those of the movers first, then the passengers'."""
         drawn: list[Shape] = []
         for i, mover in enumerate(self.movers):
-            colour = MOVER_COLOURS[i % len(MOVER_COLOURS)]
+            colour = palette.agent(i)
             driven = str(self.description["things"][mover]["label"]).split(" ")[0] in DRIVEN
             drawn += [
                 dataclasses.replace(part, thing=i, colour=part.colour or colour)
@@ -269,7 +257,7 @@ def marks_of(scene: Scene) -> Marks:
                 lookup[i, carries, k] = len(labels)
                 labels.append(": ".join([label, ", ".join(happened)]) if happened else label)
                 bad = any(word.startswith(BAD_SIGN) for word in happened)
-                colours.append(BAD_COLOUR if bad else MOVER_COLOURS[i % len(MOVER_COLOURS)])
+                colours.append(palette.BAD if bad else palette.agent(i))
     return Marks(labels, colours, lookup, masks)
 
 

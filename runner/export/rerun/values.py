@@ -8,12 +8,13 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.classes import Vocabulary
 from runner.export.rerun.columns import Batch, Sender, StepValues, instances, rgba, scalars, strips
 from runner.export.rerun.lines import series_lines
-from runner.export.rerun.scene import INK, MOVER_COLOURS, own_actions
+from runner.export.rerun.scene import own_actions
 
 NAME_X: Final = 1.0
 BAR_LEFT: Final = 2.5
@@ -48,7 +49,7 @@ class ValueWriter(Sender):
     def dress(self) -> None:
         """Log sizes, colours and the names of the series."""
         counts = self._mdp.action_counts
-        colours = [MOVER_COLOURS[i % len(MOVER_COLOURS)] for i in range(len(counts))]
+        colours = [palette.agent(i) for i in range(len(counts))]
         bars = [rgba(colour) for colour, count in zip(colours, counts, strict=True) for _ in range(count)]
         series = [
             f"{spoken(agent)} {name}"
@@ -129,7 +130,7 @@ def draw_table(stream: rr.RecordingStream, path: str, mdp: Mdp) -> None:
     ):
         labels += [spoken(agent).upper(), *names]
         places += [(NAME_X, float(y) - LABEL_RISE) for y in (rows[0] - 1.15, *rows)]
-        colours += [rgba(MOVER_COLOURS[i % len(MOVER_COLOURS)])] + [rgba(INK)] * len(names)
+        colours += [rgba(palette.agent(i))] + [rgba(palette.MIDTONE)] * len(names)
     headings = {
         BAR_LEFT + BAR_LENGTH / 2: "worst to best",
         NUMBER_X: "Q",
@@ -138,6 +139,6 @@ def draw_table(stream: rr.RecordingStream, path: str, mdp: Mdp) -> None:
     }
     labels += headings.values()
     places += [(x, -0.15 - LABEL_RISE) for x in headings]
-    colours += [rgba(INK)] * len(headings)
+    colours += [rgba(palette.MIDTONE)] * len(headings)
     words = rr.Points2D(places, labels=labels, colors=colours, radii=0.0, show_labels=True)
     stream.log(path, words, static=True)

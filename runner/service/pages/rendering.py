@@ -16,7 +16,8 @@ import jinja2
 from fastapi import Request, Response
 from markupsafe import Markup
 
-from runner.export.reports.report import code
+from runner.drawing import palette
+from runner.export.reports.rendering import code
 from runner.service.pages import static
 from runner.util import humanize
 
@@ -112,9 +113,7 @@ def picture_address(picture: str) -> str:
 
 @functools.cache
 def _picture_style() -> str:
-    dark = (static.REPORT / "report_dark.css").read_text("utf-8")
-    light = (static.REPORT / "report.css").read_text("utf-8").partition("\n")[0]
-    return f"{light} :root {{ color: var(--ink); }} @media (prefers-color-scheme: dark) {{ {dark} }}"
+    return f"{palette.css_variables()} :root {{ color: var(--ink); }}"
 
 
 def _source(name: str) -> str | None:

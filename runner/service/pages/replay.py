@@ -132,7 +132,6 @@ def _shown(part: dict[str, Any], t: int) -> dict[str, Any]:
         places = np.array(episode["places"], np.int16)[episode["state"]].reshape(len(episode["state"]), -1, 3)
         words = episode["states"][episode["state"][i]]
         picture = drawing.frame(places[i], f"The grid: {words}", places[: i + 1], style="")
-        picture = picture.replace("<style></style>", "")
         key, broad = drawing.key(), drawing.width > BROAD
     action = "none yet: the episode begins" if i == 0 else part["actions"][episode["action"][i - 1]]
     return {

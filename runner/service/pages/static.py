@@ -17,7 +17,7 @@ from typing import Final
 
 from fastapi import APIRouter, HTTPException, Request, Response
 
-from runner.drawing import svg, svg_maps
+from runner.export.reports.rendering import page_style
 
 router = APIRouter(include_in_schema=False)
 
@@ -109,12 +109,8 @@ def static(digest: str, name: str, request: Request) -> Response:
 def _style() -> str:
     """Return the style of a report and of the pictures, and what pages have besides."""
     parts = [
-        (REPORT / "report.css").read_text("utf-8"),
-        svg.STYLE,
-        svg_maps.STYLE,
+        page_style(),
         (FOLDER / UPLOT / "uPlot.min.css").read_text("utf-8"),
         (FOLDER / "pages.css").read_text("utf-8"),
-        f".ramp-colours {{ background: linear-gradient(90deg, {', '.join(svg_maps.RAMP)}); }}",
-        f"@media (prefers-color-scheme: dark) {{ {(REPORT / 'report_dark.css').read_text('utf-8')} }}",
     ]
     return "\n".join(parts)

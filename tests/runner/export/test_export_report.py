@@ -134,10 +134,10 @@ def test_what_is_not_there_is_refused(pictured, tmp_path):
 
 
 def test_names_cannot_break_out_of_the_page(pictured):
-    from runner.export.reports.report import _embedded
+    from runner.export.reports.rendering import embedded
 
-    assert "</script>" not in _embedded({"a": "</script><b>"})
-    assert json.loads(_embedded({"a": "</script>\u2028"})) == {"a": "</script>\u2028"}
+    assert "</script>" not in embedded({"a": "</script><b>"})
+    assert json.loads(embedded({"a": "</script>\u2028"})) == {"a": "</script>\u2028"}
 
 
 # --- in a browser -------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from rerun.chunk import RrdReader
 
 from runner.analysis.frames import agents_of
 from runner.analysis.outcomes import events_of
-from runner.export.rerun.cache import TINTS
+from runner.drawing.palette import COMPARED
 from runner.export.rerun.layout import PLOTS
 from runner.export.rerun.scene import marks_of, own_actions, scene_of
 from runner.export.rerun.selection import Request
@@ -285,7 +285,7 @@ def test_lines_of_two_runs_differ_in_colour(pictured, tmp_path):
         open_recording(pictured("taxis").recording) as a,
         open_recording(pictured("rivals").recording) as b,
     ):
-        sources = [Source(a, "A", "/a", TINTS[0]), Source(b, "B", "/b", TINTS[1])]
+        sources = [Source(a, "A", "/a", COMPARED[0]), Source(b, "B", "/b", COMPARED[1])]
         export(sources, Request(), tmp_path / "both.rrd")
     views = [[f"/{run}/{path}" for run in "ab" for path in paths] for _, paths in PLOTS]
     check_lines(tmp_path / "both.rrd", views)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from runner.analysis.frames import agents_of
-from runner.drawing import svg, svg_maps
+from runner.drawing import palette, svg, svg_maps
 from runner.drawing.svg import CELL, MARGIN, Drawing
 from runner.export.reports.maps import maps_of, situation, stages_of
 from runner.recording.reader import open_recording
@@ -109,9 +109,9 @@ def test_a_situation_is_all_places_of_the_free_things_and_nothing_else(pictured)
 
 
 def test_colours_go_from_dark_to_light_and_nan_is_none():
-    assert svg_maps.colour_of(0) == svg_maps.RAMP[0]
-    assert svg_maps.colour_of(svg_maps.LEVELS - 1) == svg_maps.RAMP[-1]
-    lightness = [int(svg_maps.colour_of(i)[3:5], 16) for i in range(svg_maps.LEVELS)]
+    assert palette.ramp_colour(0) == palette.RAMP[0]
+    assert palette.ramp_colour(palette.LEVELS - 1) == palette.RAMP[-1]
+    lightness = [int(palette.ramp_colour(i)[3:5], 16) for i in range(palette.LEVELS)]
     assert lightness == sorted(lightness)
     assert svg_maps.levels_of(np.array([0.0, 5.0, 10.0, np.nan]), 0, 10).tolist() == [0, 16, 31, -1]
     assert svg_maps.levels_of(np.array([3.0]), 3, 3).tolist() == [0]

@@ -1,0 +1,112 @@
+"""The templates of reports and pages: one environment, its filters, and the style that all pages share."""
+
+from __future__ import annotations
+
+import functools
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+from runner.drawing import palette, svg, svg_maps
+from runner.util import humanize
+from runner.util.extras import require
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from markupsafe import Markup
+
+TEMPLATES: Final = files("runner.export") / "templates"
+
+
+@dataclass(frozen=True)
+class View:
+    """The values that a template shows, under the names that it uses."""
+
+    TEMPLATE: ClassVar[str]
+
+
+def render(view: View) -> str:
+    """Return the page of a report.
+
+    Raises:
+        MissingExtra: Jinja2 is not installed.
+    """
+    return fill(templates(), view)
+
+
+def fill(environment: Environment, view: View) -> str:
+    """Return the HTML of a view."""
+    values = {field.name: getattr(view, field.name) for field in fields(view)}
+    return environment.get_template(view.TEMPLATE).render(values)
+
+
+@functools.cache
+def templates() -> Environment:
+    """Return the templates of reports.
+
+    Raises:
+        MissingExtra: Jinja2 is not installed.
+    """
+    environment = environment_of((TEMPLATES,))
+    environment.globals |= {"style": page_style, "script": (TEMPLATES / "replay.js").read_text}
+    return environment
+
+
+def environment_of(folders: Sequence[Traversable]) -> Environment:
+    """Return an environment of templates, which are looked for in folders in their order.
+
+    Raises:
+        MissingExtra: Jinja2 is not installed.
+    """
+    require("jinja2", extra="plots", purpose="a report")
+    import jinja2
+
+    def source(name: str) -> str | None:
+        found = next((folder / name for folder in folders if (folder / name).is_file()), None)
+        return None if found is None else found.read_text("utf-8")
+
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(source),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    filters: dict[str, Callable[..., str]] = {
+        "number": humanize.number,
+        "count": lambda value: humanize.number(value, 0),
+        "code": code,
+        "sentence": sentence,
+    }
+    environment.filters |= filters
+    return environment
+
+
+@functools.cache
+def page_style() -> str:
+    """Return the CSS of a page: its colours, its layout, and the pictures in it."""
+    layout = (TEMPLATES / "report.css").read_text("utf-8")
+    dark = f"@media (prefers-color-scheme:dark){{{svg.DARK_STYLE}}}"
+    return "\n".join([palette.css_variables(), layout, svg.STYLE, svg_maps.STYLE, dark])
+
+
+def code(text: str) -> Markup:
+    """Return a text as HTML in which the parts between backticks are set as code."""
+    from markupsafe import Markup, escape
+
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
+
+
+def sentence(text: str) -> str:
+    """Return a text with a capital at its start and a full stop at its end, unless it ends in a colon."""
+    return f"{text[:1].upper()}{text[1:]}{'' if text[-1:] in '.:' else '.'}"
+
+
+def embedded(data: Any) -> str:
+    """Return data as JSON that is safe inside a script element."""
+    text = json.dumps(data, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
