@@ -14,10 +14,10 @@ from benchmarks.figures import Figure, figure, seconds
 from benchmarks.learners import NO_LIMIT, blocks, tutorial_learner
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
-from runner.recording.chunks import Packing
 from runner.recording.protobuf import file_descriptor_set
 from runner.recording.recorder import Recorder
 from runner.recording.writer import RecordingFile
+from runner.util.packing import Packing
 
 
 def measure(quick: bool) -> list[Figure]:
@@ -27,8 +27,7 @@ def measure(quick: bool) -> list[Figure]:
     are told too.
     """
     repetitions, ours, theirs = (3, 500_000, 50_000) if quick else (5, 4_000_000, 200_000)
-    plan = tutorial_learner().config.recording
-    packing = Packing(plan.compression, plan.level or 0, plan.index)
+    packing = tutorial_learner().config.recording.packing
     records = training_steps(ours)
     messages = wire_messages(records[:theirs])
     recorder, writer = [], []

@@ -21,12 +21,11 @@ from runner.archive.reading import Archive
 from runner.archive.rows import message_payload
 from runner.config import from_mapping
 from runner.config.loading import packing_from
-from runner.config.sections import Recording as Plan
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.batching import Piles
 from runner.recording.blocks import HEADER_BYTES, message_record
-from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
+from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.messages import QTable, encode_q_table
 from runner.recording.metadata import json_object
 from runner.recording.pipeline import Pipeline
@@ -37,6 +36,7 @@ from runner.recording.writer import RecordingFile
 from runner.replay.snapshots import DerivedTables, SnapshotVisitor
 from runner.replay.tables import StepReplay
 from runner.util.files import storage_errors
+from runner.util.packing import Packing
 
 _ROWS_AT_ONCE: Final = 1024
 _MOST_STEPS: Final = 2**63 // STEP_NANOSECONDS
@@ -94,9 +94,9 @@ class _Restoring:
         self._report = report
         self._where = str(archive.folder)
         self._shape = archive.shape
-        plan = _plan_of(archive)
-        self._chunk_steps = plan.chunk_steps
-        self._pipeline = Pipeline(file, Packing(plan.compression, plan.level or 0, plan.index), lambda: None)
+        packing = _packing_of(archive)
+        self._chunk_steps = packing.chunk_steps
+        self._pipeline = Pipeline(file, packing, lambda: None)
         self._piles = Piles(self._send)
         self._room = threading.Semaphore(_UNDER_WAY)
         topics = schema.KINDS[archive.kind]
@@ -254,7 +254,7 @@ class _Restoring:
                 )
 
 
-def _plan_of(archive: Archive) -> Plan:
+def _packing_of(archive: Archive) -> Packing:
     """Return how the recording was packed.
 
     Raises:
@@ -262,11 +262,11 @@ def _plan_of(archive: Archive) -> Plan:
     """
     config = archive.config
     if archive.kind == "job":
-        return from_mapping(config).recording
+        return from_mapping(config).recording.packing
     parts = json_object(json.dumps(config.get("recording")), f"{archive.folder}: 'recording' in its config")
     if parts.get("compression") != "zstd":
         parts.pop("level", None)  # loops recorded before had one with any compression
-    return packing_from(parts)
+    return packing_from(parts).packing
 
 
 def _in_words(entry: Entry | None) -> str:

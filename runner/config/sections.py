@@ -18,6 +18,16 @@ from pydantic import (
 
 from runner.config.schedules import Probability, StepSize
 from runner.config.values import Count, FrozenMapping, Section, frozen, plain, refusal
+from runner.util.packing import (
+    DEFAULT_LEVEL,
+    MAX_CHUNK_STEPS,
+    MAX_LEVEL,
+    MIN_CHUNK_STEPS,
+    MIN_LEVEL,
+    Compression,
+    Index,
+    Packing,
+)
 
 
 def _environment_arguments(value: object) -> FrozenMapping:
@@ -163,19 +173,20 @@ class Recording(Section):
     steps: Literal["all", "none"] = Field(
         default="all", description="Whether environment steps are recorded: all, or none (measures only)."
     )
-    compression: Literal["zstd", "lz4", "none"] = Field(
-        default="zstd", description="How the chunks of a recording are compressed."
+    compression: Compression = Field(
+        default=Packing.compression, description="How the chunks of a recording are compressed."
     )
-    level: Annotated[int, Field(ge=-7, le=19)] | None = Field(
-        default_factory=lambda chosen: 3 if chosen.get("compression") == "zstd" else None,
+    level: Annotated[int, Field(ge=MIN_LEVEL, le=MAX_LEVEL)] | None = Field(
+        default_factory=lambda chosen: DEFAULT_LEVEL if chosen.get("compression") == "zstd" else None,
         description="The level of zstd, from -7 (fast) to 19 (small); 3 unless given. Only with zstd.",
     )
-    index: Literal["message", "chunk"] = Field(
-        default="message",
+    index: Index = Field(
+        default=Packing.index,
         description="message: every message, as some readers need. chunk: only chunks, 16 bytes a step less.",
     )
-    chunk_steps: Annotated[int, Field(ge=256, le=65_536)] = Field(
-        default=16_384, description="The most steps in one chunk; fewer when chunks are flushed by the clock."
+    chunk_steps: Annotated[int, Field(ge=MIN_CHUNK_STEPS, le=MAX_CHUNK_STEPS)] = Field(
+        default=Packing.chunk_steps,
+        description="The most steps in one chunk; fewer when chunks are flushed by the clock.",
     )
 
     @model_validator(mode="after")
@@ -188,6 +199,11 @@ class Recording(Section):
             )
             raise refusal(("level",), message)
         return self
+
+    @property
+    def packing(self) -> Packing:
+        """How the recording is packed, for the recorder."""
+        return Packing(self.compression, self.level or 0, self.index, self.chunk_steps)
 
 
 class Quirks(Section):

@@ -22,7 +22,6 @@ from runner.execution.observer import Observer
 from runner.learning.learner import Learner
 from runner.planning import Yardstick
 from runner.recording import schema
-from runner.recording.chunks import Packing
 from runner.recording.messages import QTable, encode, encode_log, encode_q_table
 from runner.recording.metadata_writing import (
     Attachments,
@@ -342,14 +341,13 @@ def recorder_for(
     threads: bool = True,
 ) -> Recorder:
     """Return a recorder for what a learner does, into a file, packed as the job's configuration says."""
-    plan = job.config.recording
+    options = job.config.recording
     return Recorder(
         file,
         learners=len(learner.agents),
         events=len(learner.mdp.event_names),
-        packing=Packing(plan.compression, plan.level or 0, plan.index),
-        chunk_steps=plan.chunk_steps,
-        record_steps=plan.steps == "all",
+        packing=options.packing,
+        record_steps=options.steps == "all",
         past=past,
         beat=beat,
         threads=threads,

@@ -23,7 +23,7 @@ from runner.loops.outcomes import Outcomes
 from runner.loops.spaces import Described, as_json, as_mapping, can_widen, widened
 from runner.loops.values import lone_number, warn_user
 from runner.recording import schema
-from runner.recording.chunks import MAX_CHUNK_BYTES, Packing
+from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.messages import encode, encode_image, encode_log, scalar_encoder
 from runner.recording.metadata import sizes_of
 from runner.recording.metadata_writing import (
@@ -164,8 +164,7 @@ class Loop(Generic[R]):
             self._file,
             learners=len(described.agents),
             events=int(facts["events"]),
-            packing=Packing(plan.packing.compression, plan.packing.level or 0, plan.packing.index),
-            chunk_steps=plan.packing.chunk_steps,
+            packing=plan.packing.packing,
             beat=self.run.beat,
             sizes=sizes_of(facts, str(path)),
             watch=self._outcomes.take_records,

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.schema import ALL_BLOCK_TOPICS, TOPIC_OF, Topic
+from runner.util.packing import MAX_CHUNK_STEPS, Packing
 
 MAX_CHUNK_BYTES: Final = 64 << 20
 """The largest chunk that is read, packed or unpacked; the recorder's are below 16 MiB."""
@@ -28,18 +29,7 @@ _PLAIN_BYTES: Final = 4 << 20
 """Chunks of up to this size are unpacked without a look at their first message."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, size unpacked, its CRC, and the length of the name of the compression."""
-MAX_CHUNK_MESSAGES: Final = 1 << 16
-"""The most messages of one size that a chunk has: the largest `chunk_steps`."""
 _NAME_BYTES: Final = 4
-
-
-@dataclass(frozen=True)
-class Packing:
-    """How chunks are packed: `compression` is zstd, lz4 or none; `index` is message or chunk."""
-
-    compression: str = "zstd"
-    level: int = 3
-    index: str = "message"
 
 
 @dataclass(frozen=True)
@@ -193,10 +183,8 @@ def _refuse_many(body: memoryview, head: ChunkHead, where: str) -> None:
         raise RecordingError(f"{where}: holds no whole message")
     _, length, channel, *_ = MESSAGE_HEAD.unpack(beginning[: MESSAGE_HEAD.size])
     messages = head.uncompressed_size // (9 + length)
-    if TOPIC_OF.get(channel) in ALL_BLOCK_TOPICS and messages > MAX_CHUNK_MESSAGES:
-        raise RecordingError(
-            f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_MESSAGES:,} at most"
-        )
+    if TOPIC_OF.get(channel) in ALL_BLOCK_TOPICS and messages > MAX_CHUNK_STEPS:
+        raise RecordingError(f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_STEPS:,} at most")
 
 
 def first_channel(body: bytes | memoryview, where: str) -> int:

@@ -22,10 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording.blocks import message_record
-from runner.recording.chunks import Chunk, Packing, encode_chunk
+from runner.recording.chunks import Chunk, encode_chunk
 from runner.recording.digest import ContentHash
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile, storage_error
+from runner.util.packing import Packing
 
 ENCODERS: Final = 2
 WORK_UNDER_WAY: Final = 32

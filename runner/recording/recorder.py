@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from runner.recording import schema
 from runner.recording.batching import Piles
 from runner.recording.blocks import Sizes, blank_records, block_counts, message_record, record_dtype
-from runner.recording.chunks import Packing
 from runner.recording.digest import combine
 from runner.recording.pipeline import Pipeline
 from runner.recording.reference import Past
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
+from runner.util.packing import Packing
 
 FLUSH_SECONDS: Final = 0.5
 """An open block is closed when it is this old; with the time to write it, well under a second."""
@@ -65,8 +65,7 @@ class Recorder:
         file: the recording to write; None records nothing but the digest.
         learners: number of reward columns.
         events: number of event counters.
-        packing: how chunks are packed.
-        chunk_steps: the most steps in a chunk.
+        packing: how chunks are packed, and their most steps.
         record_steps: False keeps the steps' digest but not the steps.
         past: what the recording already holds.
         beat: called about once a second while the recorder lives, by who writes.
@@ -84,7 +83,6 @@ class Recorder:
         learners: int,
         events: int,
         packing: Packing | None = None,
-        chunk_steps: int = 16_384,
         record_steps: bool = True,
         past: Past | None = None,
         beat: Callable[[], None] = lambda: None,
@@ -93,9 +91,10 @@ class Recorder:
         watch: Callable[[Topic, NDArray[np.void]], None] = lambda *_: None,
         before: Callable[[], None] | None = None,
     ) -> None:
+        packing = packing or Packing()
         self._file = file
         self._watch = watch
-        self._chunk_steps = chunk_steps
+        self._chunk_steps = packing.chunk_steps
         self._first_records = _FIRST_RECORDS if before is not None else None
         self._past = past or Past()
         sizes = sizes or {topic: block_counts(topic, learners, events) for topic in schema.BLOCK_TOPICS}
@@ -103,7 +102,7 @@ class Recorder:
             topic: _Lane(
                 topic,
                 own,
-                capacity=capacity_of(topic, own, chunk_steps),
+                capacity=capacity_of(topic, own, packing.chunk_steps),
                 write=record_steps or topic.message is not schema.STEP,
             )
             for topic, own in sizes.items()
@@ -113,7 +112,7 @@ class Recorder:
         self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
         """Messages committed so far, a topic."""
         self._last_flush = time.monotonic()
-        self._pipeline = Pipeline(file, packing or Packing(), beat, threads, before)
+        self._pipeline = Pipeline(file, packing, beat, threads, before)
         self._piles = Piles(self._pipeline.send)
 
     @property

@@ -16,7 +16,7 @@ from runner.execution import verify as verifying
 from runner.execution.session import run_job
 from runner.execution.verify import verify
 from runner.recording import schema
-from runner.recording.chunks import Packing, encode_chunk
+from runner.recording.chunks import encode_chunk
 from runner.recording.integrity import places
 from runner.recording.messages import decode, encode
 from runner.recording.reader import open_recording
@@ -24,6 +24,7 @@ from runner.recording.repair import repair
 from runner.recording.scan import read_chunk, survey
 from runner.recording.writer import RecordingFile
 from runner.runs.run import create_run
+from runner.util.packing import Packing
 from tests.runner.altering import altered
 from tests.runner.recording.making import TAXIS, make_run, stopping_after
 

@@ -1,0 +1,27 @@
+"""The options by which a recording is packed, with their defaults and bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+Compression = Literal["zstd", "lz4", "none"]
+Index = Literal["message", "chunk"]
+MIN_LEVEL: Final = -7
+MAX_LEVEL: Final = 19
+DEFAULT_LEVEL: Final = 3
+MIN_CHUNK_STEPS: Final = 256
+MAX_CHUNK_STEPS: Final = 1 << 16
+
+
+@dataclass(frozen=True)
+class Packing:
+    """How a recording is packed."""
+
+    compression: Compression = "zstd"
+    level: int = DEFAULT_LEVEL
+    """The level of zstd; the other codecs ignore it."""
+    index: Index = "message"
+    """Whether each message is indexed, or only each chunk."""
+    chunk_steps: int = 1 << 14
+    """The most steps in a chunk."""
