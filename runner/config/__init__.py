@@ -5,9 +5,8 @@
 Everything that can be wrong is told in one `ConfigError`, a line for each problem.
 """
 
-from runner.config.file import ExperimentFile
 from runner.config.loading import from_mapping, from_text, load
-from runner.config.model import ExperimentConfig
+from runner.config.model import ExperimentConfig, ExperimentFile
 from runner.config.schedules import Exponential, Linear, Piecewise, Schedule
 from runner.config.schema import json_schema
 from runner.config.sections import (

@@ -1,4 +1,4 @@
-"""From YAML, or from Python values, to an `ExperimentConfig`; whatever is wrong is told at once.
+"""From YAML, or from Python values, to an `ExperimentConfig`; all problems are reported at once.
 
 text -> document (plain values and their places) -> overrides -> ExperimentFile -> ExperimentConfig
 """
@@ -9,29 +9,34 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, Final
 
 from pydantic import ValidationError
 
 from runner.config.document import Document, Place, Problem, read_yaml
-from runner.config.file import ExperimentFile, SeedRange
 from runner.config.model import (
     EXPLORATION,
     LEARNERS,
-    OWN_SECTIONS,
+    SECTION_OF,
     ExperimentConfig,
+    ExperimentFile,
     Rewards,
+    SeedRange,
     Tables,
 )
-from runner.config.overrides import override
 from runner.config.problems import found, problems_in, refuse
+from runner.config.schema import schema_at
 from runner.config.sections import Recording
 from runner.config.shipped import config_path, suggestion
+from runner.config.values import MAX_DEPTH, Path, Section
 from runner.errors import ConfigError
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN
 
-MAX_BYTES = 1 << 20
+MAX_BYTES: Final = 1 << 20
 """The largest file that is read; a configuration of a thousand lines is a twentieth of it."""
+_MAX_SHOWN: Final = 80
+_RIVALS: Final = {"seed": ("seeds",), "seeds": ("seed",), "mode": ("tables", "rewards")}
+"""Keys that an override of another key replaces."""
 
 
 def load(path: str | os.PathLike[str], overrides: Sequence[str] = ()) -> ExperimentConfig:
@@ -100,15 +105,11 @@ def packing_from(values: Mapping[str, Any]) -> Recording:
     Raises:
         ConfigError: there is no such option, or a value is out of its bounds.
     """
-    if not values:
-        return Recording()
     try:
-        return from_mapping({"episodes": 1, "recording": dict(values)}).recording
-    except ConfigError as error:
-        parts = (problem.message for problem in error.problems)
-        keys = (problem.path.removeprefix("recording.") for problem in error.problems)
-        lines = "\n".join(f"{key}: {part}" for key, part in zip(keys, parts, strict=True))
-        raise ConfigError(lines or str(error), error.problems) from None
+        return Recording.model_validate(dict(values))
+    except ValidationError as error:
+        problems = problems_in(error, values, schema_at(("recording",)))
+        raise refuse(problems, Document(values)) from None
 
 
 def read_text(file: FilePath) -> str:
@@ -146,10 +147,14 @@ def experiment_in(
         )
         raise refuse([*document.problems, problem], document)
     override(document, overrides)
-    file, problems = _validated(document.value)
-    problems = [*document.problems, *problems]
+    file, problems = None, document.problems
+    try:
+        file = ExperimentFile.model_validate(dict(document.value))
+    except ValidationError as error:
+        problems = [*problems, *problems_in(error, document.value)]
     unusable = {problem.path[0] for problem in problems if problem.path}
-    problems += _contradictions({key: given for key, given in document.value.items() if key not in unusable})
+    usable = {key: value for key, value in document.value.items() if key not in unusable}
+    problems = [*problems, *_contradictions(usable)]
     if file and file.name is None and not re.fullmatch(NAME_PATTERN, name):
         problems.append(Problem(("name",), f"missing, and {named_by} cannot be it: expected {NAME_EXPECTED}"))
     if file is None or problems:
@@ -159,13 +164,6 @@ def experiment_in(
         return ExperimentConfig.model_validate(resolved)
     except ValidationError as error:
         raise refuse(problems_in(error, resolved), document) from None
-
-
-def _validated(values: Mapping[str, Any]) -> tuple[ExperimentFile | None, list[Problem]]:
-    try:
-        return ExperimentFile.model_validate(dict(values)), []
-    except ValidationError as error:
-        return None, problems_in(error, values)
 
 
 def _contradictions(given: Mapping[str, Any]) -> list[Problem]:
@@ -184,14 +182,16 @@ def _contradictions(given: Mapping[str, Any]) -> list[Problem]:
 
 
 def _resolved(file: ExperimentFile, name: str) -> dict[str, Any]:
-    """Return the values of the resolved experiment, with the shorthands of `file` spelled out."""
+    """Return the values of the resolved experiment, without the shorthands of `file`."""
     values = {key: getattr(file, key) for key in ExperimentConfig.model_fields}
     values["name"] = file.name or name
     values["tables"], values["rewards"] = _learners(file)
     values["exploration"] = file.exploration or EXPLORATION[values["tables"]]
-    for key, (algorithm, usual) in OWN_SECTIONS.items():
-        if file.algorithm == algorithm and values[key] is None:
-            values[key] = usual
+    for key, section in SECTION_OF.items():
+        if values[key] is None:
+            del values[key]
+            if file.algorithm == section.algorithm:
+                values[key] = section()
     if isinstance(file.seeds, SeedRange):
         values["seeds"] = tuple(range(file.seeds.first, file.seeds.first + file.seeds.count))
     elif file.seeds is None:
@@ -206,3 +206,102 @@ def _learners(file: ExperimentFile) -> tuple[Tables, Rewards]:
         return file.tables, file.rewards
     given = file.tables or file.rewards or "joint"
     return next(pair for pair in LEARNERS.values() if given in pair)
+
+
+# --- overrides ----------------------------------------------------------------------------------------
+
+
+def override(document: Document, overrides: Sequence[str]) -> None:
+    """Apply every `KEY=VALUE` of `overrides` to `document`, whose value must be a mapping.
+
+    A key on the way to KEY that holds something else than a mapping becomes one. A section that the
+    document does not mention starts from its default, so that only the value named is changed.
+    """
+    put(document, [_parse(text) for text in overrides])
+
+
+def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) -> None:
+    """Put values at paths of `document`, as `override` does; each brings its own places."""
+    assigned: set[str] = set()
+    for path, read in values:
+        assigned.add(path[0])
+        for rival in _rivals(path, read.value):
+            if rival not in assigned:
+                document.value = {key: each for key, each in document.value.items() if key != rival}
+                document.problems = _without(document.problems, (rival,))
+        for length in range(1, len(path)):
+            if not isinstance(_at(document.value, path[:length]), Mapping | list | tuple):
+                start = {} if path[0] in document.value else _default(path[0])
+                place = {here: place for here, place in read.places.items() if not here}
+                _assign(document, path[:length], Document(start, place))
+        _assign(document, path, read)
+
+
+def _rivals(path: tuple[str, ...], value: object) -> tuple[str, ...]:
+    """Return the keys that an override removes: that of the algorithm, the sections of all others."""
+    if path == ("algorithm",):
+        return tuple(key for key, section in SECTION_OF.items() if section.algorithm != value)
+    return _RIVALS.get(path[0], ())
+
+
+def _parse(text: str) -> tuple[tuple[str, ...], Document]:
+    shown = text if len(text) <= _MAX_SHOWN else text[:_MAX_SHOWN] + "…"
+    source = "--set " + (shown if shown.isprintable() else repr(shown))
+    key, separator, value = text.partition("=")
+    path = tuple(key.strip().split("."))
+    if not separator or not all(path):
+        raise ConfigError(f"{source}: expected KEY=VALUE, such as epsilon=0.2 or evaluation.trials=50")
+    if len(path) > MAX_DEPTH:
+        raise ConfigError(f"{source}: expected a key of at most {MAX_DEPTH} parts")
+    read = read_yaml(value, source, lines=False)
+    read.places[()] = Place(source)
+    return path, read
+
+
+def _assign(document: Document, path: tuple[str, ...], read: Document) -> None:
+    for old in [place for place in document.places if place[: len(path)] == path]:
+        del document.places[old]
+    document.value = _with(document.value, path, read.value)
+    document.places |= {(*path, *below): place for below, place in read.places.items()}
+    document.problems = _without(document.problems, path)
+    document.problems += [problem._replace(path=(*path, *problem.path)) for problem in read.problems]
+
+
+def _without(problems: list[Problem], path: Path) -> list[Problem]:
+    """Return the problems except those of the value at `path`; problems of the text itself stay."""
+    return [problem for problem in problems if problem.place or problem.path[: len(path)] != path]
+
+
+def _with(value: object, path: Path, new: object) -> Any:
+    """Return `value` with `new` at `path`; only mappings and lists on the path are copied."""
+    if not path:
+        return new
+    key, below = path[0], path[1:]
+    if isinstance(value, list | tuple) and (at := _position(key, value)) is not None:
+        return [*value[:at], _with(value[at], below, new), *value[at + 1 :]]
+    mapping = dict(value) if isinstance(value, Mapping) else {}
+    return {**mapping, key: _with(mapping.get(key), below, new)}
+
+
+def _at(value: Any, path: Path) -> Any:
+    for part in path:
+        if isinstance(value, Mapping):
+            value = value.get(part)
+        elif isinstance(value, list | tuple) and _position(part, value) is not None:
+            value = value[int(part)]
+        else:
+            return None
+    return value
+
+
+def _position(part: str | int, items: Sequence[object]) -> int | None:
+    """Return `part` as a position in `items`, if it is one."""
+    text = str(part)
+    return int(text) if text.isascii() and text.isdecimal() and int(text) < len(items) else None
+
+
+def _default(key: str) -> dict[str, Any]:
+    """Return the default of a section as plain values; empty for other keys."""
+    field = ExperimentFile.model_fields.get(key)
+    default = field.default if field else None
+    return default.model_dump(mode="json", exclude_unset=True) if isinstance(default, Section) else {}

@@ -1,16 +1,22 @@
-"""What an experiment is: the frozen object every part of a run is given.
+"""An experiment: what a YAML file may contain, and the resolved object that every part of a run uses.
 
-Every value is present and no shorthand is left; what a file may say is in `runner.config.file`.
+`ExperimentFile` has the shorthands (`mode`, `seed`) and keys that may be left out; `runner.config.loading`
+resolves it to an `ExperimentConfig`, where every value is present.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, Literal, Self, TypeVar, get_args
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Discriminator, Field, GetCoreSchemaHandler, Tag, model_validator
+from pydantic_core import CoreSchema
 
+from runner.config.document import write_yaml
 from runner.config.schedules import Probability, StepSize
 from runner.config.sections import (
+    Algorithm,
+    AlgorithmSection,
     Environment,
     Evaluation,
     Hysteretic,
@@ -25,29 +31,21 @@ from runner.config.values import Section, refusal
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN
 
 Mode = Literal["cooperative", "competitive"]
-Algorithm = Literal[
-    "q_learning",
-    "sarsa",
-    "expected_sarsa",
-    "double_q_learning",
-    "hysteretic_q_learning",
-    "wolf_phc",
-    "random",
-]
 Tables = Literal["joint", "per_agent"]
 Rewards = Literal["team", "individual"]
 Exploration = Literal["shared", "independent"]
 
-LEARNERS: dict[Mode, tuple[Tables, Rewards]] = {
+LEARNERS: Final[dict[Mode, tuple[Tables, Rewards]]] = {
     "cooperative": ("joint", "team"),
     "competitive": ("per_agent", "individual"),
 }
-"""What each mode is short for."""
+"""The tables and rewards of each mode."""
 
-EXPLORATION: dict[Tables, Exploration] = {"joint": "shared", "per_agent": "independent"}
-"""The exploration of a file that does not name one: separate learners explore independently of each other."""
+EXPLORATION: Final[dict[Tables, Exploration]] = {"joint": "shared", "per_agent": "independent"}
+"""The default exploration: separate learners explore independently of each other."""
 
 Name = Annotated[str, Field(pattern=NAME_PATTERN, json_schema_extra={"patternErrorMessage": NAME_EXPECTED})]
+T = TypeVar("T")
 
 
 def _unique(seeds: tuple[int, ...]) -> tuple[int, ...]:
@@ -67,22 +65,68 @@ Seeds = Annotated[
 ]
 
 
-OWN_SECTIONS: dict[str, tuple[Algorithm, Section]] = {
-    "hysteretic": ("hysteretic_q_learning", Hysteretic()),
-    "wolf_phc": ("wolf_phc", WolfPhc()),
-}
-"""Sections that only one algorithm has: by key, which one, and what it is unless given."""
+class SeedRange(Section):
+    """Consecutive seeds."""
+
+    first: Seed = Field(default=0, description="The first seed.")
+    count: Annotated[int, Field(ge=1, le=100_000)] = Field(description="Number of seeds.")
+
+    @model_validator(mode="after")
+    def _last_is_a_seed(self) -> Self:
+        if self.first + self.count > 2**64:
+            raise refusal(("count",), f"found {self.count}, expected the last seed to stay below 2^64")
+        return self
+
+
+def _seeds_kind(value: object) -> str | None:
+    if isinstance(value, Mapping | SeedRange):
+        return "SeedRange"
+    return "array" if isinstance(value, list | tuple) else None
+
+
+SeveralSeeds = Annotated[
+    Annotated[Seeds, Tag("array")] | Annotated[SeedRange, Tag("SeedRange")], Discriminator(_seeds_kind)
+]
+
+
+class _NotNull:
+    """Validates `X | None` as X: None is the default of a key that is left out, and no value of its own."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return handler.generate_schema(get_args(source)[0])
+
+
+Optional = Annotated[T | None, _NotNull()]
+"""A key that may be left out, but not be null."""
+
+
+def _only_with(section: type[AlgorithmSection]) -> Any:
+    return Field(default=None, description=f"Only with algorithm: {section.algorithm}.")
 
 
 class Settings(Section):
-    """What a file and the resolved experiment say in the same words."""
+    """The keys that a file and the resolved experiment share, in the order in which people read them."""
 
+    name: Optional[Name] = Field(
+        default=None, description="Name of the runs; the name of the file without its ending unless given."
+    )
     env: Environment = Field(default=Environment(), description="The environment and its arguments.")
+    tables: Optional[Tables] = Field(
+        default=None, description="One table over joint actions, or one for each agent. Follows `rewards`."
+    )
+    rewards: Optional[Rewards] = Field(
+        default=None,
+        description="The team's summed reward for all, or each agent's own. Follows `tables`.",
+    )
     algorithm: Algorithm = Field(
-        default="q_learning", description="What learns (docs/algorithms.md), or random: nothing learns."
+        default="q_learning",
+        description="The learning algorithm (docs/algorithms.md), or random: nothing is learned.",
     )
     episodes: Annotated[int, Field(ge=0, le=10**12)] = Field(
-        description="How many episodes to train for; 0 only evaluates the initial tables."
+        description="Number of training episodes; 0 only evaluates the initial tables."
+    )
+    seeds: Optional[SeveralSeeds] = Field(
+        default=None, description="Several seeds instead of one: a list, or the first and the number of them."
     )
     step_size: StepSize = Field(
         default=0.1, description="How far an update moves a value towards its target: above 0, at most 1."
@@ -93,11 +137,19 @@ class Settings(Section):
     epsilon: Probability = Field(
         default=0.1, description="The probability of exploring: of acting at random instead of greedily."
     )
+    exploration: Optional[Exploration] = Field(
+        default=None,
+        description="independent (the default with `tables: per_agent`): each agent decides by a draw of its "
+        "own whether to explore. shared: one draw decides for all agents, so that they explore at the same "
+        "steps, as in the published tutorial. A joint table is one learner: both are the same.",
+    )
     initial_q: InitialTable = Field(
         default=0.0,
         description="The Q-tables' first values: a number, random (uniform in [0, 1) or in a range given), "
         "or the tables of a recorded run.",
     )
+    hysteretic: Optional[Hysteretic] = _only_with(Hysteretic)
+    wolf_phc: Optional[WolfPhc] = _only_with(WolfPhc)
     evaluation: Evaluation | None = Field(
         default=Evaluation(every=1000, trials=200),
         description="Greedy trials during training, which never alter it; null for none.",
@@ -108,12 +160,45 @@ class Settings(Section):
     )
     recording: Recording = Field(default=Recording(), description="What is recorded and how it is packed.")
     quirks: Quirks = Field(
-        default=Quirks(), description="The published tutorial's code taken at its word, to get its figures."
+        default=Quirks(), description="Deviations of the published tutorial's code, to reproduce its figures."
     )
 
 
+class ExperimentFile(Settings):
+    """An experiment as a YAML file describes it."""
+
+    mode: Optional[Mode] = Field(
+        default=None,
+        description="cooperative (the default): one joint table learns from the summed reward. "
+        "competitive: each agent has its own table and reward. "
+        "Short for `tables` and `rewards`, which may be given instead.",
+    )
+    seed: Optional[Seed] = Field(
+        default=None, description="The seed of every random draw; 0 unless given. One run."
+    )
+
+
+def _keys() -> tuple[str, ...]:
+    keys = list(Settings.model_fields)
+    keys.insert(keys.index("tables"), "mode")
+    keys.insert(keys.index("seeds"), "seed")
+    return tuple(keys)
+
+
+KEYS: Final = _keys()
+"""The keys of a file in the order in which people read them."""
+
+SECTION_OF: Final[dict[str, type[AlgorithmSection]]] = {
+    key: section
+    for key, field in Settings.model_fields.items()
+    for section in get_args(field.annotation)
+    if isinstance(section, type) and issubclass(section, AlgorithmSection)
+}
+"""The sections that only one algorithm has, by key."""
+
+
 class ExperimentConfig(Settings):
-    """One experiment, resolved: every value present and checked, nothing to be changed.
+    """One experiment, resolved: every value is present, checked and frozen.
 
     Make one with `load` or `from_mapping`. The paths of its attributes are the keys of the file.
     """
@@ -121,13 +206,9 @@ class ExperimentConfig(Settings):
     name: Name
     tables: Tables
     rewards: Rewards
+    seeds: Seeds
     exploration: Exploration
     """Whether one draw decides for all agents if they explore, or each agent has its own."""
-    seeds: Seeds
-    hysteretic: Hysteretic | None = None
-    """Present if, and only if, the algorithm is Hysteretic Q-learning."""
-    wolf_phc: WolfPhc | None = None
-    """Present if, and only if, the algorithm is WoLF-PHC."""
 
     @property
     def mode(self) -> Mode | None:
@@ -156,9 +237,11 @@ class ExperimentConfig(Settings):
                 "but there is one joint table: set tables: per_agent (and rewards: team) or mode: competitive"
             )
             raise refusal(("algorithm",), message)
-        for key, (algorithm, _) in OWN_SECTIONS.items():
-            if getattr(self, key) is not None and self.algorithm != algorithm:
-                message = f"goes with algorithm: {algorithm}, found algorithm: {self.algorithm}. Remove it"
+        for key, section in SECTION_OF.items():
+            if getattr(self, key) is not None and self.algorithm != section.algorithm:
+                message = (
+                    f"goes with algorithm: {section.algorithm}, found algorithm: {self.algorithm}. Remove it"
+                )
                 raise refusal((key,), message)
         return self
 
@@ -167,21 +250,8 @@ class ExperimentConfig(Settings):
 
         Sections of other algorithms are left out.
         """
-        values = self.model_dump(
-            mode="json", exclude={key for key in OWN_SECTIONS if getattr(self, key) is None}
-        )
-        return {key: values[key] for key in KEYS if key in values}
+        return self.model_dump(mode="json", exclude={key for key in SECTION_OF if getattr(self, key) is None})
 
     def to_yaml(self) -> str:
         """Return `to_mapping` as YAML, which `load` takes back to an equal object."""
-        from runner.config.document import write_yaml
-
         return write_yaml(self.to_mapping())
-
-
-KEYS = (
-    *("name", "env", "mode", "tables", "rewards", "algorithm", "episodes", "seed", "seeds"),
-    *("step_size", "discount", "epsilon", "exploration", "initial_q", "hysteretic", "wolf_phc"),
-    *("evaluation", "log", "snapshots", "recording", "quirks"),
-)
-"""The keys of a file in the order in which people read them."""

@@ -7,8 +7,7 @@ import functools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from runner.config.file import ExperimentFile
-from runner.config.model import KEYS
+from runner.config.model import KEYS, ExperimentFile
 
 Schema = Mapping[str, Any]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import (
     BeforeValidator,
@@ -223,8 +223,27 @@ class Quirks(Section):
     )
 
 
-class Hysteretic(Section):
+Algorithm = Literal[
+    "q_learning",
+    "sarsa",
+    "expected_sarsa",
+    "double_q_learning",
+    "hysteretic_q_learning",
+    "wolf_phc",
+    "random",
+]
+
+
+class AlgorithmSection(Section):
+    """The parameters of one algorithm: a field here is all that the configuration needs of a parameter."""
+
+    algorithm: ClassVar[Algorithm]
+
+
+class Hysteretic(AlgorithmSection):
     """Hysteretic Q-learning's second step size; the first is `step_size`."""
+
+    algorithm = "hysteretic_q_learning"
 
     decrease: Probability = Field(
         default=0.01,
@@ -233,8 +252,10 @@ class Hysteretic(Section):
     )
 
 
-class WolfPhc(Section):
+class WolfPhc(AlgorithmSection):
     """How fast WoLF-PHC moves its policy towards the greedy action: it wins or learns fast."""
+
+    algorithm = "wolf_phc"
 
     win: StepSize = Field(
         default=0.05,

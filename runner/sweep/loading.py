@@ -13,9 +13,8 @@ from pydantic import ValidationError
 
 from runner.config import ConfigError, ExperimentConfig, load
 from runner.config.document import Document, Problem, read_yaml
-from runner.config.loading import experiment_in, read_text
-from runner.config.model import OWN_SECTIONS
-from runner.config.overrides import put
+from runner.config.loading import experiment_in, put, read_text
+from runner.config.model import SECTION_OF
 from runner.config.problems import found, problems_in, refuse
 from runner.config.schema import Schema, without_references
 from runner.config.shipped import config_path
@@ -153,7 +152,7 @@ def _start_of_trials(
     where these are searched over, each trial gets the default that goes with its values.
     """
     values = base.to_mapping()
-    followers = {"exploration": _LEARNERS} | {key: {"algorithm"} for key in OWN_SECTIONS}
+    followers = {"exploration": _LEARNERS} | {key: {"algorithm"} for key in SECTION_OF}
     for key, leaders in followers.items():
         if key not in given and leaders & set(parameters):
             values.pop(key, None)

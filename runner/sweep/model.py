@@ -12,8 +12,7 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from runner.config import ExperimentConfig, from_mapping
-from runner.config.file import SeveralSeeds
-from runner.config.model import OWN_SECTIONS, Name, Seed
+from runner.config.model import SECTION_OF, Name, Seed, SeveralSeeds
 from runner.config.values import Count, Section, refusal
 
 Strategy = Literal["grid", "random", "tpe", "genetic"]
@@ -262,7 +261,7 @@ class Sweep:
     def applicable(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values without those in the section of another algorithm than the one they name."""
         algorithm = values.get("algorithm", self.base.algorithm)
-        others = {key for key, (owner, _) in OWN_SECTIONS.items() if owner != algorithm}
+        others = {key for key, section in SECTION_OF.items() if section.algorithm != algorithm}
         if "algorithm" not in values:
             others = set()  # then it is a mistake, which the configuration reports
         return {path: value for path, value in values.items() if path.partition(".")[0] not in others}
