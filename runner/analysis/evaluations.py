@@ -44,7 +44,7 @@ class Evaluation:
 
 def evaluations_of(recording: Recording) -> list[Evaluation]:
     """Return a run's evaluations: those with metrics; of a loop, its trials between training episodes."""
-    if recording.kind != "job":
+    if not recording.is_job:
         return _of_loop(recording)
     found: list[Evaluation] = []
     for metrics in recording.metrics("eval"):

@@ -12,7 +12,6 @@ the records need nothing.
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -169,8 +168,8 @@ def episode_columns(
     records = recording.episodes(phase, start, stop)
     columns = _plain_columns(records, ("episode", "length", "penalties", "success"))
     columns |= _plain_columns(records, ("terminated", "truncated", "last_step"))
-    columns |= _by_name(records["returns"], [f"return.{agent}" for agent in agents_of(recording)])
-    return columns | _by_name(records["events"], event_names_of(recording))
+    columns |= _by_name(records["returns"], [f"return.{agent}" for agent in recording.agents])
+    return columns | _by_name(records["events"], recording.event_names)
 
 
 def step_columns(
@@ -201,7 +200,7 @@ def step_columns(
         records = recording.episode_steps(phase, episode)
     names = records.dtype.names or ()
     columns = _spread(_plain_columns(records, [name for name in _BEFORE if name in names]))
-    columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in agents_of(recording)])
+    columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in recording.agents])
     return columns | _plain_columns(records, [name for name in _BEHIND if name in names])
 
 
@@ -219,8 +218,8 @@ def evaluation_records(recording: Recording) -> list[dict[str, Any]]:
     and no `training`; `mean_penalties` is None where the environment does not define penalties; returns that
     are not finite are left out of `mean_returns` and counted in `not_finite`.
     """
-    agents, events = agents_of(recording), event_names_of(recording)
-    if recording.kind != "job":
+    agents, events = recording.agents, recording.event_names
+    if not recording.is_job:
         return _loop_evaluations(recording, agents, events)
     return [evaluation_record(metrics, agents, events) for metrics in recording.metrics("eval")]
 
@@ -287,21 +286,11 @@ def trained_before(recording: Recording) -> NDArray[np.int64]:
 
 def training_records(recording: Recording) -> list[dict[str, Any]]:
     """Return the reports of training of a recording, in order, as JSON can hold them."""
-    agents = agents_of(recording)
+    agents = recording.agents
     return [
         {"episode": metrics["episode"], "step": metrics["step"]} | _training_side(metrics, agents)
         for metrics in recording.metrics("train")
     ]
-
-
-def agents_of(recording: Recording) -> list[str]:
-    """Return the names of the learners: one table and one reward each."""
-    return list(json.loads(recording.run["agents"]))
-
-
-def event_names_of(recording: Recording) -> list[str]:
-    """Return the names of the environment's events; none where it has none."""
-    return list(recording.environment["event_names"])
 
 
 def evaluation_record(

@@ -33,7 +33,7 @@ def told_of(recording: Recording, replay: TableReplay, state: int | None = None)
         RunnerError: there is no such state.
         RecordingError: the steps are not recorded, which a state's history needs.
     """
-    told: dict[str, Any] = {"run": recording.run["run_id"], "step": replay.step}
+    told: dict[str, Any] = {"run": recording.run_id, "step": replay.step}
     pairs = zip(replay.agents, replay.tables, strict=True)
     told["tables"] = [summary_of(agent, values) for agent, values in pairs]
     return told if state is None else told | state_of(recording, replay, state)

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.frames import LARGEST, agents_of, evaluation_records, is_usable, training_records
+from runner.analysis.frames import LARGEST, evaluation_records, is_usable, training_records
 from runner.analysis.series import LOGGED, SHARES, Readings, RunSeries
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
@@ -22,15 +22,15 @@ _MOST_NAMES: Final = 64
 
 def read_series(recording: Recording) -> RunSeries:
     """Return the metrics of a recording, also of one that was cut off."""
-    if recording.kind != "job":
+    if not recording.is_job:
         return loop_series(recording)
     evaluations = evaluation_records(recording)
     training = [(record["episode"], training_readings(record)) for record in training_records(recording)]
     training += [(record["episode"], training_readings(record["training"])) for record in evaluations]
-    agents = agents_of(recording)
+    agents = recording.agents
     exact = {measures["evaluation"]: exact_readings(measures, agents) for measures in recording.optimality()}
     return RunSeries(
-        run_id=recording.run["run_id"],
+        run_id=recording.run_id,
         name=recording.name,
         seed=recording.seed,
         status=recording.status,
@@ -62,7 +62,7 @@ def loop_series(recording: Recording) -> RunSeries:
     if left_out := sum(record["not_finite"] for record in evaluations):
         not_finite["mean_return"] = left_out
     return RunSeries(
-        run_id=recording.run["run_id"],
+        run_id=recording.run_id,
         name=recording.name,
         seed=recording.seed,
         status=recording.status,
@@ -148,7 +148,7 @@ def _binned_episodes(
     recording: Recording, edges: NDArray[np.int64], not_finite: Counter[str]
 ) -> dict[int, Readings]:
     """Return mean length and return of the training episodes between the edges."""
-    agents, bins = agents_of(recording), len(edges) - 1
+    agents, bins = recording.agents, len(edges) - 1
     count, length = np.zeros(bins), np.zeros(bins)
     returns, usable_returns = np.zeros((bins, len(agents))), np.zeros((bins, len(agents)))
     for block in recording.blocks(schema.TRAIN_EPISODE):

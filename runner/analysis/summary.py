@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from runner.analysis.frames import agents_of, evaluation_records, loop_summary, training_records
+from runner.analysis.frames import evaluation_records, loop_summary, training_records
 from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
@@ -39,7 +39,7 @@ def describe(run: Run, recording: Recording) -> dict[str, Any]:
         "eval": evaluation_records(recording),
         "optimality": [_without_times(measures) for measures in recording.optimality()],
         "train": training_records(recording),
-        "loop": None if recording.kind == "job" else loop_summary(recording),
+        "loop": None if recording.is_job else loop_summary(recording),
     }
 
 
@@ -51,7 +51,7 @@ def random_policy_sentence(recording: Recording) -> str:
     """
     from runner.planning import random_baseline
 
-    if recording.kind != "job" or recording.config["algorithm"] == "random":
+    if not recording.is_job or recording.config["algorithm"] == "random":
         return ""
     baseline = random_baseline(recording.mdp)
     return baseline.sentence if baseline else ""
@@ -86,11 +86,11 @@ def _without_recording(run: Run) -> dict[str, Any]:
 
 def _tables(recording: Recording) -> list[dict[str, Any]]:
     """Return size and fill of each table, as last reported."""
-    if recording.kind != "job":
+    if not recording.is_job:
         return []  # what a loop learned is its own
     reports = [*recording.metrics("train"), *recording.metrics("eval")]
     last = max(reports, key=lambda report: report["step"], default=None)
-    agents = agents_of(recording)
+    agents = recording.agents
     if last is None:
         return [{"agent": agent} for agent in agents]
     return [

@@ -29,7 +29,7 @@ def run_table(recording: Recording) -> pa.Table:
         "run_id": (pa.string(), facts["run_id"]),
         "name": (pa.string(), recording.name),
         "seed": (pa.uint64(), facts["seed"]),
-        "job": (pa.string(), recording.run["job"]),
+        "job": (pa.string(), recording.job),
         "status": (pa.string(), facts["status"]),
         "created": (pa.timestamp("ms", tz="UTC"), created),
         "content_digest": (pa.string(), summary.get("content_digest")),

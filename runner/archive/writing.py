@@ -126,7 +126,7 @@ class _Writing:
         self._write_descriptions()
         for table in self._batches.shape.tables:
             with TableWriter(self._folder / table.name, table.columns) as writer:
-                if self._recording.kind == "job" and table.name == layout.STEPS:
+                if self._recording.is_job and table.name == layout.STEPS:
                     self._write_learning(table, writer)
                     continue
                 for batch in self._batches.of(table):
@@ -179,7 +179,7 @@ class _Writing:
     def _write_learning(self, table: Table, steps: TableWriter) -> None:
         """Write the steps of a job, and beside them its snapshots, which they make."""
         recording = self._recording
-        seed = int(recording.run["seed"])
+        seed = recording.seed or 0
         tables = DerivedTables(StepReplay(recording.config, recording.mdp, seed, self._where))
         columns = layout.SCHEMAS[layout.Q_TABLES]
         with TableWriter(self._folder / layout.Q_TABLES, columns) as snapshots:

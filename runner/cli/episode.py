@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from runner.analysis.frames import agents_of
 from runner.analysis.outcomes import events_of
 from runner.cli.output import number
 from runner.drawing.text import Drawing
@@ -36,7 +35,7 @@ class Episode:
         self._mdp = recording.mdp
         self._records = recording.episode_steps(phase, number)
         self._events = events_of(self._mdp, self._records)
-        self._agents = agents_of(recording)
+        self._agents = recording.agents
         self._title = title
         self._drawing = Drawing(self._mdp.scene) if self._mdp.scene is not None else None
         self._states, self._actions = states_in_words(self._mdp), actions_in_words(self._mdp)

@@ -33,7 +33,7 @@ Start = int | Literal["random", "each"]
 def holds_steps(run: Run) -> bool:
     """Return whether a run's recording holds its steps."""
     with open_recording(run.recording) as recording:
-        return bool(recording.config["recording"]["steps"] == "all")
+        return not recording.leaves_out_steps
 
 
 def rerecord(run: Run, report: Report = lambda _: None, stop: Stop = lambda: False) -> Run:

@@ -177,8 +177,8 @@ def _job(run: Run) -> tuple[Job, bool]:
     told = Job(from_mapping(run.file.config), run.seed)
     try:
         with open_recording(run.recording) as recording:
-            recorded = Job(from_mapping(recording.config), int(recording.run["seed"]))
-            claimed = recording.run["job"]
+            recorded = Job(from_mapping(recording.config), recording.seed or 0)
+            claimed = recording.job
     except (RecordingError, ConfigError, KeyError, ValueError):
         return told, False
     if claimed in (recorded.identity, told.identity):

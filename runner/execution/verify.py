@@ -21,7 +21,6 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
-from runner.analysis.frames import agents_of
 from runner.config import from_mapping
 from runner.config.job import Job
 from runner.config.sections import RunTable
@@ -195,11 +194,11 @@ def _lost(recording: Recording) -> Verification | None:
 
 
 def _compare(recording: Recording, rerun: bool, report: Report) -> Verification:
-    if recording.kind != "job":
+    if not recording.is_job:
         return _compare_loop(recording)
     config = from_mapping(recording.config)
-    job = Job(config, int(recording.run["seed"]))
-    if recording.run["job"] != job.identity:
+    job = Job(config, recording.seed or 0)
+    if recording.job != job.identity:
         return _other_job(recording, job.identity)
     mdp = load_mdp(config.env.id, config.env.kwargs, config.rewards) if rerun else recording.mdp
     complete = recording.status == "finished"
@@ -242,8 +241,8 @@ def _compare_names(recording: Recording, learners: list[str] | None = None) -> N
     for key, name in (("env_id", "id"), ("kwargs", "kwargs")):
         if described.get(key) != config.get(name):
             raise Diverged("environment.json", key, described.get(key), config.get(name))
-    if learners is not None and agents_of(recording) != learners:
-        raise Diverged("metadata run", "agents", agents_of(recording), learners)
+    if learners is not None and list(recording.agents) != learners:
+        raise Diverged("metadata run", "agents", list(recording.agents), learners)
 
 
 def _compare_description(recording: Recording, mdp: Mdp) -> None:
@@ -399,7 +398,7 @@ def _compare_result(found: Verification, recording: Recording, summary: dict[str
 
 
 def _other_job(recording: Recording, expected: str) -> Verification:
-    error = Diverged("metadata run", "job", recording.run["job"], expected)
+    error = Diverged("metadata run", "job", recording.job, expected)
     return Verification(recording.path, str(error), error)
 
 

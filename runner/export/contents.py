@@ -17,19 +17,14 @@ def shortcomings(recording: Recording) -> list[str]:
     said, status = [], recording.status
     if status != "finished":
         done = "there is what its loop had done"
-        if recording.kind == "job":
+        if recording.is_job:
             planned = recording.config.get("episodes")
             of = f" of {planned:,}" if is_whole(planned, 0, 2**63) else ""
             done = f"there are {recording.count(schema.TRAIN_EPISODE):,}{of} training episodes"
         how = "is still running" if status == "running" else f"did not finish ({status})"
-        said.append(f"Run {recording.run['run_id']} {how}: {done}.")
+        said.append(f"Run {recording.run_id} {how}: {done}.")
     said += [f"Of {topic} some messages were lost in a repair; they are missing." for topic in recording.lost]
     return said
-
-
-def has_steps(recording: Recording) -> bool:
-    """Return whether any step was recorded."""
-    return bool(recording.count(schema.TRAIN_STEP) or recording.count(schema.EVAL_STEP))
 
 
 def require_steps(recording: Recording, purpose: str) -> None:
@@ -38,16 +33,16 @@ def require_steps(recording: Recording, purpose: str) -> None:
     Raises:
         RecordingError: it has none.
     """
-    if not has_steps(recording):
+    if not recording.has_steps:
         raise RecordingError(f"{recording.path}: found no steps to {purpose}: {why_no_steps(recording)}.")
 
 
 def why_no_steps(recording: Recording) -> str:
     """Return why a recording has no steps, and what gives it some."""
-    plan = recording.config.get("recording")
-    if isinstance(plan, Mapping) and plan.get("steps") == "none":
-        run_id = recording.run["run_id"]
-        return f"they were left out (recording.steps: none); `dualtaxi rerecord {run_id}` records them"
+    if recording.leaves_out_steps:
+        return (
+            f"they were left out (recording.steps: none); `dualtaxi rerecord {recording.run_id}` records them"
+        )
     return "it ended before one was recorded"
 
 

@@ -10,14 +10,13 @@ from __future__ import annotations
 import importlib.util
 import math
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from runner.analysis.frames import agents_of
 from runner.drawing import palette, svg
 from runner.environments.mdp import Mdp
 from runner.environments.naming import events_in_words, exploration_in_words, spoken, states_in_words
@@ -138,7 +137,7 @@ class Film:
         room = int((width - 2 * _MARGIN) / (_FONT * _LETTER))
         self._captions = [
             [line for text in caption for line in textwrap.wrap(text, room) or [""]]
-            for caption in captions_of(mdp, agents_of(recording), episode, scene=has_scene)
+            for caption in captions_of(mdp, recording.agents, episode, scene=has_scene)
         ]
         heads = textwrap.wrap(title, room)
         top = 10 + _LINE * len(heads)
@@ -265,7 +264,7 @@ class _Grid:
         return self._segments[ends]
 
 
-def captions_of(mdp: Mdp, learners: list[str], episode: Episode, scene: bool = True) -> list[list[str]]:
+def captions_of(mdp: Mdp, learners: Sequence[str], episode: Episode, scene: bool = True) -> list[list[str]]:
     """Return for each frame what is written below it: step, actions, rewards, events."""
     actions = deeds_in_words(mdp)
     totals = np.cumsum(episode.rewards, axis=0)
@@ -289,7 +288,7 @@ def captions_of(mdp: Mdp, learners: list[str], episode: Episode, scene: bool = T
     return captions
 
 
-def _rewards(learners: list[str], rewards: list[float], totals: list[float]) -> str:
+def _rewards(learners: Sequence[str], rewards: list[float], totals: list[float]) -> str:
     if len(rewards) == 1:
         return f"reward {rewards[0]:+g}, sum {totals[0]:+g}"
     each = [f"{spoken(name)} {own:+g}" for name, own in zip(learners, rewards, strict=True)]

@@ -50,7 +50,7 @@ def require_packages() -> None:
 
 def dataset_id(recording: Recording) -> str:
     """Return the name of a run's dataset: NAME-RUN-v0, with what Minari allows in names."""
-    return re.sub(r"[^\w-]", "_", f"{recording.name}-{recording.run['run_id']}-v0")
+    return re.sub(r"[^\w-]", "_", f"{recording.name}-{recording.run_id}-v0")
 
 
 def write_dataset(
@@ -115,7 +115,7 @@ def write_dataset(
 
 def _buffers(recording: Recording, phase: str, ranges: Ranges) -> Iterator[tuple[Any, bool]]:
     """Yield each episode as Minari takes it, and whether it was reset before its end."""
-    if recording.kind == "job":
+    if recording.is_job:
         yield from ((_buffer(steps), False) for steps in episodes_of(recording, phase, ranges))
         return
     yield from (
@@ -193,7 +193,7 @@ def _after_reset(values: NDArray[Any]) -> NDArray[Any]:
 def _told(recording: Recording, phase: str) -> dict[str, Any]:
     run, config = recording.run, recording.config
     digest = recording.result.content_digest or f"none ({recording.status})"
-    job = recording.kind == "job"
+    job = recording.is_job
     what = "Observations are states, actions joint actions." if job else "Recorded from a loop."
     told = {
         "description": f"The {phase} episodes of the dualtaxi run {run['run_id']} "
@@ -206,7 +206,7 @@ def _spaces(recording: Recording) -> tuple[Any, Any, Any, list[str]]:
     """Return both spaces, what makes the environment again, if that can be done, and what to say."""
     from gymnasium.spaces import Discrete
 
-    if recording.kind == "job":
+    if recording.is_job:
         observations: Any = Discrete(recording.mdp.states)
         actions: Any = Discrete(recording.mdp.joint_actions)
     else:

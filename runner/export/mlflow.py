@@ -95,13 +95,13 @@ def _export(
     client = MlflowClient(tracking_uri=tracking, registry_uri=tracking)
     found = client.get_experiment_by_name(experiment)
     into = client.create_experiment(experiment) if found is None else found.experiment_id
-    known = client.search_runs([into], f"tags.`{RUN_TAG}` = '{recording.run['run_id']}'")
+    known = client.search_runs([into], f"tags.`{RUN_TAG}` = '{recording.run_id}'")
     same = [one for one in known if one.data.tags.get(DIGEST_TAG) == _digest(recording)]
     if same and not force:
         return Exported(same[0].info.run_id, 0, already=True)
     if known and not force:
         raise RunnerError(
-            f"{tracking}: experiment {experiment!r} has the run {recording.run['run_id']} "
+            f"{tracking}: experiment {experiment!r} has the run {recording.run_id} "
             "with other content; --force replaces it."
         )
     made = client.create_run(into, start_time=round(created(recording) * 1000), tags=_tags(recording))
@@ -158,7 +158,7 @@ def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) 
 def _measured(recording: Recording) -> Iterator[Measures]:
     """Yield the measures of a run; of a loop, which has few, also length and return of its episodes."""
     yield from measures(recording)
-    if recording.kind != "job":
+    if not recording.is_job:
         for phase in ("train", "eval"):
             yield from episodes(recording, phase)
 

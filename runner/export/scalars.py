@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from runner.analysis.frames import agents_of, event_names_of
 from runner.errors import RecordingError
 from runner.recording.reader import Recording
 from runner.recording.schema import EVAL_EPISODE, SCALAR_TOPIC, STEP_NANOSECONDS, TRAIN_EPISODE
@@ -54,7 +53,7 @@ def measures(recording: Recording) -> Iterator[Measures]:
     Raises:
         RecordingError: the recording is damaged.
     """
-    agents, events = agents_of(recording), event_names_of(recording)
+    agents, events = recording.agents, recording.event_names
     for phase in ("train", "eval"):
         for metrics in recording.iter_metrics(phase):
             values = training_values(metrics, agents)
@@ -67,7 +66,7 @@ def measures(recording: Recording) -> Iterator[Measures]:
     for exact in recording.optimality():
         position = exact["log_time"] // STEP_NANOSECONDS
         yield Measures("eval", position, exact["step"], exact["episode"], exact_values(exact, agents))
-    if recording.kind != "job":
+    if not recording.is_job:
         yield from _logged(recording)
 
 
@@ -87,7 +86,7 @@ def episodes(recording: Recording, phase: str) -> Iterator[Measures]:
     Raises:
         RecordingError: the recording is damaged.
     """
-    names = [f"episode/return/{agent}" for agent in agents_of(recording)]
+    names = [f"episode/return/{agent}" for agent in recording.agents]
     topic = TRAIN_EPISODE if phase == "train" else EVAL_EPISODE
     for block in recording.blocks(topic):
         columns = (
@@ -138,10 +137,10 @@ def created(recording: Recording) -> float:
         RecordingError: it says no time.
     """
     try:
-        return datetime.fromisoformat(recording.run["created"]).timestamp()
+        return datetime.fromisoformat(recording.created).timestamp()
     except (ValueError, OverflowError) as error:
         raise RecordingError(
-            f"{recording.path}: found {recording.run['created']!r}, expected the time it was made."
+            f"{recording.path}: found {recording.created!r}, expected the time it was made."
         ) from error
 
 

@@ -103,7 +103,7 @@ def _episodes(recording: Recording, phase: str) -> int:
 
 def metric_batches(recording: Recording) -> Iterator[pa.RecordBatch]:
     """Yield every measure as a row: phase, position, step, episode, name and value."""
-    run_id = recording.run["run_id"]
+    run_id = recording.run_id
     rows = (
         (run_id, found.phase, found.position, found.step, found.episode, name, value)
         for found in measures(recording)

@@ -40,7 +40,7 @@ def write_events(recording: Recording, folder: Path) -> int:
     from tensorboardX.record_writer import RecordWriter
 
     began, count = created(recording), 0
-    writer = RecordWriter(str(folder / f"events.out.tfevents.{int(began)}.{recording.run['run_id']}"))
+    writer = RecordWriter(str(folder / f"events.out.tfevents.{int(began)}.{recording.run_id}"))
     try:
         writer.write(Event(wall_time=began, file_version="brain.Event:2").SerializeToString())
         for position, step, values in _moments(recording):

@@ -85,7 +85,7 @@ class _Phase:
     def __init__(self, recording: Recording, phase: str, complete: bool) -> None:
         self._recording, self._phase, self._complete = recording, phase, complete
         self._n = n = recording.environments
-        learners = int(recording.run["learners"])
+        learners = len(recording.agents)
         self._learners = learners
         self._mdp = recording.mdp if recording.tabular else None
         counted = 1 + (len(self._mdp.event_names) if self._mdp else 0)
@@ -521,7 +521,7 @@ def _records(recording: Recording, name: str) -> Iterator[NDArray[np.void]]:
     if topic in recording.dtypes:
         yield from recording.blocks(topic)
         return
-    learners = int(recording.run["learners"])
+    learners = len(recording.agents)
     kinds = {"rewards": ("f8", (learners,)), "terminated": "?", "truncated": "?"}
     fields = [
         (each.name, kinds.get(each.name, "i8"))

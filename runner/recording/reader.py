@@ -10,6 +10,7 @@ by one. It is the only way in which the rest of the project reads recordings.
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 from bisect import bisect_right
@@ -117,13 +118,38 @@ class Recording:
 
     @cached_property
     def run(self) -> dict[str, str]:
-        """Id, name, seed, job and creation of the run."""
+        """The metadata record `run`: id, name, seed, job, creation, agents and more, as texts."""
         return self.metadata("run")
 
     @property
+    def run_id(self) -> str:
+        """The id of the run."""
+        return self.run["run_id"]
+
+    @property
+    def job(self) -> str:
+        """The identity of the run's job."""
+        return self.run["job"]
+
+    @property
+    def created(self) -> str:
+        """When the run began, in ISO format."""
+        return self.run["created"]
+
+    @property
     def seed(self) -> int | None:
-        """Its job's seed; None for a loop that was given none."""
+        """The seed of the run's job; None for a loop without one."""
         return None if self.run.get("seeded") == "false" else int(self.run["seed"])
+
+    @cached_property
+    def agents(self) -> tuple[str, ...]:
+        """The names of the learners: one table and one reward each."""
+        return tuple(map(str, json.loads(self.run["agents"])))
+
+    @property
+    def event_names(self) -> tuple[str, ...]:
+        """The names of the environment's events, which episodes count."""
+        return tuple(self.environment["event_names"])
 
     @property
     def title(self) -> str:
@@ -278,6 +304,17 @@ class Recording:
         """Whether the environment's arrays are there, so that it has an `mdp`."""
         return self.kind in ("job", "step") and bool(self.environment["arrays"])
 
+    @property
+    def has_steps(self) -> bool:
+        """Whether any step was recorded."""
+        return any(len(self._chunks(self.topic(f"/{phase}/step"))) for phase in schema.PHASES)
+
+    @property
+    def leaves_out_steps(self) -> bool:
+        """Whether the configuration leaves the steps out of the recording (`recording.steps: none`)."""
+        plan = self.config.get("recording")
+        return isinstance(plan, Mapping) and plan.get("steps") == "none"
+
     # --- blocks ------------------------------------------------------------------------------------
 
     @cached_property
@@ -297,6 +334,11 @@ class Recording:
         return kind_of(self.run)
 
     @property
+    def is_job(self) -> bool:
+        """Whether the runner itself learned it, from a configuration; else it was recorded from a loop."""
+        return self.kind == "job"
+
+    @property
     def topics(self) -> tuple[Topic, ...]:
         """The topics that a recording of its kind has."""
         return schema.KINDS[self.kind]
@@ -307,7 +349,7 @@ class Recording:
         Raises:
             RunnerError: it is one; `purpose` says what it cannot be used for, `instead` what can be done.
         """
-        if self.kind != "job":
+        if not self.is_job:
             raise RunnerError(
                 f"{self.path}: was recorded from somebody's own loop, by {self.config.get('made_by')}; "
                 f"{purpose} is for runs that were trained here. {instead}"
@@ -486,7 +528,7 @@ class Recording:
             tables: how many tables there are of a moment; by default the learners' Q-tables are given, and
                 what else their algorithm keeps is left out.
         """
-        learners = int(self.run["learners"])
+        learners = len(self.agents)
         for snapshot in self._since(step, tables or learners):
             if tables or snapshot.table < learners:
                 yield snapshot

@@ -175,7 +175,7 @@ class TableReplay(StepReplay):
     """
 
     def __init__(self, recording: Recording, step: int = 0) -> None:
-        super().__init__(recording.config, recording.mdp, int(recording.run["seed"]), str(recording.path))
+        super().__init__(recording.config, recording.mdp, recording.seed or 0, str(recording.path))
         self._recording = recording
         self._recorded = recording.count(schema.TRAIN_STEP)
         self._checkpoints = Checkpoints(recording)
@@ -264,9 +264,8 @@ class TableReplay(StepReplay):
 
     def _missing(self, stop: int) -> RecordingError:
         recording = self._recording
-        has_steps = recording.config["recording"]["steps"] == "all"
-        taken = self._recorded if has_steps else recording.result.get("train_steps", stop)
-        if has_steps or taken < stop:
+        taken = recording.result.get("train_steps", stop) if recording.leaves_out_steps else self._recorded
+        if not recording.leaves_out_steps or taken < stop:
             return RecordingError(
                 f"{recording.path}: found {taken} training steps, expected at least {stop}."
             )
@@ -397,7 +396,7 @@ def _snapshot_before(
     recording: Recording, step: int, kinds: tuple[str, ...]
 ) -> tuple[int, list[Held]] | None:
     """Return the last complete snapshot at or before a step, and its step; None if there is none."""
-    tables = int(recording.run["learners"]) * len(kinds)
+    tables = len(recording.agents) * len(kinds)
     nearest: list[QTable] = []
     group: list[QTable] = []
     for snapshot in recording.snapshots(step, tables):
@@ -413,7 +412,7 @@ def _snapshot_before(
 
 def _snapshot_steps(recording: Recording) -> list[int]:
     """Return the steps of the complete snapshots, ascending."""
-    tables = int(recording.run["learners"]) * len(kinds_of(from_mapping(recording.config)))
+    tables = len(recording.agents) * len(kinds_of(from_mapping(recording.config)))
     counts: dict[int, int] = {}
     for snapshot in recording.snapshots(0, tables):
         counts[snapshot.step] = counts.get(snapshot.step, 0) + 1

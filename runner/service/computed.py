@@ -77,7 +77,7 @@ def records(path: Path, which: Which, start: int, stop: int, most: int) -> bytes
         shown = found[start:stop]
         if len(shown) > most:
             raise too_many(len(shown), most)
-        told = {"run_id": recording.run["run_id"], "start": start, "total": len(found), "records": shown}
+        told = {"run_id": recording.run_id, "start": start, "total": len(found), "records": shown}
         return as_json(told)
 
 

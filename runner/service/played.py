@@ -85,15 +85,14 @@ def typical(path: Path) -> bytes:
 
 def learned(path: Path) -> bytes:
     """Return policy and values of a run at stages of learning, as JSON: a row of maps for each."""
-    from runner.analysis.frames import agents_of
     from runner.export.reports.maps import maps_of, stages_of
 
     with open_recording(path) as recording:
-        if recording.kind != "job":
+        if not recording.is_job:
             return b"[]"
         mdp = recording.mdp
         start = _typical_start(recording)
-        rows = maps_of(mdp, agents_of(recording), stages_of(recording), start)
+        rows = maps_of(mdp, recording.agents, stages_of(recording), start)
         return json.dumps([asdict(row) for row in rows]).encode()
 
 

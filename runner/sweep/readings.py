@@ -10,7 +10,7 @@ import numpy as np
 
 from runner.analysis.compare.moments import first_crossing
 from runner.analysis.compare.statistics import NEVER
-from runner.analysis.frames import agents_of, evaluation_record, event_names_of
+from runner.analysis.frames import evaluation_record
 from runner.analysis.readings import evaluation_readings, exact_readings, training_readings
 from runner.errors import RunnerError, nearest
 from runner.recording.reader import Recording
@@ -26,7 +26,7 @@ def curve_of(recording: Recording, metric: str) -> Curve:
     Raises:
         RunnerError: the metric is in none of them.
     """
-    agents, events = agents_of(recording), event_names_of(recording)
+    agents, events = recording.agents, recording.event_names
     exact = {measures["evaluation"]: measures for measures in recording.optimality()}
     found = [
         (metrics["episode"], readings(metrics, exact.get(metrics["evaluation"]), agents, events))

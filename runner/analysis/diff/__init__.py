@@ -111,7 +111,7 @@ def diff(
         first: only settings, the first step of training at which they part, and what differs there; why the
             tables came to differ is left out.
     """
-    if not a.kind == b.kind == "job":
+    if not (a.is_job and b.is_job):
         return _diff_of_loops(a, b)
     digests = [recording.result.content_digest for recording in (a, b)]
     same = digests[0] is not None and digests[0] == digests[1]
@@ -170,7 +170,7 @@ def _diff_of_loops(a: Recording, b: Recording) -> RunDiff:
 
 def _values(a: Recording, b: Recording, parts: Sequence[str]) -> dict[str, Any]:
     """Return what differs in these parts of a `RunDiff`, nothing for the others; and what is alike."""
-    jobs = a.kind == b.kind == "job"
+    jobs = a.is_job and b.is_job
     told = {
         "config": (_settings(a), _settings(b)),
         "provenance": (a.provenance, b.provenance),
@@ -218,8 +218,8 @@ def _notes(a: Recording, b: Recording) -> list[str]:
     for name, recording in (("A", a), ("B", b)):
         if recording.status != "finished":
             notes.append(f"{name} is not finished: compared as far as it got")
-        if recording.kind == "job" and recording.config["recording"]["steps"] == "none":
-            again = f"`dualtaxi rerecord {recording.run['run_id']}` records them"
+        if recording.leaves_out_steps:
+            again = f"`dualtaxi rerecord {recording.run_id}` records them"
             notes.append(f"{name} holds no steps, so no trajectory is compared; {again}")
         elif not recording.count(schema.TRAIN_STEP):
             notes.append(f"{name} has no training steps, so no trajectory of training is compared")
@@ -230,6 +230,6 @@ def _notes(a: Recording, b: Recording) -> list[str]:
             notes.append(f"{name} lost parts of evaluations: those that are not whole are not compared")
     if not _same_sizes(a, b):
         notes.append("the environments have other states or actions: neither steps nor tables are compared")
-    elif a.run["learners"] != b.run["learners"]:
+    elif len(a.agents) != len(b.agents):
         notes.append("other modes: rewards are compared summed, and Q-tables not at all")
     return notes

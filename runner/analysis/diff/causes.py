@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from runner.analysis.diff.tables import own_actions_in_words
 from runner.analysis.diff.trajectory import Parting
-from runner.analysis.frames import agents_of
 from runner.environments.naming import actions_in_words, agent_actions, exploration_in_words, states_in_words
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -116,13 +115,13 @@ def kind_of(parting: Parting, a: Recording, b: Recording) -> Cause:
 
 def _explorers(recording: Recording, step: np.void) -> list[bool]:
     """Return whether each learner explored in a step."""
-    return [bool(int(step["explored"]) >> i & 1) for i in range(len(agents_of(recording)))]
+    return [bool(int(step["explored"]) >> i & 1) for i in range(len(recording.agents))]
 
 
 def _exploration_text(left: np.void, right: np.void, a: Recording, b: Recording) -> str:
     """Return who explored in either run: `A explored there, B took its greedy action`."""
-    words = [exploration_in_words(int(s["explored"]), agents_of(r)) for r, s in ((a, left), (b, right))]
-    if len(agents_of(a)) == len(agents_of(b)) == 1:
+    words = [exploration_in_words(int(s["explored"]), r.agents) for r, s in ((a, left), (b, right))]
+    if len(a.agents) == len(b.agents) == 1:
         explorer, other = ("A", "B") if words[0] else ("B", "A")
         acted = "an action of its learned policy" if _draws_actions(a, b) else "its greedy action"
         return f"{explorer} explored there, {other} took {acted}"
@@ -183,7 +182,7 @@ def _from_tables(
     steps = parting.trained or (parting.step, parting.step)  # taken when the step was chosen
     known = training is not None and training[0].step < min(steps)
     try:
-        if known or steps[0] != steps[1] or a.run["agents"] != b.run["agents"]:
+        if known or steps[0] != steps[1] or a.agents != b.agents:
             replays = [TableReplay(recording, step) for recording, step in zip((a, b), steps, strict=True)]
             update = training[1].update if training is not None and known else None
         else:

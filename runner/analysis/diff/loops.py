@@ -28,7 +28,7 @@ def loop_environment_diff(a: Recording, b: Recording) -> EnvironmentDiff:
 
 
 def _spaces(recording: Recording) -> dict[str, Any]:
-    return {} if recording.kind == "job" else recording.spaces
+    return {} if recording.is_job else recording.spaces
 
 
 def comparable(a: Recording, b: Recording) -> bool:
@@ -36,7 +36,7 @@ def comparable(a: Recording, b: Recording) -> bool:
     both = {a.kind, b.kind}
     if both <= {"job", "step"}:
         return True
-    return len(both) == 1 and a.spaces == b.spaces and a.run["agents"] == b.run["agents"]
+    return len(both) == 1 and a.spaces == b.spaces and a.agents == b.agents
 
 
 def loop_parting(a: Recording, b: Recording, phase: str = "train") -> Parting | None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from runner.analysis.frames import agents_of
 from runner.errors import RunnerError, nearest
 from runner.recording.reader import Recording
 
@@ -69,7 +68,7 @@ def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> li
 
 def _values(recording: Recording) -> dict[str, dict[int, float]]:
     """Return metric to episode to value; what is unknown (nan) is left out."""
-    agents = agents_of(recording)
+    agents = recording.agents
     table: dict[str, dict[int, float]] = {}
     for metrics in recording.iter_metrics("eval"):
         plain = {name: metrics[key] for name, key in SERIES.items()}

@@ -131,12 +131,11 @@ def _loop_results(loop: dict[str, Any]) -> dict[str, str]:
 
 def _exactly(run: Run, measures: dict[str, Any]) -> dict[str, str]:
     """Return what the last exact measures say, beside what is possible."""
-    from runner.analysis.frames import agents_of
     from runner.environments.naming import states_in_words
     from runner.recording.reader import open_recording
 
     with open_recording(run.recording) as recording:
-        words, agents = states_in_words(recording.mdp), agents_of(recording)
+        words, agents = states_in_words(recording.mdp), recording.agents
     gain = " and ".join(
         f"{best - own:.3f} ({agent})"
         for agent, own, best in zip(agents, measures["values"], measures["best_responses"], strict=True)

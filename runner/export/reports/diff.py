@@ -19,7 +19,6 @@ from runner.analysis.diff.sections import (
     where_in_words,
 )
 from runner.analysis.diff.tables import common_snapshots
-from runner.analysis.frames import agents_of
 from runner.analysis.groups import Group
 from runner.analysis.readings import read_series
 from runner.analysis.sections import Grid, Section
@@ -162,7 +161,7 @@ def _picture(recording: Recording, step: np.void, title: str, after: bool) -> di
     mdp = recording.mdp
     state = int(step["next_state"] if after else step["state"])
     if after:
-        explored = exploration_in_words(int(step["explored"]), agents_of(recording)) or "greedy"
+        explored = exploration_in_words(int(step["explored"]), recording.agents) or "greedy"
         rewards = " and ".join(f"{reward:g}" for reward in step["rewards"])
         end = "; the end" if step["terminated"] else "; the step limit" if step["truncated"] else ""
         told = f"{deeds_in_words(mdp)[int(step['action'])]} ({explored}); reward {rewards}{end}"

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_after, evaluations_of
-from runner.analysis.frames import agents_of
 from runner.analysis.outcomes import events_of
 from runner.environments.mdp import Mdp
 from runner.environments.naming import (
@@ -166,7 +165,7 @@ def default_trial(recording: Recording) -> tuple[int, int] | None:
     It is the typical trial of the last whole evaluation. A loop does not say how many trials an evaluation
     has: there it is the first trial after the most training episodes. None if there is no such trial.
     """
-    if recording.kind == "job":
+    if recording.is_job:
         return typical_trial(recording) if last_whole_evaluation(recording) is not None else None
     evaluations = evaluations_of(recording)
     return (evaluations[-1].after, 0) if evaluations else None
@@ -183,7 +182,7 @@ def last_whole_evaluation(recording: Recording) -> int | None:
     A recording that was cut off may have an evaluation's metrics without its trials. A loop has none: where
     its evaluations end nobody said.
     """
-    if recording.kind != "job":
+    if not recording.is_job:
         return None
     episodes, steps = recording.count(schema.EVAL_EPISODE), recording.count(schema.EVAL_STEP)
     for one in reversed(evaluations_of(recording)):
@@ -203,7 +202,7 @@ def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[
         episodes: which.
         places: from states to places as `svg.Drawing.places` gives them; None without a scene.
     """
-    mdp, agents = recording.mdp, agents_of(recording)
+    mdp, agents = recording.mdp, recording.agents
     own = numbered_actions(mdp)
     joint = actions_in_words(mdp).tolist()
     return {
@@ -260,7 +259,7 @@ def _values(
     recording: Recording, steps: NDArray[np.void], table_step: int
 ) -> tuple[NDArray[np.float64], ...]:
     """Return each learner's Q-values in the states of steps; none where the tables cannot be had."""
-    if recording.kind != "job":
+    if not recording.is_job:
         return ()  # what somebody's own loop learned is not known
     try:
         if table_step >= 0:

@@ -13,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.frames import agents_of
 from runner.drawing.svg_maps import pair_map, policy_map
 from runner.environments.mdp import Mdp
 from runner.environments.naming import spoken, states_in_words
@@ -56,7 +55,7 @@ def stages_of(recording: Recording) -> list[Stage]:
     The middle is the snapshot nearest to half of the episodes; where there is none between the first and
     the last, the steps up to there are replayed, if they were recorded.
     """
-    learners = len(agents_of(recording))
+    learners = len(recording.agents)
     found: dict[int, Stage] = {}
     for table in recording.snapshots():
         stage = found.setdefault(table.step, Stage("", table.episode, table.step, []))

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runner.analysis.frames import agents_of, evaluation_records
+from runner.analysis.frames import evaluation_records
 from runner.analysis.groups import Group, groups_of
 from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries, values_left_out
@@ -18,7 +18,7 @@ from runner.analysis.summary import random_policy_sentence
 from runner.drawing import palette, svg
 from runner.environments.naming import event_in_words, spoken
 from runner.errors import RecordingError, RunnerError
-from runner.export.contents import flat_text, has_steps, shortcomings, why_no_steps
+from runner.export.contents import flat_text, shortcomings, why_no_steps
 from runner.export.plots.figure import footnote
 from runner.export.plots.metrics import panels_of
 from runner.export.plots.svg import panel_svgs
@@ -113,13 +113,13 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
     drawing = None if environment["scene"] is None else svg.Drawing(environment["scene"])
     return {
         "number": number,
-        "id": recording.run["run_id"],
+        "id": recording.run_id,
         "name": recording.name,
         "seed": recording.seed,
         "title": recording.title,
         "state": recording.status,
         "agents": [spoken(agent) for agent in environment["agents"]],
-        "learners": agents_of(recording),
+        "learners": recording.agents,
         "environment": environment,
         "facts": _facts(recording),
         "conduct": _conduct(recording),
@@ -127,7 +127,7 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
         "last": evaluations[-1] if evaluations else None,
         "last_return": _return_of(evaluations[-1]) if evaluations else None,
         "random": random_policy_sentence(recording),
-        "steps": has_steps(recording),
+        "steps": recording.has_steps,
         "evaluations": evaluations,
         "event_names": [_heading(name) for name in environment["event_names"]],
         "broad": drawing is not None and drawing.width > svg.BROAD,
@@ -141,13 +141,13 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
 
 def _notes(recording: Recording) -> list[str]:
     """Return what a reader should know that is missing, a sentence each."""
-    run, notes = recording.run["run_id"], shortcomings(recording)
-    if recording.kind != "job":
+    run, notes = recording.run_id, shortcomings(recording)
+    if not recording.is_job:
         notes.append(
             f"Run {run} was recorded from a loop: what it learned is not known, so no episode is shown with "
             "it; `dualtaxi view` shows what was recorded."
         )
-    elif not has_steps(recording):
+    elif not recording.has_steps:
         notes.append(
             f"No episode of run {run} can be replayed, as there are no steps: {why_no_steps(recording)}."
         )
@@ -156,7 +156,7 @@ def _notes(recording: Recording) -> list[str]:
 
 def _conduct(recording: Recording) -> str:
     """Return how the agents of a run act: `learning`, `random`, or unknown, in a `loop`."""
-    if recording.kind != "job":
+    if not recording.is_job:
         return "loop"
     return "random" if recording.config["algorithm"] == "random" else "learning"
 
@@ -173,7 +173,7 @@ def _facts(recording: Recording) -> dict[str, str]:
         topic: recording.count(topic) for topic in (schema.TRAIN_EPISODE, schema.TRAIN_STEP, schema.EVAL_STEP)
     }
     config = recording.config
-    if recording.kind != "job":
+    if not recording.is_job:
         return _loop_facts(recording, counts)
     told = {
         "Environment": config["env"]["id"],
@@ -182,8 +182,8 @@ def _facts(recording: Recording) -> dict[str, str]:
         "Training": f"{counts[schema.TRAIN_EPISODE]:,} of {config['episodes']:,} episodes, "
         f"{counts[schema.TRAIN_STEP]:,} steps recorded",
         "Evaluation": f"{counts[schema.EVAL_STEP]:,} steps recorded",
-        "Begun": recording.run["created"],
-        "Job": recording.run["job"],
+        "Begun": recording.created,
+        "Job": recording.job,
         "Content digest": recording.result.content_digest or f"none ({recording.status})",
     }
     return {key: str(value) for key, value in told.items()}
@@ -199,14 +199,14 @@ def _loop_facts(recording: Recording, counts: Mapping[schema.Topic, int]) -> dic
         "Spaces": f"observation {spaces['observation']}, action {spaces['action']}",
         "Training": f"{counts[schema.TRAIN_EPISODE]:,} episodes, {counts[schema.TRAIN_STEP]:,} steps",
         "Evaluation": f"{counts[schema.EVAL_STEP]:,} steps",
-        "Begun": recording.run["created"],
+        "Begun": recording.created,
         "Content digest": recording.result.content_digest or f"none ({recording.status})",
     }
 
 
 def _episodes(recording: Recording, chosen: Sequence[Choice]) -> list[Episode]:
     """Return the episodes that are shown: of the last evaluation, and the first and last of training."""
-    if not has_steps(recording) or recording.kind != "job":
+    if not recording.has_steps or not recording.is_job:
         return []
     found: dict[str, Episode] = {}
 
@@ -234,12 +234,12 @@ def _episodes(recording: Recording, chosen: Sequence[Choice]) -> list[Episode]:
 
 def _maps(recording: Recording, episodes: Sequence[Episode]) -> list[MapRow]:
     """Return the maps, for the situation in which the first episode shown begins."""
-    if recording.kind != "job":
+    if not recording.is_job:
         return []
     mdp = recording.mdp
     start = int(episodes[0].states[0]) if episodes else int(mdp.start.argmax())
     try:
-        return maps_of(mdp, agents_of(recording), stages_of(recording), start)
+        return maps_of(mdp, recording.agents, stages_of(recording), start)
     except RecordingError:
         return []
 

@@ -13,7 +13,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from runner.analysis.frames import agents_of
 from runner.export.rerun.classes import vocabulary_of
 from runner.export.rerun.columns import Batch, Sender, scalars
 from runner.export.rerun.events import EventWriter
@@ -44,7 +43,7 @@ class LoopExporter:
         self._recording = recording
         self._selection = selection
         self._root = root
-        self._learners = tuple(agents_of(recording))
+        self._learners = recording.agents
         self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._logged: list[str] = []
         self._frames = [phase for phase in PHASES if any(True for _ in recording.messages(_frame(phase)))]

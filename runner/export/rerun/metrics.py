@@ -189,7 +189,7 @@ def send_metrics(writer: MetricWriter, recording: Recording) -> None:
     writer.rewards(reports, sorted({reward for row in reports for reward in row["rewards"]}))
     writer.evaluations(evaluations)
     ends = np.array([row["step"] for row in reports], np.int64)
-    learners, events = int(recording.run["learners"]), int(recording.run["events"])
+    learners, events = len(recording.agents), len(recording.event_names)
     sums = np.zeros((len(reports) + 1, 2 + learners + events))
     for phase, (_, topic) in schema.PHASES.items():
         for block in recording.blocks(topic):

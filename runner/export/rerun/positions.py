@@ -55,7 +55,7 @@ def where_they_part(runs: Sequence[Run]) -> tuple[tuple[int, ...] | None, str]:
     part, or where it cannot be known.
     """
     with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
-        if not a.kind == b.kind == "job":
+        if not (a.is_job and b.is_job):
             return None, "Where two loops part is told by `dualtaxi diff`."
         if not can_compare_steps(a, b):
             return (
@@ -86,7 +86,7 @@ def _train_step(recording: Recording, episode: int, t: int) -> tuple[str, int, R
 
 def _eval_step(recording: Recording, after: int, trial: int, t: int) -> tuple[str, int, Request]:
     train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
-    job, where = recording.kind == "job", str(recording.path)
+    job, where = recording.is_job, str(recording.path)
     known = evaluations_with_steps(recording, train, evals) if job else evaluations_of(recording)
     evaluation = evaluation_after(known, after, where)
     number = evaluation.trial(trial, where)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.evaluations import Evaluation, evaluation_after
 from runner.errors import RecordingError
-from runner.export.contents import has_steps, require_steps, shortcomings, whole_ranges, why_no_steps
+from runner.export.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
 
@@ -89,12 +89,12 @@ def select(recording: Recording, request: Request) -> Selection:
     Raises:
         RecordingError: an episode or evaluation does not exist, or steps are asked for and not recorded.
     """
-    if recording.kind != "job":
+    if not recording.is_job:
         return _select_loop(recording, request)
     selection = Selection(warnings=shortcomings(recording))
     if recording.mdp.scene is None or recording.mdp.scene_cells is None:
         selection.warnings.append("The environment has no scene: state and action are shown as series.")
-    if not has_steps(recording):
+    if not recording.has_steps:
         if not request.is_default:
             require_steps(recording, "export")
         selection.warnings.append(

@@ -91,7 +91,7 @@ class StepValueReader:
         new[0] |= before != self._last
         self._last = (int(block["log_time"][-1]), int(context[-1]))
         rows = np.flatnonzero(new)
-        shape = len(rows), int(self._recording.run["learners"]), self._states.shape[1]
+        shape = len(rows), len(self._recording.agents), self._states.shape[1]
         states = self._states[context[rows]]
         return StateProbe(rows, states, np.empty(shape, np.float32), np.empty(shape, np.int32))
 

@@ -13,7 +13,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from runner.analysis.frames import agents_of
 from runner.errors import RecordingError
 from runner.export.rerun.ahead import ahead
 from runner.export.rerun.classes import Vocabulary, vocabulary_of
@@ -55,8 +54,8 @@ def export(sources: Sequence[Source], request: Request, path: Path) -> list[Sele
         StorageError: the file cannot be written.
     """
     selections = [select(source.recording, request) for source in sources]
-    stream = new_stream("-".join(source.recording.run["run_id"] for source in sources))
-    if any(source.recording.kind != "job" for source in sources):
+    stream = new_stream("-".join(source.recording.run_id for source in sources))
+    if any(not source.recording.is_job for source in sources):
         return _export_loops(stream, sources, selections, path)
     exporters = [
         RunExporter(stream, source, selection) for source, selection in zip(sources, selections, strict=True)
@@ -75,7 +74,7 @@ def _export_loops(
     from runner.export.rerun.loops import LoopExporter
 
     for source in sources:
-        if source.recording.kind == "job":
+        if source.recording.is_job:
             raise RecordingError(
                 f"{source.recording.path}: was trained here, the other was recorded from a loop; "
                 "look at them one by one."
@@ -119,7 +118,7 @@ class RunExporter:
         self._selection = selection
         self._source = source
         self._sent = 0
-        self._learners = tuple(agents_of(source.recording))
+        self._learners = source.recording.agents
         self._scene: Scene | None = scene_of(source.recording.mdp)
         self._marks: Marks | None = marks_of(self._scene) if self._scene else None
         steps = [source.recording.count(topic) for topic in (schema.TRAIN_STEP, schema.EVAL_STEP)]
@@ -143,7 +142,7 @@ class RunExporter:
             self._learners,
             source.recording.mdp.event_names,
             source.tint,
-            source.recording.run["run_id"] if source.tint else "",
+            source.recording.run_id if source.tint else "",
         )
         send_metrics(writer, self._recording)
         if not self._selection.steps:

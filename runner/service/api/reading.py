@@ -327,5 +327,5 @@ async def _records(
 
 def _columns(recording: Recording, columns: dict[str, NDArray[Any]], start: int, total: int) -> Response:
     lists = {name: values.tolist() for name, values in columns.items()}
-    told = {"run_id": recording.run["run_id"], "start": start, "total": total, "columns": lists}
+    told = {"run_id": recording.run_id, "start": start, "total": total, "columns": lists}
     return Response(computed.as_json(told), media_type="application/json")

@@ -71,7 +71,7 @@ def _episode_rows(
     return [
         {
             "name": addresses[i].replace("eval/", "").replace("train/", "").replace("/", ", trial "),
-            "href": f"/runs/{run.run_id}/replay/{addresses[i]}" if recording.kind == "job" else "",
+            "href": f"/runs/{run.run_id}/replay/{addresses[i]}" if recording.is_job else "",
             "cells": [_end(lists, i), *(f"{lists[name][i]:,g}" for name in names)],
         }
         for i in range(len(addresses))
@@ -80,7 +80,7 @@ def _episode_rows(
 
 def _addresses(recording: Recording, phase: str, numbers: list[int]) -> list[str]:
     """Return where the replay of each episode is: trials are counted within their evaluation."""
-    if phase == "train" or recording.kind != "job":
+    if phase == "train" or not recording.is_job:
         return [f"{phase}/{number}" for number in numbers]
     ends: list[tuple[int, int, int]] = []
     before = 0

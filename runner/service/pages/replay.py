@@ -150,7 +150,7 @@ def _around(run: Run, recording: Recording, which: tuple[int, ...]) -> dict[str,
     episodes = recording.count(recording.topic("/train/episode"))
     found = [
         {"after": metrics["episode"], "trials": metrics["trials"]}
-        for metrics in (recording.iter_metrics("eval") if recording.kind == "job" else [])
+        for metrics in (recording.iter_metrics("eval") if recording.is_job else [])
     ]
     base = f"/runs/{run.run_id}/replay"
     if len(which) == 1:

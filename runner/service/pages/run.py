@@ -14,7 +14,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.frames import agents_of, evaluation_record, evaluation_records
+from runner.analysis.frames import evaluation_record, evaluation_records
 from runner.environments.naming import event_in_words
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
@@ -113,8 +113,8 @@ def standing(
 @router.get("/evaluations")
 def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
     """Show the last evaluations."""
-    is_job = recording.kind == "job"
-    learners, events = agents_of(recording), recording.environment["event_names"]
+    is_job = recording.is_job
+    learners, events = recording.agents, recording.event_names
     if is_job:
         last = deque(recording.iter_metrics("eval"), MOST_EVALUATIONS)
         shown = [evaluation_record(metrics, learners, events) for metrics in last]
@@ -270,7 +270,7 @@ def _recorded_facts(
     }
     try:
         with open_recording(run.recording) as recording:
-            facts |= {"Job": recording.run.get("job", ""), "Size": humanize.size(recording.size)}
+            facts |= {"Job": recording.job, "Size": humanize.size(recording.size)}
             return facts, recording.provenance, _log(recording)
     except RecordingError as error:
         return facts | {"Recording": settings.without_folders(str(error))}, {}, []

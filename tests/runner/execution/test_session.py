@@ -138,7 +138,7 @@ def test_run_json_says_what_was_done(tmp_path):
         last = recording.metrics("eval")[-1]
         assert summary["train_steps"] == recording.count(schema.TRAIN_STEP) == last["step"]
         assert summary["eval_steps"] == recording.count(schema.EVAL_STEP)
-        assert recording.run["job"] == Job(experiment(TAXIS), 9).identity
+        assert recording.job == Job(experiment(TAXIS), 9).identity
     assert summary["episodes"] == last["episode"] == 60
     assert summary["last_evaluation"] == {
         "episode": 60,

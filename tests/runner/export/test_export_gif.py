@@ -9,7 +9,6 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
-from runner.analysis.frames import agents_of
 from runner.cli import cli
 from runner.drawing.svg import Drawing
 from runner.export.gif import Film, captions_of, render_svg
@@ -25,7 +24,7 @@ def test_frames_show_each_state_and_tell_each_step(recording):
     mdp = recording.mdp
     episode = training_episode(recording, 3, 30)
     steps = recording.episode_steps("train", 3)[:30]
-    captions = captions_of(mdp, agents_of(recording), episode, scene=mdp.scene is not None)
+    captions = captions_of(mdp, recording.agents, episode, scene=mdp.scene is not None)
     assert len(Film(recording, episode)) == len(captions) == len(steps) + 1
     totals = steps["rewards"].sum(axis=1).cumsum()
     for k in range(len(steps)):

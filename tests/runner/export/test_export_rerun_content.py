@@ -9,7 +9,6 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from runner.analysis.frames import agents_of
 from runner.analysis.outcomes import events_of
 from runner.drawing.palette import COMPARED
 from runner.export.rerun.layout import PLOTS
@@ -144,7 +143,7 @@ class TestSteps:
             return
         steps, pictures = exported.steps(phase), scene.placements
         time = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
-        for learner, name in enumerate(agents_of(recording)):
+        for learner, name in enumerate(recording.agents):
             table = exported.table(f"/{phase}/map/{name}")
             letters = exported.table(f"/{phase}/map/{name}/stops")["Points2D:class_ids"]
             still = np.array([not any(action["move"] or ()) for action in scene.description["actions"]])
@@ -157,11 +156,11 @@ class TestSteps:
                 seen = tables_at(recording, trained)[learner]
                 q = seen.max(axis=1)
                 shown = np.array(table["DepthImage:buffer"][k][0], np.uint8).view(np.float32)
-                order = pictures.order(learner if len(agents_of(recording)) > 1 else 0)
+                order = pictures.order(learner if len(recording.agents) > 1 else 0)
                 states = pictures.states[pictures.context[step["state"]]][order]
                 assert np.array_equal(shown[states >= 0], q[states[states >= 0]].astype(np.float32))
                 greedy = seen[states[states >= 0]].argmax(axis=1)
-                own = greedy if len(agents_of(recording)) > 1 else own_actions(recording.mdp)[greedy]
+                own = greedy if len(recording.agents) > 1 else own_actions(recording.mdp)[greedy]
                 assert len(letters[k]) == still[own].sum()
 
     def test_events_are_in_the_log(self, exported, phase):

@@ -8,7 +8,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from runner.analysis.frames import agents_of
 from runner.drawing import palette, svg, svg_maps
 from runner.drawing.svg import CELL, MARGIN, Drawing
 from runner.export.reports.maps import maps_of, situation, stages_of
@@ -69,7 +68,7 @@ def test_the_key_names_everything(scene):
 
 
 def test_maps_are_svg_at_every_stage_with_arrows_after_learning(scene, recording):
-    learners = agents_of(recording)
+    learners = recording.agents
     stages = stages_of(recording)
     assert [stage.episode for stage in stages] == [0, 20, 40]
     rows = maps_of(scene, learners, stages, int(scene.start.argmax()))
@@ -88,7 +87,7 @@ def test_an_arrow_points_to_the_action_of_the_highest_value(pictured):
 
     with open_recording(pictured("cliff").recording) as opened:
         mdp, stage = opened.mdp, stages_of(opened)[-1]
-        (row,) = maps_of(mdp, agents_of(opened), [stage], 36)
+        (row,) = maps_of(mdp, opened.agents, [stage], 36)
     picture = row.svgs[0][1]
     table = stage.tables[0]
     angles = {"up": 0, "right": 90, "down": 180, "left": 270}

@@ -83,7 +83,7 @@ def test_what_is_held_at_any_step_is_what_the_learner_held(run):
 def test_a_snapshot_holds_all_that_the_learner_held(algorithm, run):
     kinds = KINDS.get(algorithm, ["q"])
     with open_recording(run.recording) as recording:
-        learners = int(recording.run["learners"])
+        learners = len(recording.agents)
         snapshots = list(recording.snapshots(0, learners * len(kinds)))
         assert [table.table for table in snapshots] == [*range(learners * len(kinds))] * 3
         for table in snapshots:

@@ -138,7 +138,7 @@ def test_a_run_of_the_same_id_and_other_content_stays(lake, taxis, tmp_path):
     new = import_recording(file, tmp_path / "mine", as_new=True).run
     assert new.run_id not in (lake.run_id, taxis.run_id)
     with open_recording(new.recording) as recording:
-        assert recording.run["run_id"] == new.run_id
+        assert recording.run_id == new.run_id
     assert verify(new.recording).content_digest == lake.summary["content_digest"]
     assert other.recording.read_bytes() == taxis.recording.read_bytes()
 
