@@ -29,8 +29,10 @@ from runner.service.jobs.queue import JobNotFound, JobStateConflict, QueueFull
 from runner.service.logs import LOG
 from runner.service.receiving.model import Conflict, TooLarge, TooMany
 from runner.service.settings import Settings
+from runner.util.processes import CallFailed
 
 _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
+    CallFailed: HTTPStatus.SERVICE_UNAVAILABLE,
     ConfigError: HTTPStatus.UNPROCESSABLE_ENTITY,
     Conflict: HTTPStatus.CONFLICT,
     Diverged: HTTPStatus.CONFLICT,

@@ -9,20 +9,16 @@ A thread waits for each busy process: that works on every platform, unlike an ev
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import multiprocessing
-import signal
 import threading
-import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from http import HTTPStatus
 from multiprocessing import forkserver
-from pathlib import Path
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
 from runner.service.errors import Refused
+from runner.util.processes import CallFailed, ChildProcess, ProcessDied, start_method
 
 Args = ParamSpec("Args")
 Answer = TypeVar("Answer")
@@ -32,27 +28,11 @@ MAX_WAITING: Final = 32
 _PRELOADED: Final = ["runner.service.jobs.preload"]
 
 
-class WorkFailed(Refused):
-    """A call came to no end of its own."""
+class Busy(Refused):
+    """Too many calls are waiting."""
 
     def __init__(self, message: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(HTTPStatus.SERVICE_UNAVAILABLE, message, headers)
-
-
-class Busy(WorkFailed):
-    """Too many calls are waiting."""
-
-
-class TimedOut(WorkFailed):
-    """A call exceeded its time limit."""
-
-
-class OutOfMemory(WorkFailed):
-    """A call exceeded its memory limit."""
-
-
-class ProcessDied(WorkFailed):
-    """The process died over a call."""
 
 
 class ProcessPool:
@@ -71,7 +51,7 @@ class ProcessPool:
     ) -> None:
         self.seconds = seconds
         self._memory_bytes, self._keep_seconds = memory_bytes, keep_seconds
-        self._context = _context()
+        self._context = start_method(_PRELOADED)
         self._threads = ThreadPoolExecutor(processes, "processes")
         self._places = threading.Semaphore(processes + MAX_WAITING)
         self._lock = threading.Lock()
@@ -142,20 +122,18 @@ class ProcessPool:
     def _called(self, child: _Child, function: Callable[..., Any], args: Any, keywords: Any) -> Any:
         is_reusable = False
         try:
-            kind, result = child.call((function, args, keywords), self.seconds)
-            is_reusable = kind != "memory" and self._keep_seconds != 0
+            result = child.call(function, self.seconds, *args, **keywords)
+            is_reusable = self._keep_seconds != 0
+        except CallFailed:
+            raise
+        except (RunnerError, OSError, RuntimeError):  # raised by the function: the process waits for the next
+            is_reusable = self._keep_seconds != 0
+            raise
         finally:
             if is_reusable:
                 self._keep(child)
             else:
                 self._end(child)
-        if kind == "memory":
-            limit = f"{self._memory_bytes / (1 << 30):g} GiB"
-            raise OutOfMemory(f"this needs more than {limit} of memory, and was given up; ask for less.")
-        if kind == "error":
-            raise _rebuilt(*result)
-        if kind == "unexpected":
-            raise RuntimeError(result)
         return result
 
     def _started(self) -> _Child:
@@ -169,7 +147,7 @@ class ProcessPool:
                     child.timer.cancel()  # else each call would leave a thread behind for `keep_seconds`
             if child is None:
                 try:
-                    child = _Child(self._context, self._memory_bytes)
+                    child = _Child(self._memory_bytes, self._context)
                 except OSError as error:
                     raise Busy(f"the system has no process for it ({error.strerror}); try again.") from error
                 with self._lock:
@@ -210,125 +188,14 @@ class ProcessPool:
                 self._idle.remove(child)
 
 
-class _Child:
-    """A process that calls functions, one after the other."""
+class _Child(ChildProcess):
+    """A process of the pool."""
 
-    def __init__(self, context: Any, memory_bytes: int) -> None:
-        self.uses = 0
-        self.timer: threading.Timer | None = None
-        """Ends the process while it is idle, unless that is kept until the pool is closed."""
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, memory_bytes), daemon=True)
-        try:
-            self._process.start()
-        except BaseException:
-            self._pipe.close()
-            raise
-        finally:
-            theirs.close()
-
-    def call(self, work: tuple[Callable[..., Any], Any, Any], seconds: float) -> tuple[str, Any]:
-        """Return the kind of a call's result, and the result.
-
-        Raises:
-            TimedOut, ProcessDied: there is none.
-        """
-        try:
-            self._pipe.send(work)
-            if not self._pipe.poll(seconds):
-                raise TimedOut(f"this took longer than {seconds:g} s and was given up; ask for less.")
-            kind, result = self._pipe.recv()
-        except (EOFError, OSError):
-            raise ProcessDied(
-                "the process that worked on this died; it may have run out of memory."
-            ) from None
-        return kind, result
-
-    def is_alive(self) -> bool:
-        """Return whether the process lives."""
-        return bool(self._process.is_alive())
-
-    def kill(self) -> None:
-        """Kill the process, while another thread may be waiting for it."""
-        with contextlib.suppress(ValueError):  # closed meanwhile
-            self._process.kill()
-
-    def end(self) -> None:
-        """Kill the process and free what it held."""
-        self.kill()
-        with contextlib.suppress(ValueError):
-            self._process.join()
-            self._process.close()
-        self._pipe.close()
+    uses = 0
+    timer: threading.Timer | None = None
+    """Ends the process while it is idle, unless it is kept until the pool is closed."""
 
 
 def busy() -> Busy:
     """Return the error that too many calls are waiting."""
     return Busy("the service is busy; try again.", {"retry-after": "5"})
-
-
-def _context() -> Any:
-    """Return how processes are started: forked from one that has loaded what they need, where possible."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(_PRELOADED)
-    return context
-
-
-def _serve(pipe: Any, memory_bytes: int) -> None:
-    """Call functions that come through a pipe, and send what they return, until it is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the service's to act on
-    _limit_memory(memory_bytes)
-    with contextlib.suppress(EOFError, BrokenPipeError):
-        while True:
-            function, args, keywords = pipe.recv()
-            pipe.send(_outcome(function, args, keywords))
-
-
-def _outcome(function: Callable[..., Any], args: Any, keywords: Any) -> tuple[str, Any]:
-    try:
-        return "done", function(*args, **keywords)
-    except MemoryError:
-        return "memory", None
-    except (RunnerError, OSError) as error:
-        if _ran_out_of_memory(error):
-            return "memory", None
-        return "error", (type(error), error.args, vars(error))
-    except Exception as error:
-        return ("memory", None) if _ran_out_of_memory(error) else ("unexpected", traceback.format_exc())
-
-
-def _ran_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error came of a `MemoryError`, which others may have wrapped."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, MemoryError):
-            return True
-        cause = cause.__cause__ or cause.__context__
-    return False
-
-
-def _limit_memory(more_bytes: int) -> None:
-    """Limit what this process may allocate from now on."""
-    with contextlib.suppress(ImportError, OSError, ValueError):
-        import resource
-
-        limit = _allocated_bytes() + more_bytes
-        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
-
-
-def _allocated_bytes() -> int:
-    """Return what counts against `RLIMIT_DATA` already: stacks and buffers of libraries, by the core."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmData:"):
-                return int(line.split()[1]) << 10
-    return 0
-
-
-def _rebuilt(kind: type[Exception], args: tuple[Any, ...], attributes: dict[str, Any]) -> Exception:
-    """Return an error as it was in the other process."""
-    error = kind.__new__(kind, *args)
-    vars(error).update(attributes)
-    return error

@@ -19,7 +19,8 @@ from runner.config.loading import MAX_BYTES
 from runner.config.problems import refuse
 from runner.errors import ConfigError, RunnerError
 from runner.service.jobs.queue import Kind
-from runner.service.processes import OutOfMemory, ProcessDied, ProcessPool, TimedOut, busy
+from runner.service.processes import ProcessPool, busy
+from runner.util.processes import OutOfMemory, ProcessDied, TimedOut
 
 PROCESSES: Final = 2
 """Texts that are checked at the same time."""

@@ -10,7 +10,8 @@ import time
 import pytest
 
 from runner.errors import RecordingError
-from runner.service.processes import OutOfMemory, ProcessDied, ProcessPool, TimedOut
+from runner.service.processes import ProcessPool
+from runner.util.processes import OutOfMemory, ProcessDied, TimedOut
 
 MEMORY = 256 << 20
 

@@ -1,0 +1,183 @@
+"""A child process that calls functions within limits on time and memory.
+
+    with ChildProcess(memory_bytes=1 << 30) as child:
+        result = child.call(function, argument, seconds=60)
+
+For work that is long, needs much memory, or runs code that cannot be trusted to end. The thread that calls
+waits for it; any other may end the process meanwhile by `kill`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import signal
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, ParamSpec, Self, TypeVar
+
+from runner.errors import RunnerError
+
+Args = ParamSpec("Args")
+Result = TypeVar("Result")
+
+
+class CallFailed(RunnerError):
+    """A call in a child process did not end by itself."""
+
+
+class TimedOut(CallFailed):
+    """A call exceeded its time limit."""
+
+
+class OutOfMemory(CallFailed):
+    """A call exceeded its memory limit."""
+
+
+class ProcessDied(CallFailed):
+    """The process died during a call."""
+
+
+def start_method(preload: Sequence[str] = ()) -> Any:
+    """Return the context that starts processes: forked from one that has loaded modules, where possible.
+
+    Args:
+        preload: the modules.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(list(preload))
+    return context
+
+
+class ChildProcess:
+    """A process that calls functions, one after the other.
+
+    Args:
+        memory_bytes: how much its calls may allocate; not limited on Windows.
+        context: how to start it; by default `start_method()`.
+
+    Raises:
+        OSError: the system cannot start another process.
+    """
+
+    def __init__(self, memory_bytes: int, context: Any = None) -> None:
+        self._memory_bytes = memory_bytes
+        context = context or start_method()
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, memory_bytes), daemon=True)
+        try:
+            self._process.start()
+        except BaseException:
+            self._pipe.close()
+            raise
+        finally:
+            theirs.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def call(
+        self, function: Callable[Args, Result], seconds: float, *args: Args.args, **keywords: Args.kwargs
+    ) -> Result:
+        """Return what a function returns in the process.
+
+        Args:
+            function: of a module, not nested.
+            seconds: the time limit; the process is of no use after it.
+            args: of the function; they and the result are pickled.
+            keywords: of the function.
+
+        Raises:
+            TimedOut, OutOfMemory, ProcessDied: the call did not end by itself.
+            RunnerError, OSError: the function raised it.
+            RuntimeError: the function raised anything else, whose traceback is in the message.
+        """
+        try:
+            self._pipe.send((function, args, keywords))
+            if not self._pipe.poll(seconds):
+                raise TimedOut(f"this took longer than {seconds:g} s and was given up; ask for less.")
+            kind, result = self._pipe.recv()
+        except (EOFError, OSError):
+            raise ProcessDied(
+                "the process that worked on this died; it may have run out of memory."
+            ) from None
+        if kind == "memory":
+            limit = f"{self._memory_bytes / (1 << 30):g} GiB"
+            raise OutOfMemory(f"this needs more than {limit} of memory, and was given up; ask for less.")
+        if kind == "error":
+            raise _rebuilt(*result)
+        if kind == "unexpected":
+            raise RuntimeError(result)
+        return result  # type: ignore[no-any-return]
+
+    def is_alive(self) -> bool:
+        """Return whether the process lives."""
+        return bool(self._process.is_alive())
+
+    def kill(self) -> None:
+        """Kill the process, while another thread may be waiting for it."""
+        with contextlib.suppress(ValueError):  # closed meanwhile
+            self._process.kill()
+
+    def end(self) -> None:
+        """Kill the process and release its resources."""
+        self.kill()
+        with contextlib.suppress(ValueError):
+            self._process.join()
+            self._process.close()
+        self._pipe.close()
+
+
+def _serve(pipe: Any, memory_bytes: int) -> None:
+    """Call functions that come through a pipe, and send what they return, until it is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent to act on
+    _limit_memory(memory_bytes)
+    with contextlib.suppress(EOFError, BrokenPipeError):
+        while True:
+            function, args, keywords = pipe.recv()
+            pipe.send(_outcome(function, args, keywords))
+
+
+def _outcome(function: Callable[..., Any], args: Any, keywords: Any) -> tuple[str, Any]:
+    try:
+        return "done", function(*args, **keywords)
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None:  # others may have wrapped a `MemoryError`
+            if isinstance(cause, MemoryError):
+                return "memory", None
+            cause = cause.__cause__ or cause.__context__
+        if isinstance(error, RunnerError | OSError):
+            return "error", (type(error), error.args, vars(error))
+        return "unexpected", traceback.format_exc()
+
+
+def _limit_memory(more_bytes: int) -> None:
+    """Limit what this process may allocate from now on."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        limit = _allocated_bytes() + more_bytes
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+
+
+def _allocated_bytes() -> int:
+    """Return what counts against `RLIMIT_DATA` already: stacks and buffers of libraries, by the core."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmData:"):
+                return int(line.split()[1]) << 10
+    return 0
+
+
+def _rebuilt(kind: type[Exception], args: tuple[Any, ...], attributes: dict[str, Any]) -> Exception:
+    """Return an error as it was in the other process."""
+    error = kind.__new__(kind, *args)
+    vars(error).update(attributes)
+    return error

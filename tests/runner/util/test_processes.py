@@ -1,0 +1,42 @@
+"""A child process gives a function's result or error, or says which limit it exceeded."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import pytest
+
+from runner.errors import RecordingError
+from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, TimedOut
+
+MEMORY = 256 << 20
+
+
+def refuse(path):
+    raise RecordingError(f"{path} is damaged.")
+
+
+@pytest.fixture
+def child():
+    with ChildProcess(MEMORY) as made:
+        yield made
+
+
+def test_a_process_returns_what_functions_return_and_raises_what_they_raise(child):
+    assert child.call(sorted, 60, [2, 1], reverse=True) == [2, 1]
+    with pytest.raises(RecordingError, match="x is damaged"):
+        child.call(refuse, 60, "x")
+    with pytest.raises(RuntimeError, match="TypeError"):
+        child.call(len, 60, 1)
+
+
+@pytest.mark.parametrize(
+    ("function", "argument", "error"),
+    [(bytearray, 2 * MEMORY, OutOfMemory), (os._exit, 3, ProcessDied), (time.sleep, 600, TimedOut)],
+)
+def test_a_call_that_exceeds_a_limit_or_ends_the_process_is_an_error_of_its_own(
+    child, function, argument, error
+):
+    with pytest.raises(error):
+        child.call(function, 5, argument)
