@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from runner.errors import RecordingError
+from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_usable
 from runner.runs.run import Run
 from runner.util.extras import require
 from runner.util.values import flatten
@@ -37,8 +38,6 @@ Phase = Literal["train", "eval"]
 
 RECENT_EPISODES: Final = 100
 """Training episodes that the summary of a loop averages, the last ones."""
-LARGEST: Final = 1e300
-"""Values beyond it are left out of means: their sums, and the margins of an axis, would overflow."""
 
 _BEFORE: Final = ("step", "episode", "t", "state", "action", "next_state", "next_observation")
 _BEHIND: Final = ("terminated", "truncated", "explored", "acted", "agents_terminated", "agents_truncated")
@@ -238,7 +237,7 @@ def loop_summary(recording: Recording) -> dict[str, Any]:
     evaluations = evaluation_records(recording)
     recent = recording.episodes("train", max(0, total - RECENT_EPISODES), total)
     return {
-        "last_evaluation": None if not evaluations else _brief(evaluations[-1]),
+        "last_evaluation": evaluation_summary(evaluations[-1]) if evaluations else None,
         "recent_training": {
             "episodes": len(recent),
             "mean_length": finite_mean(recent["length"]),
@@ -258,17 +257,6 @@ def _last_logged(recording: Recording) -> dict[str, float | None]:
         scalar["name"]: scalar["value"] if math.isfinite(scalar["value"]) else None
         for scalar in recording.decoded(schema.SCALAR_TOPIC)
     }
-
-
-def finite_mean(values: NDArray[Any]) -> float | None:
-    """Return the mean of those values that are finite and no larger than `LARGEST`; None without any."""
-    usable = is_usable(values)
-    return float(values[usable].mean()) if usable.any() else None
-
-
-def is_usable(values: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return which values are finite and small enough that sums of them stay finite."""
-    return abs(values) <= LARGEST  # false for NaN
 
 
 def trained_before(recording: Recording) -> NDArray[np.int64]:
@@ -304,14 +292,18 @@ def evaluation_record(
         "step": metrics["step"],
         "trials": metrics["trials"],
         "successes": metrics["successes"] if known else None,
-        "success_percent": metrics["success_percent"] if known else None,
-        "mean_length": metrics["eval_mean_length"],
-        "mean_penalties": metrics["mean_penalties"],
+        **{each.key: _known(metrics[each.field], agents) for each in METRICS},
         "terminations": metrics["terminations"],
-        "mean_returns": dict(zip(agents, metrics["mean_returns"], strict=True)),
         "events": dict(zip(events, metrics["events"], strict=True)),
         "training": _training_side(metrics, agents),
     }
+
+
+def _known(value: float | list[float], agents: Sequence[str]) -> float | dict[str, float] | None:
+    """Return a recorded value, by agent if each has its own; NaN, which stands for unknown, as None."""
+    if isinstance(value, list):
+        return dict(zip(agents, value, strict=True))
+    return None if math.isnan(value) else value
 
 
 def _loop_evaluations(
@@ -329,40 +321,43 @@ def _loop_evaluations(
         for episodes in np.unique(after).tolist():
             found.setdefault(episodes, []).append(block[after == episodes])
     environment = recording.environment
-    return [
-        _loop_evaluation(number, episode, np.concatenate(found[episode]), agents, events)
-        | ({} if environment["success_events"] else {"successes": None, "success_percent": None})
-        | ({} if environment["penalty_below"] is not None else {"mean_penalties": None})
-        for number, episode in enumerate(sorted(found))
-    ]
+    defined = defined_metrics(bool(environment["success_events"]), environment["penalty_below"] is not None)
+    records = []
+    for number, episode in enumerate(sorted(found)):
+        trials = np.concatenate(found[episode])
+        values = {each.key: each.of_trials(trials) for each in defined}
+        records.append(
+            {
+                "evaluation": number,
+                "episode": episode,
+                "trials": len(trials),
+                "successes": int(trials["success"].sum()) if environment["success_events"] else None,
+                **dict.fromkeys(each.key for each in METRICS),
+                **{key: _mean(of_trials, agents) for key, of_trials in values.items()},
+                "terminations": int(trials["terminated"].sum()),
+                "not_finite": sum(int((~is_usable(of_trials)).sum()) for of_trials in values.values()),
+                "events": dict(zip(events, trials["events"].sum(axis=0, dtype=int).tolist(), strict=True)),
+            }
+        )
+    return records
 
 
-def _loop_evaluation(
-    number: int, episode: int, trials: NDArray[np.void], agents: Sequence[str], events: Sequence[str]
-) -> dict[str, Any]:
-    returns = trials["returns"]
-    return {
-        "evaluation": number,
-        "episode": episode,
-        "trials": len(trials),
-        "successes": int(trials["success"].sum()),
-        "success_percent": 100 * float(trials["success"].mean()),
-        "mean_length": float(trials["length"].mean()),
-        "mean_penalties": float(trials["penalties"].mean()),
-        "terminations": int(trials["terminated"].sum()),
-        "mean_returns": {agent: finite_mean(returns[:, i]) for i, agent in enumerate(agents)},
-        "not_finite": int((~is_usable(returns)).sum()),
-        "events": dict(zip(events, trials["events"].sum(axis=0, dtype=int).tolist(), strict=True)),
-    }
+def _mean(values: NDArray[Any], agents: Sequence[str]) -> float | dict[str, float | None] | None:
+    """Return the mean over trials, by agent if each has its own, without what is not finite."""
+    if values.ndim == 1:
+        return finite_mean(values)
+    return {agent: finite_mean(values[:, i]) for i, agent in enumerate(agents)}
 
 
-def _brief(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a summary has of an evaluation of a loop."""
-    returns = list(record["mean_returns"].values())
-    brief = {
-        key: record[key] for key in ("episode", "trials", "success_percent", "mean_length", "mean_penalties")
-    }
-    return brief | {"mean_return": None if None in returns else sum(returns)}
+def evaluation_summary(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures of an evaluation record, summed over agents; None for what is unknown of any."""
+    summary = {"episode": record["episode"], "trials": record["trials"]}
+    for metric in METRICS:
+        value = record[metric.key]
+        if metric.per_agent:
+            value = None if None in value.values() else sum(value.values())
+        summary[metric.name] = value
+    return summary
 
 
 def _training_side(metrics: Mapping[str, Any], agents: Sequence[str]) -> dict[str, Any]:
@@ -419,8 +414,10 @@ def _flat(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _evaluation_column(key: str) -> str:
-    """Return the column of a value of an evaluation: events by their own names, returns by agent."""
-    return key.removeprefix("events.").replace("mean_returns.", "mean_return.", 1)
+    """Return the column of a value of an evaluation: events by their own names, measures by agent."""
+    first, dot, rest = key.partition(".")
+    names = {metric.key: metric.name for metric in METRICS}
+    return rest if first == "events" else f"{names.get(first, first)}{dot}{rest}"
 
 
 def _plain_columns(records: NDArray[np.void], names: Sequence[str]) -> dict[str, Any]:

@@ -9,11 +9,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.frames import LARGEST, evaluation_records, is_usable, training_records
-from runner.analysis.series import LOGGED, SHARES, Readings, RunSeries
+from runner.analysis.frames import evaluation_records, training_records
+from runner.analysis.series import LOGGED, Readings, RunSeries
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.metrics import LARGEST, METRICS, SHARES, is_usable
 from runner.recording.reader import Recording
 
 _POINTS: Final = 200
@@ -76,26 +77,24 @@ def loop_series(recording: Recording) -> RunSeries:
 
 def evaluation_readings(record: Mapping[str, Any]) -> Readings:
     """Return the readings of a record of `runner.frames.evaluation_records`."""
-    trials = record["trials"]
-    known = {} if record["success_percent"] is None else {"success_percent": {"": record["success_percent"]}}
-    events: Readings = {}
+    readings: Readings = {}
+    for metric in METRICS:
+        value = record[metric.key]
+        lines = value if metric.per_agent else {"": value}
+        if known := {line: value for line, value in lines.items() if value is not None}:
+            readings[metric.name] = known
     for name, count in record["events"].items():
         agent, _, kind = name.rpartition(".")
-        events.setdefault(f"event.{kind}", {})[agent] = count / trials
-    returns = {agent: value for agent, value in record["mean_returns"].items() if value is not None}
-    means: Readings = {"mean_length": {"": record["mean_length"]}}
-    if record["mean_penalties"] is not None:
-        means["mean_penalties"] = {"": record["mean_penalties"]}
-    if returns:
-        means["mean_return"] = returns
-    return known | means | events
+        readings.setdefault(f"event.{kind}", {})[agent] = count / record["trials"]
+    return readings
 
 
 def _loop_readings(record: Mapping[str, Any]) -> Readings:
     """Return the readings of an evaluation of a loop; the return of a single agent has no name."""
     readings = evaluation_readings(record)
-    if len(record["mean_returns"]) == 1 and "mean_return" in readings:
-        readings["mean_return"] = {"": next(iter(readings["mean_return"].values()))}
+    for metric in METRICS:
+        if metric.per_agent and len(record[metric.key]) == 1 and metric.name in readings:
+            readings[metric.name] = {"": next(iter(readings[metric.name].values()))}
     return readings
 
 

@@ -8,8 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from runner.analysis.frames import LARGEST
 from runner.environments.naming import event_in_words
+from runner.recording.metrics import LARGEST, METRIC_OF, SHARES
 
 Readings = dict[str, dict[str, float]]
 """Metric -> line (an agent, a reward, or "") -> value."""
@@ -42,31 +42,10 @@ class RunSeries:
         return self.status == "finished"
 
 
-SHARES: Final = "training.reward"
-"""The metric whose lines are shares of a whole."""
 LOGGED: Final = "training.logged."
 """What somebody's own loop logged under a name of its own."""
 _TITLE: Final = 40
 """Letters of a name for which there is room above a panel."""
-
-TITLES: Final = {
-    "success_percent": ("Evaluation trials that succeed", "percent of trials"),
-    "mean_length": ("Length of evaluation trials", "steps, mean"),
-    "mean_penalties": ("Penalties in evaluation trials", "a trial, mean"),
-    "mean_return": ("Return of evaluation trials", "summed reward, mean"),
-    "exact.success_percent": ("Start states that succeed, exactly", "percent of start states"),
-    "exact.mean_length": ("Length of an episode, exactly", "steps, mean over start states"),
-    "exact.value": ("Value of the greedy policy", "discounted, mean"),
-    "exact.to_gain": ("To gain by a best response", "discounted, mean"),
-    "training.mean_length": ("Length of training episodes", "steps, mean"),
-    "training.mean_return": ("Return of training episodes", "summed reward, mean"),
-    "training.mean_reward": ("Reward in training", "a step, running mean"),
-    "training.percent_filled": ("Q-table filled", "percent of its cells"),
-    "training.zero_cells": ("Q-table cells still zero", "cells"),
-    "training.schedule": ("Schedules", "value"),
-    SHARES: ("Training steps by reward", "percent of recent steps"),
-}
-"""Metric -> title and unit, in the order they are shown; events come after the evaluation's."""
 
 
 def is_loop(run: RunSeries) -> bool:
@@ -103,7 +82,7 @@ def title_of(metric: str) -> tuple[str, str]:
     if metric.startswith(LOGGED):
         name = " ".join(metric.removeprefix(LOGGED).split())
         return f"Logged: {name if len(name) <= _TITLE else name[: _TITLE - 1] + '…'}", "as logged, mean"
-    return TITLES[metric]
+    return METRIC_OF[metric].title, METRIC_OF[metric].unit
 
 
 def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[int, float]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runner.cli.output import UNBOUNDED, number, table
 from runner.environments.naming import spoken
+from runner.recording.metrics import METRICS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -86,18 +87,17 @@ def _events(names: Iterable[str], success_events: Sequence[str]) -> list[_Event]
 def _measures(records: Sequence[Mapping[str, Any]]) -> list[_Column]:
     """Return the columns of the measures that the environment defines; of a loop also the return."""
     columns = [_Column("episode", [f"{record['episode']:,}" for record in records])]
-    if not all("training" in record for record in records):
+    is_job = all("training" in record for record in records)
+    if not is_job:
         columns.append(_Column("trials", [f"{record['trials']:,}" for record in records]))
-        columns.append(_Column("mean return", [_returns(record["mean_returns"]) for record in records]))
-    measures = (("success %", "success_percent"), ("mean length", "mean_length"))
-    for heading, key in (*measures, ("mean penalties", "mean_penalties")):
-        if "training" in records[0] or any(record[key] is not None for record in records):
-            columns.append(_Column(heading, [number(record[key]) for record in records]))
+    for metric in METRICS:
+        values = [record[metric.key] for record in records]
+        if metric.per_agent and not is_job:
+            cells = ["/".join(number(value) for value in by_agent.values()) for by_agent in values]
+            columns.append(_Column(metric.heading, cells))
+        elif not metric.per_agent and (is_job or any(value is not None for value in values)):
+            columns.append(_Column(metric.heading, [number(value) for value in values]))
     return columns
-
-
-def _returns(returns: Mapping[str, float | None]) -> str:
-    return "/".join(number(value) for value in returns.values())
 
 
 def _fill(records: Sequence[Mapping[str, Any]]) -> list[_Column]:

@@ -30,6 +30,7 @@ from runner.recording.metadata_writing import (
     write_description,
     write_result,
 )
+from runner.recording.metrics import METRICS, defined_metrics
 from runner.recording.recorder import Recorder
 from runner.recording.reference import Past
 from runner.recording.writer import RecordingFile, create_recording
@@ -312,23 +313,19 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> dict[s
         "evaluation": evaluation,
         "trials": len(trials),
         "successes": successes if known else -1,
-        "success_percent": 100.0 * successes / len(trials) if known else float("nan"),
-        "eval_mean_length": float(trials["length"].mean()),
-        "mean_penalties": float(trials["penalties"].mean()),
+        **{each.field: math.nan for each in METRICS},
+        **{each.field: each.of_trials(trials).mean(axis=0).tolist() for each in defined_metrics(known, True)},
         "terminations": int(trials["terminated"].sum()),
-        "mean_returns": trials["returns"].mean(axis=0).tolist(),
         "events": trials["events"].sum(axis=0, dtype=np.int64).tolist(),
     }
 
 
 def evaluation_brief(metrics: dict[str, Any]) -> dict[str, Any]:
-    """Return the four figures of an evaluation that people quote; finish percent None if unknown."""
-    finished = metrics["success_percent"]
+    """Return the figures of an evaluation that a summary has; None for what is unknown."""
+    values = {metric.name: metrics[metric.field] for metric in METRICS if not metric.per_agent}
     return {
         "episode": metrics["episode"],
-        "success_percent": None if math.isnan(finished) else finished,
-        "mean_length": metrics["eval_mean_length"],
-        "mean_penalties": metrics["mean_penalties"],
+        **{name: None if math.isnan(value) else value for name, value in values.items()},
     }
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from html import escape
 from typing import Any, Final
 
@@ -156,14 +156,16 @@ def _result_html(run: Run) -> str:
     last = run.summary.last_evaluation
     if last is None:
         return f"<p><b>{escape(run.title)}</b></p>"
-    success = "" if last.success_percent is None else f"{last.success_percent:.1f} % of trials succeed, "
-    length = "" if last.mean_length is None else f"{last.mean_length:,.1f} steps on average"
-    return f"<p><b>{escape(run.title)}</b>, last evaluation: {success}{length}.</p>"
+    percent, length = (last.values.get(name) for name in ("success_percent", "mean_length"))
+    success = "" if percent is None else f"{percent:.1f} % of trials succeed, "
+    steps = "" if length is None else f"{length:,.1f} steps on average"
+    return f"<p><b>{escape(run.title)}</b>, last evaluation: {success}{steps}.</p>"
 
 
 def facts_html(run: Run) -> str:
     """Return what `run.json` says of a run, as a small table."""
-    evaluation = asdict(run.summary.last_evaluation) if run.summary.last_evaluation else {}
+    last = run.summary.last_evaluation
+    evaluation = {"episode": last.episode, "trials": last.trials, **last.values} if last else {}
     facts = {
         "run": f"{run.run_id}, {run.status}",
         "name": f"{run.title}",

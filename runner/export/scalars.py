@@ -19,6 +19,7 @@ from datetime import datetime
 from typing import Any
 
 from runner.errors import RecordingError
+from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
 from runner.recording.schema import EVAL_EPISODE, SCALAR_TOPIC, STEP_NANOSECONDS, TRAIN_EPISODE
 
@@ -28,7 +29,6 @@ _EXACT = {
     **{"mean_returns": "mean_return", "values": "value", "best_responses": "best_response"},
     **{f"optimal_{name}": f"optimal_{name}" for name in ("value", "success_percent", "mean_length")},
 }
-_OF_EVALUATION = ("trials", "successes", "success_percent", "mean_penalties", "terminations")
 
 
 @dataclass(frozen=True)
@@ -114,11 +114,11 @@ def evaluation_values(
 ) -> dict[str, float]:
     """Return what came of an evaluation, by name."""
     values: dict[str, float] = {}
-    for name in _OF_EVALUATION:
+    for name in ("trials", "successes", "terminations"):
         if name != "successes" or metrics[name] >= 0:
             values |= _named(name, metrics[name], agents)
-    values |= _named("mean_length", metrics["eval_mean_length"], agents)
-    values |= _named("mean_return", metrics["mean_returns"], agents)
+    for metric in METRICS:
+        values |= _named(metric.name, metrics[metric.field], agents)
     return values | _named("events", metrics["events"], events)
 
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.frames import RECENT_EPISODES, finite_mean, is_usable
+from runner.analysis.frames import RECENT_EPISODES
 from runner.environments.mdp import Mdp
 from runner.recording import schema
+from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_usable
 from runner.recording.schema import Topic
 
 MAX_NAMES: Final = 64
@@ -25,14 +25,17 @@ class Outcomes:
     """
 
     def __init__(self, mdp: Mdp | None) -> None:
-        self._has_success = mdp is not None and bool(mdp.success_events)
-        self._has_penalties = mdp is not None and math.isfinite(mdp.penalty_below)
+        has_success = mdp is not None and bool(mdp.success_events)
+        has_penalties = mdp is not None and math.isfinite(mdp.penalty_below)
+        self._defined = defined_metrics(has_success, has_penalties)
         self._trained = 0
         self._recent = np.empty((0, 2))
         """[episodes, 2]: returns and lengths of the last training episodes."""
         self._evaluated_after = -1
-        self._trials: defaultdict[str, float] = defaultdict(float)
-        """Sums over the trials of the last evaluation."""
+        self._trials = 0
+        """Number of trials of the last evaluation."""
+        self._sums: dict[str, tuple[float, int]] = {}
+        """Sum over those trials and number of usable values, by metric."""
         self._logged: dict[str, float | None] = {}
 
     def take_records(self, topic: Topic, records: NDArray[np.void]) -> None:
@@ -44,14 +47,14 @@ class Outcomes:
             self._recent = np.concatenate([self._recent, results])[-RECENT_EPISODES:]
         elif topic.name == schema.EVAL_EPISODE.name:
             if self._evaluated_after != self._trained:
-                self._evaluated_after, self._trials = self._trained, defaultdict(float)
-            returns = records["returns"].sum(axis=1)
-            usable = returns[is_usable(returns)]
-            self._trials["trials"] += len(records)
-            self._trials["usable"] += len(usable)
-            self._trials["return"] += float(usable.sum())
-            for name in ("length", "success", "penalties"):
-                self._trials[name] += int(records[name].sum(dtype=np.int64))
+                self._evaluated_after, self._trials, self._sums = self._trained, 0, {}
+            self._trials += len(records)
+            for metric in self._defined:
+                values = metric.of_trials(records).astype(np.float64)
+                values = values.sum(axis=1) if metric.per_agent else values
+                values = values[is_usable(values)]
+                total, count = self._sums.get(metric.name, (0.0, 0))
+                self._sums[metric.name] = total + float(values.sum()), count + len(values)
 
     def take_logged(self, name: str, value: float) -> None:
         """Take a logged value."""
@@ -72,14 +75,8 @@ class Outcomes:
         }
 
     def _evaluation(self) -> dict[str, Any] | None:
-        sums, count = self._trials, int(self._trials["trials"])
-        if not count:
+        if not self._trials:
             return None
-        return {
-            "episode": self._evaluated_after,
-            "trials": count,
-            "success_percent": 100 * sums["success"] / count if self._has_success else None,
-            "mean_length": sums["length"] / count,
-            "mean_penalties": sums["penalties"] / count if self._has_penalties else None,
-            "mean_return": sums["return"] / sums["usable"] if sums["usable"] else None,
-        }
+        means = {name: total / count for name, (total, count) in self._sums.items() if count}
+        values = {metric.name: means.get(metric.name) for metric in METRICS}
+        return {"episode": self._evaluated_after, "trials": self._trials, **values}

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 
+from runner.recording.metrics import METRICS
+
 STATED_STATUSES: Final = ("running", "finished", "interrupted", "failed")
 """The statuses that a run's owner writes."""
 MAX_DEPTH: Final = 100
@@ -38,12 +40,15 @@ class EvaluationMetrics:
 
     episode: int | None = None
     """Training episodes before it."""
-    success_percent: float | None = None
-    mean_length: float | None = None
-    mean_penalties: float | None = None
-    mean_return: float | None = None
-    """Summed over agents; known of loops."""
     trials: int | None = None
+    values: Mapping[str, float | None] = field(default_factory=dict)
+    """Value by name of a metric; the sum over agents of one that each agent has, known of loops."""
+
+    @classmethod
+    def of(cls, record: Mapping[str, Any]) -> EvaluationMetrics:
+        """Return the figures of a summary's `last_evaluation`."""
+        values = {metric.name: record.get(metric.name) for metric in METRICS}
+        return cls(record.get("episode"), record.get("trials"), values)
 
 
 @dataclass(frozen=True)
@@ -181,7 +186,7 @@ def parse_summary(stated: Mapping[str, Any], where: str, problems: list[str]) ->
     for key, record, checks in _RECORDS:
         if key in fields:
             known[key] = figures = _fitting(fields[key], checks, f"{where}{key}.", problems)
-            fields[key] = record(**{name: figures.get(name) for name in checks})
+            fields[key] = record({name: figures.get(name) for name in checks})
     return Summary(**fields, values_by_key=known)
 
 
@@ -271,27 +276,30 @@ def _optional(check: Check) -> Check:
     return Check(lambda value: value is None or check.fits(value), f"{check.expected} or null")
 
 
+def _within(lowest: float = -math.inf, highest: float = math.inf) -> Check:
+    if math.isfinite(highest):
+        expected = f"a number from {lowest:g} to {highest:g}"
+    else:
+        expected = f"a finite number from {lowest:g} up" if math.isfinite(lowest) else "a finite number"
+    return Check(lambda value: _is_number(value) and lowest <= value <= highest, expected)
+
+
 _DIGEST: Final = Check(
     lambda value: _is_text(value) and re.fullmatch(r"[0-9A-Za-z]{1,128}", value) is not None, "a digest"
 )
 _COUNT: Final = Check(_is_count, "a whole number from 0 up")
 _TEXT: Final = Check(_is_text, "a text")
 _OBJECT: Final = Check(_is_object, "an object")
-_NUMBER: Final = Check(_is_number, "a finite number")
-_LENGTH: Final = Check(lambda value: _is_number(value) and value >= 0, "a finite number from 0 up")
+_NUMBER: Final = _within()
+_LENGTH: Final = _within(0)
 _STATUS: Final = Check(lambda value: value in STATED_STATUSES, f"one of {', '.join(STATED_STATUSES)}")
 
 _EVALUATION: Final = {
     "episode": _optional(_COUNT),
-    "success_percent": _optional(
-        Check(lambda value: _is_number(value) and 0 <= value <= 100, "a number from 0 to 100")
-    ),
-    "mean_length": _optional(_LENGTH),
-    "mean_penalties": _optional(_LENGTH),
-    "mean_return": _optional(_NUMBER),
+    **{metric.name: _optional(_within(metric.lowest, metric.highest)) for metric in METRICS},
     "trials": _optional(_COUNT),
 }
-_RENAMED: Final = {"finish_percent": "success_percent"}
+_RENAMED: Final = {metric.stored_as: metric.name for metric in METRICS if metric.stored_as}
 """Keys of an evaluation as earlier versions wrote them."""
 _RECENT: Final = {
     "episodes": _optional(_COUNT),
@@ -299,8 +307,8 @@ _RECENT: Final = {
     "mean_return": _optional(_NUMBER),
 }
 _RECORDS: Final = (
-    ("last_evaluation", EvaluationMetrics, _EVALUATION),
-    ("recent_training", RecentTraining, _RECENT),
+    ("last_evaluation", EvaluationMetrics.of, _EVALUATION),
+    ("recent_training", lambda figures: RecentTraining(**figures), _RECENT),
 )
 _SUMMARY: Final = {
     "status": Check(lambda value: value in STATED_STATUSES[1:], f"one of {', '.join(STATED_STATUSES[1:])}"),

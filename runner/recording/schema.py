@@ -10,6 +10,8 @@ from typing import Final
 
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 
+from runner.recording.metrics import METRICS
+
 FORMAT_VERSION: Final = 1
 PROFILE: Final = "dualtaxi"
 STEP_NANOSECONDS: Final = 100_000_000
@@ -106,20 +108,17 @@ _TRAINING_SIDE = (
     Field(10, "discount", _DOUBLE),
 )
 TRAIN_METRICS = MessageType("TrainMetrics", _TRAINING_SIDE)
+_EVALUATION_SIDE = (
+    Field(11, "evaluation", _SFIXED64),
+    Field(12, "trials", _SFIXED64),
+    Field(13, "successes", _SFIXED64),
+    Field(17, "terminations", _SFIXED64),
+    Field(19, "events", _SFIXED64, repeated=True),
+    *(Field(each.number, each.field, _DOUBLE, each.per_agent, each.stored_as) for each in METRICS),
+)
 EVAL_METRICS = MessageType(
     "EvalMetrics",
-    (
-        *_TRAINING_SIDE,
-        Field(11, "evaluation", _SFIXED64),
-        Field(12, "trials", _SFIXED64),
-        Field(13, "successes", _SFIXED64),
-        Field(14, "success_percent", _DOUBLE, stored_as="finish_percent"),
-        Field(15, "eval_mean_length", _DOUBLE),
-        Field(16, "mean_penalties", _DOUBLE),
-        Field(17, "terminations", _SFIXED64),
-        Field(18, "mean_returns", _DOUBLE, repeated=True),
-        Field(19, "events", _SFIXED64, repeated=True),
-    ),
+    (*_TRAINING_SIDE, *sorted(_EVALUATION_SIDE, key=lambda field: field.number)),
 )
 OPTIMALITY = MessageType(
     "Optimality",

@@ -7,12 +7,11 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from runner.analysis.groups import Group, each_once, flat_config, label_of, sameness
-from runner.analysis.series import SHARES, RunSeries
+from runner.analysis.series import RunSeries
 from runner.errors import RunnerError, nearest
+from runner.recording.metrics import METRICS, SHARES
 
 _NOT_COMPARED = ("seeds", "recording", "name")
-_USUAL = ("success_percent", "mean_length", "mean_penalties", "mean_return")
-_USUAL_WITHOUT_GOAL = ("mean_return", "mean_length", "mean_penalties")
 _USUAL_OF_TRAINING = ("training.mean_return", "training.mean_reward", "training.mean_length")
 
 
@@ -85,7 +84,9 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
         raise RunnerError(
             "found neither an evaluation nor a report of training in any run, so there is nothing to compare."
         )
-    usual = _USUAL if "success_percent" in known else _USUAL_WITHOUT_GOAL
+    usual = [metric.name for metric in METRICS]
+    if not any(metric.name in known for metric in METRICS if metric.requires == "success_events"):
+        usual.sort(key=lambda name: name != "mean_return")  # without a goal the return says most
     names = list(chosen)
     for some in (usual, _USUAL_OF_TRAINING):
         names = names or [name for name in some if name in known]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -13,22 +12,15 @@ from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
 from runner.analysis.series import RunSeries, has_goal, points_of
 from runner.errors import RunnerError
-
-_HIGHER_IS_BETTER: Final = {
-    "success_percent": True,
-    "mean_return": True,
-    "training.mean_reward": True,
-    "training.mean_return": True,
-    "mean_penalties": False,
-}
-_LENGTHS: Final = ("mean_length", "training.mean_length")
+from runner.recording.metrics import METRIC_OF
 
 
 def higher_is_better(metric: str, groups: Sequence[Group]) -> bool | None:
     """Return what is better of a metric; None where nobody can say it in general."""
-    if metric in _LENGTHS and all(has_goal(run) for group in groups for run in group.runs):
-        return False
-    return _HIGHER_IS_BETTER.get(metric)
+    better = METRIC_OF[metric].better if metric in METRIC_OF else None
+    if better == "lower_to_goal":
+        return False if all(has_goal(run) for group in groups for run in group.runs) else None
+    return None if better is None else better == "higher"
 
 
 @dataclass(frozen=True)

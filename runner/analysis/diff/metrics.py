@@ -5,21 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 
 from runner.errors import RunnerError, nearest
+from runner.recording.metrics import METRIC_OF, METRICS
 from runner.recording.reader import Recording
 
-SERIES = {
-    "success_percent": "success_percent",
-    "mean_length": "eval_mean_length",
-    "mean_penalties": "mean_penalties",
-    "training.mean_length": "mean_length",
-}
-"""A metric's name to the field of an evaluation."""
-BY_AGENT = {"mean_return": "mean_returns", "training.percent_filled": "percent_filled"}
-"""The same for those of which each learner has its own: `mean_return.taxi_1`."""
+_COMPARED: Final = (*METRICS, METRIC_OF["training.mean_length"], METRIC_OF["training.percent_filled"])
 
 
 @dataclass(frozen=True)
@@ -71,15 +65,12 @@ def _values(recording: Recording) -> dict[str, dict[int, float]]:
     agents = recording.agents
     table: dict[str, dict[int, float]] = {}
     for metrics in recording.iter_metrics("eval"):
-        plain = {name: metrics[key] for name, key in SERIES.items()}
-        own = {
-            f"{name}.{agent}": value
-            for name, key in BY_AGENT.items()
-            for agent, value in zip(agents, metrics[key], strict=False)
-        }
-        for name, value in (plain | own).items():
-            if not math.isnan(value):
-                table.setdefault(name, {})[int(metrics["episode"])] = float(value)
+        for metric in _COMPARED:
+            value = metrics[metric.field]
+            lines = [f"{metric.name}.{agent}" for agent in agents] if metric.per_agent else [metric.name]
+            for line, own in zip(lines, value if metric.per_agent else [value], strict=False):
+                if not math.isnan(own):
+                    table.setdefault(line, {})[int(metrics["episode"])] = float(own)
     return table
 
 

@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from runner.analysis.groups import Group
-from runner.analysis.series import SHARES, is_loop, values_left_out
+from runner.analysis.series import is_loop, values_left_out
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.errors import RunnerError
 from runner.export.plots.metrics import Curve, Panel
+from runner.recording.metrics import SHARES
 from runner.util.extras import require
 
 if TYPE_CHECKING:

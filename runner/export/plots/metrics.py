@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.groups import Group
-from runner.analysis.series import LOGGED, SHARES, TITLES, points_of, title_of
+from runner.analysis.series import LOGGED, points_of, title_of
 from runner.errors import RunnerError
+from runner.recording.metrics import METRIC_OF, SHARES
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def _panel(metric: str, curves: tuple[Curve, ...]) -> Panel:
 
 def _rank(metric: str) -> tuple[int, int]:
     """Return where a metric stands: evaluation, its events, training."""
-    order = list(TITLES)
+    order = list(METRIC_OF)
     if metric.startswith("event."):
         return 1, 0
     if metric.startswith(LOGGED):

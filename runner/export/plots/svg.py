@@ -17,11 +17,11 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.series import SHARES
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.export.plots.figure import number_on_axis
 from runner.export.plots.metrics import Curve, Panel
+from runner.recording.metrics import SHARES
 
 Values = NDArray[np.float64]
 

@@ -12,6 +12,7 @@ from importlib.resources.abc import Traversable
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from runner.drawing import palette, svg, svg_maps
+from runner.recording.metrics import METRICS
 from runner.util import humanize
 from runner.util.extras import require
 
@@ -83,6 +84,7 @@ def environment_of(folders: Sequence[Traversable]) -> Environment:
         "sentence": sentence,
     }
     environment.filters |= filters
+    environment.globals["metrics"] = METRICS
     return environment
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runner.analysis.frames import evaluation_records
+from runner.analysis.frames import evaluation_records, evaluation_summary
 from runner.analysis.groups import Group, groups_of
 from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries, values_left_out
@@ -125,7 +125,7 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> dict[st
         "conduct": _conduct(recording),
         "made_by": recording.config.get("made_by", ""),
         "last": evaluations[-1] if evaluations else None,
-        "last_return": _return_of(evaluations[-1]) if evaluations else None,
+        "last_return": evaluation_summary(evaluations[-1])["mean_return"] if evaluations else None,
         "random": random_policy_sentence(recording),
         "steps": recording.has_steps,
         "evaluations": evaluations,
@@ -159,12 +159,6 @@ def _conduct(recording: Recording) -> str:
     if not recording.is_job:
         return "loop"
     return "random" if recording.config["algorithm"] == "random" else "learning"
-
-
-def _return_of(evaluation: Mapping[str, Any]) -> float | None:
-    """Return the mean return of an evaluation, summed over agents; None if one is not finite."""
-    returns = list(evaluation["mean_returns"].values())
-    return None if None in returns else sum(returns)
 
 
 def _facts(recording: Recording) -> dict[str, str]:

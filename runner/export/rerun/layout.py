@@ -13,21 +13,31 @@ from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import spoken
 from runner.export.rerun.maps import draw_blocks
+from runner.export.rerun.metrics import TRAINING_MEANS
 from runner.export.rerun.scene import Scene
 from runner.export.rerun.values import TOP, WIDTH, bar_rows, draw_table
+from runner.recording.metrics import METRICS
 
 FRAMES_A_SECOND: Final = 10.0
 PLOTS: Final = (
-    ("Success (% of trials)", ("eval/metrics/success_percent",)),
-    ("Episode length (mean)", ("train/metrics/episode_length", "eval/metrics/episode_length")),
-    ("Return of an episode (mean)", ("train/metrics/returns", "eval/metrics/returns")),
-    ("Penalties an episode", ("train/metrics/penalties", "eval/metrics/penalties")),
+    *(
+        (
+            metric.heading.capitalize(),
+            (
+                *(f"train/metrics/{n}" for n in TRAINING_MEANS if n == metric.name),
+                f"eval/metrics/{metric.name}",
+            ),
+        )
+        for metric in METRICS
+    ),
     ("Collisions an episode", ("train/metrics/collisions", "eval/metrics/collisions")),
     ("Q-table filled (%)", ("train/metrics/filled_percent",)),
     ("Epsilon, step size", ("train/metrics/epsilon", "train/metrics/step_size")),
     ("Rewards (% of the last steps)", ("train/metrics/reward_percent",)),
 )
 """The views of metrics: title, and the entities whose lines it shows."""
+_RESULTS: Final = len(METRICS)
+"""Number of views, the first ones, that show results of evaluations."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +71,10 @@ def blueprint(runs: Sequence[Shown]) -> rrb.Blueprint:
         body = rrb.Horizontal(*parts, column_shares=shares)
     else:
         halves = [rrb.Horizontal(*_half(run), name=run.title) for run in with_steps]
-        rows = [rrb.Horizontal(*plots[k : k + 4], name=name) for k, name in ((0, "Results"), (4, "Training"))]
+        rows = [
+            rrb.Horizontal(*plots[:_RESULTS], name="Results"),
+            rrb.Horizontal(*plots[_RESULTS:], name="Training"),
+        ]
         below = rrb.Tabs(*(row for row in rows if row.contents))
         body = rrb.Vertical(rrb.Horizontal(*halves), below, row_shares=[7, 3]) if halves else below
     return rrb.Blueprint(

@@ -13,9 +13,12 @@ from runner.environments.naming import spoken
 from runner.export.rerun.events import evaluation_texts, send_text
 from runner.export.rerun.lines import line_colours, phase_colours, series_lines
 from runner.recording import schema
+from runner.recording.metrics import METRICS, EvaluationMetric
 from runner.recording.reader import Recording
 
 SCHEDULES: Final = ("epsilon", "step_size", "discount")
+TRAINING_MEANS: Final = ("mean_length", "mean_penalties", "mean_return")
+"""The measures of an evaluation that training has as well."""
 _ONE_PHASE: Final = ("filled_percent", "reward_percent", "events", "episodes")
 """Metrics of several lines whose view has one phase alone."""
 
@@ -55,7 +58,7 @@ class MetricWriter:
         """Send what training measured of itself: of both kinds of metrics messages."""
         if not rows:
             return
-        self._series("train/metrics/episode_length", rows, [[r["mean_length"]] for r in rows], ["training"])
+        self._series("train/metrics/mean_length", rows, [[r["mean_length"]] for r in rows], ["training"])
         filled = [name if len(self._learners) > 1 else "filled" for name in self._learners]
         self._series("train/metrics/filled_percent", rows, [r["percent_filled"] for r in rows], filled)
         for name in SCHEDULES:
@@ -77,20 +80,10 @@ class MetricWriter:
         """Send the results of evaluations, as series and as text."""
         if not rows:
             return
-        if any(row["successes"] >= 0 for row in rows):
-            self._series(
-                "eval/metrics/success_percent", rows, [[r["success_percent"]] for r in rows], ["success"]
-            )
-        self._series(
-            "eval/metrics/episode_length", rows, [[r["eval_mean_length"]] for r in rows], ["evaluation"]
-        )
-        self._series("eval/metrics/penalties", rows, [[r["mean_penalties"]] for r in rows], ["evaluation"])
-        self._series(
-            "eval/metrics/returns",
-            rows,
-            [r["mean_returns"] for r in rows],
-            self._whose("evaluation"),
-        )
+        for metric in known_metrics(rows):
+            values = np.array([row[metric.field] for row in rows], np.float64).reshape(len(rows), -1)
+            names = self._whose("evaluation") if metric.per_agent else ["evaluation"]
+            self._series(f"eval/metrics/{metric.name}", rows, values, names)
         counts = np.array([row["events"] for row in rows], float).reshape(len(rows), -1)
         trials = np.array([[row["trials"]] for row in rows], float)
         if self._events:
@@ -131,9 +124,9 @@ class MetricWriter:
             return
         rows, means = [rows[k] for k in some], sums[some] / sums[some, 1:2]
         learners = len(self._learners)
-        self._series("train/metrics/penalties", rows, means[:, :1], ["training"])
+        self._series("train/metrics/mean_penalties", rows, means[:, :1], ["training"])
         self._series(
-            "train/metrics/returns",
+            "train/metrics/mean_return",
             rows,
             means[:, 2 : 2 + learners],
             self._whose("training"),
@@ -179,6 +172,11 @@ class MetricWriter:
         if name in SCHEDULES:  # one over the other where their values are equal
             width = 3.0 - SCHEDULES.index(name)
         return series_lines([self._label + name for name in names], colours, width)
+
+
+def known_metrics(rows: Rows) -> list[EvaluationMetric]:
+    """Return the measures that are known of any of these evaluations."""
+    return [metric for metric in METRICS if not np.isnan([row[metric.field] for row in rows]).all()]
 
 
 def send_metrics(writer: MetricWriter, recording: Recording) -> None:

@@ -18,7 +18,7 @@ from runner.export.rerun.ahead import ahead
 from runner.export.rerun.classes import Vocabulary, vocabulary_of
 from runner.export.rerun.columns import Batch, Sender, StepValues, ink, instances, new_stream, place, texts
 from runner.export.rerun.layout import Shown, blueprint, draw_background, loop_blueprint
-from runner.export.rerun.metrics import MetricWriter, send_metrics
+from runner.export.rerun.metrics import TRAINING_MEANS, MetricWriter, known_metrics, send_metrics
 from runner.export.rerun.scene import TRAIL_STEPS, Marks, Scene, marks_of, scene_of
 from runner.export.rerun.selection import Request, Selection, Span, select
 from runner.export.rerun.step_values import StepValueReader
@@ -289,17 +289,10 @@ def _metric_paths(recording: Recording) -> Iterator[str]:
     evaluations = recording.metrics("eval")
     events = recording.mdp.event_names
     reports = recording.metrics("train") or evaluations
-    for name in ("episode_length", "penalties", "returns"):
-        if reports:
-            yield f"train/metrics/{name}"
-        if evaluations:
-            yield f"eval/metrics/{name}"
+    yield from (f"eval/metrics/{metric.name}" for metric in known_metrics(evaluations))
     if reports:
-        yield from (
-            f"train/metrics/{name}" for name in ("filled_percent", "epsilon", "step_size", "reward_percent")
-        )
-    if any(row["successes"] >= 0 for row in evaluations):
-        yield "eval/metrics/success_percent"
+        names = ("filled_percent", "epsilon", "step_size", "reward_percent")
+        yield from (f"train/metrics/{name}" for name in (*TRAINING_MEANS, *names))
     for name in (f"{event}s" for event in events if "." not in event):
         if reports:
             yield f"train/metrics/{name}"

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import RunnerError
+from runner.recording.metrics import METRICS
 from runner.runs.catalogue.fields import FIELDS, SETTING, field_of
 from runner.runs.run import RECORDING_FILE
 from runner.util.humanize import UNKNOWN, age, duration, number, size
@@ -21,7 +22,8 @@ MADE: Final = ("same_as", "path")
 PROGRAMS: Final = (
     *("run_id", "name", "config", "seed", "status", "tags", "note", "created"),
     *("episodes", "episodes_to_do", "train_steps", "eval_steps", "seconds"),
-    *("success_percent", "mean_length", "mean_penalties", "mean_return", "logged"),
+    *(metric.name for metric in METRICS),
+    "logged",
     *("bytes", "content_digest", "same_as"),
     *("mode", "environment", "host", "git", "archive", "path"),
 )
@@ -134,7 +136,7 @@ def _logged_in_words(values: dict[str, float | None]) -> str:
 
 
 _IN_WORDS: Final[dict[str, Callable[[Any], str]]] = {
-    **dict.fromkeys(("success_percent", "mean_length", "mean_penalties", "mean_return"), number),
+    **dict.fromkeys((metric.name for metric in METRICS), number),
     "logged": _logged_in_words,
     "age": age,
     "bytes": size,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from runner.errors import RunnerError, nearest
+from runner.recording.metrics import METRICS
 
 SETTING: Final = "config."
 """What the path of a configuration's value begins with, as a field."""
@@ -54,13 +55,14 @@ _ALL: Final = (
     Field("steps", Kind.NUMBER, "steps of training and evaluation"),
     Field("train_steps", Kind.NUMBER, "steps of training"),
     Field("eval_steps", Kind.NUMBER, "steps of evaluation"),
-    Field("success_percent", Kind.NUMBER, "percent of the last evaluation's trials that succeeded"),
-    Field("mean_length", Kind.NUMBER, "mean length of the last evaluation's trials"),
-    Field("mean_penalties", Kind.NUMBER, "mean penalties of the last evaluation's trials"),
-    Field(
-        "mean_return",
-        Kind.NUMBER,
-        "of a loop: mean return in its last evaluation, or in its last 100 training episodes",
+    *(
+        Field(
+            metric.name,
+            Kind.NUMBER,
+            f"{metric.heading} of the last evaluation"
+            + (" of a loop; of its last 100 training episodes without one" if metric.per_agent else ""),
+        )
+        for metric in METRICS
     ),
     Field("logged", Kind.PROSE, "the values that a loop logged last, by name"),
     Field("seconds", Kind.NUMBER, "how long it took"),

@@ -12,6 +12,7 @@ from typing import Any, Final
 from peewee import BigIntegerField, BooleanField, CompositeKey, Field, FloatField, Model, TextField
 
 from runner.errors import RecordingError
+from runner.recording.metrics import METRICS
 from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.runs.run import Run
 
@@ -79,10 +80,6 @@ class Row(Model):
     steps = BigIntegerField(null=True)
     train_steps = BigIntegerField(null=True)
     eval_steps = BigIntegerField(null=True)
-    success_percent = FloatField(null=True)
-    mean_length = FloatField(null=True)
-    mean_penalties = FloatField(null=True)
-    mean_return = FloatField(null=True)
     logged = TextField(null=True)
     """The last value logged under each name, as a JSON object; null for a value that is not finite."""
     seconds = FloatField(null=True)
@@ -116,6 +113,10 @@ class Row(Model):
         )
 
 
+for _metric in METRICS:
+    Row._meta.add_field(_metric.name, FloatField(null=True))
+
+
 def row_of(run: Run, size: int | None) -> dict[str, Any]:
     """Return what is kept of a run, by column; the place and the fingerprint are not in it.
 
@@ -124,7 +125,7 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         size: bytes of its recording; None if there is none.
     """
     config, summary = run.file.config, run.summary
-    last = summary.last_evaluation or EvaluationMetrics()
+    last, recent = summary.last_evaluation or EvaluationMetrics(), summary.recent_training
     done = summary if summary.episodes is not None else {**_recorded(run), **summary}
     episodes, train, evaluation = (done.get(key) for key in ("episodes", "train_steps", "eval_steps"))
     called = text(config.get("name"))
@@ -144,10 +145,8 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         "steps": None if train is None or evaluation is None else train + evaluation,
         "train_steps": train,
         "eval_steps": evaluation,
-        "success_percent": last.success_percent,
-        "mean_length": last.mean_length,
-        "mean_penalties": last.mean_penalties,
-        "mean_return": _mean_return(summary),
+        **{metric.name: last.values.get(metric.name) for metric in METRICS},
+        **({} if summary.last_evaluation or not recent else {"mean_return": recent.mean_return}),
         "logged": json.dumps(_logged(summary)),
         "seconds": summary.seconds,
         "bytes": size,
@@ -171,12 +170,6 @@ def _recorded(run: Run) -> Mapping[str, Any]:
         with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
             return recording.done()
     return {}
-
-
-def _mean_return(summary: Summary) -> float | None:
-    """Return the mean return of a loop's last evaluation; of its last training episodes without one."""
-    last = summary.last_evaluation or summary.recent_training
-    return last.mean_return if last else None
 
 
 def _logged(summary: Summary) -> dict[str, float | None]:

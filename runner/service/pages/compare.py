@@ -11,6 +11,7 @@ from starlette.concurrency import run_in_threadpool
 from runner.analysis.groups import flat_config
 from runner.analysis.step_reference import episode_reference, parse_step_reference, step_reference
 from runner.errors import RunnerError
+from runner.recording.metrics import METRICS
 from runner.runs.run import Run
 from runner.service import played
 from runner.service.api.comparing import found_runs
@@ -179,13 +180,17 @@ def _flat(run: Run) -> dict[str, str]:
 def _results(found: list[Run]) -> list[tuple[str, list[str]]]:
     """Return what came of runs, a row a measure."""
     last = [last_evaluation(each) for each in found]
-    returns = [humanize.number(each.mean_return) for each in last]
+    measures = {
+        metric.heading: [each.values.get(metric.name) for each in last]
+        for metric in METRICS
+        if not metric.per_agent or any(map(is_loop, found))
+    }
     return [
         ("Status", [each.status for each in found]),
-        *([("Mean return in the last evaluation", returns)] if any(map(is_loop, found)) else []),
-        ("Success in the last evaluation, %", [humanize.number(each.success_percent) for each in last]),
-        ("Mean length of its trials", [humanize.number(each.mean_length) for each in last]),
-        ("Penalties a trial", [humanize.number(each.mean_penalties) for each in last]),
+        *(
+            (f"{heading.capitalize()} in the last evaluation", [humanize.number(value) for value in values])
+            for heading, values in measures.items()
+        ),
         ("Training episodes", [humanize.number(each.summary.episodes, 0) for each in found]),
         ("Steps of training", [humanize.number(each.summary.train_steps, 0) for each in found]),
         (

@@ -57,5 +57,5 @@ def loop_results(run: Run) -> dict[str, Any]:
 def last_evaluation(run: Run) -> EvaluationMetrics:
     """Return the measures of the last evaluation of a run; all unknown without one."""
     if is_loop(run):
-        return EvaluationMetrics(**(loop_results(run)["last_evaluation"] or {}))
+        return EvaluationMetrics.of(loop_results(run)["last_evaluation"] or {})
     return run.summary.last_evaluation or EvaluationMetrics()

@@ -18,6 +18,7 @@ from markupsafe import Markup
 
 from runner.drawing import palette
 from runner.export.reports.rendering import code
+from runner.recording.metrics import METRICS
 from runner.service.pages import static
 from runner.util import humanize
 
@@ -54,7 +55,7 @@ def templates() -> jinja2.Environment:
         "with_prefix": lambda value, prefix: f"{prefix}{value}",
         "query": lambda values: urlencode(list(values), doseq=True),
     }
-    environment.globals |= {"static": static.address, "sections": SECTIONS}
+    environment.globals |= {"static": static.address, "sections": SECTIONS, "metrics": METRICS}
     return environment
 
 

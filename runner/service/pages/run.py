@@ -19,6 +19,7 @@ from runner.environments.naming import event_in_words
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
 from runner.recording.labels import MAX_NOTE
+from runner.recording.metrics import METRICS, EvaluationMetric
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service import played
@@ -214,19 +215,12 @@ def _standing(run: Run, jobs: Jobs, settings: Settings) -> dict[str, Any]:
 def _results(run: Run, last: Mapping[str, Any]) -> dict[str, str]:
     """Return the last results of a run by name: of a loop those that it has."""
     if not is_loop(run):
-        return {
-            "Success in the last evaluation": _percent(last.get("success_percent")),
-            "Mean length of its trials": humanize.number(last.get("mean_length")),
-            "Penalties a trial": humanize.number(last.get("mean_penalties")),
-        }
+        return _of_evaluation({metric: last.get(metric.name) for metric in METRICS if not metric.per_agent})
     results = loop_results(run)
     evaluation, recent = results["last_evaluation"] or {}, results["recent_training"]
     episodes = f"the last {recent['episodes']:,} training episodes"
     measures = {
-        "Success in the last evaluation": _percent(evaluation.get("success_percent")),
-        "Mean return in the last evaluation": humanize.number(evaluation.get("mean_return")),
-        "Mean length of its trials": humanize.number(evaluation.get("mean_length")),
-        "Penalties a trial": humanize.number(evaluation.get("mean_penalties")),
+        **_of_evaluation({metric: evaluation.get(metric.name) for metric in METRICS}),
         f"Mean return of {episodes}": humanize.number(recent["mean_return"]),
         f"Mean length of {episodes}": humanize.number(recent["mean_length"]),
     }
@@ -235,6 +229,13 @@ def _results(run: Run, last: Mapping[str, Any]) -> dict[str, str]:
         for name, value in islice(results["logged"].items(), MOST_LOGGED)
     }
     return {name: text for name, text in measures.items() if humanize.UNKNOWN not in text} | logged
+
+
+def _of_evaluation(values: Mapping[EvaluationMetric, float | None]) -> dict[str, str]:
+    return {
+        f"{metric.heading.capitalize()} in the last evaluation": humanize.number(value)
+        for metric, value in values.items()
+    }
 
 
 def _job_of(run: Run, jobs: Jobs) -> tuple[int | None, dict[str, Any]]:
@@ -251,10 +252,6 @@ def _seconds(run: Run) -> str:
         return f"{humanize.duration((datetime.now(UTC) - run.created).total_seconds())} so far"
     seconds = run.summary.seconds
     return humanize.UNKNOWN if seconds is None else humanize.duration(seconds)
-
-
-def _percent(value: float | None) -> str:
-    return humanize.UNKNOWN if value is None else f"{humanize.number(value)} %"
 
 
 def _recorded_facts(

@@ -192,13 +192,21 @@ def test_the_marks_say_what_went_wrong(exported):
 
 def test_every_metric_is_there(exported):
     metrics = exported.recording.metrics("eval")
-    assert exported.table("/eval/metrics/episode_length")["Scalars:scalars"] == [
+    assert exported.table("/eval/metrics/mean_length")["Scalars:scalars"] == [
         [row["eval_mean_length"]] for row in metrics
     ]
     if metrics[0]["successes"] >= 0:
         finished = [[row["success_percent"]] for row in metrics]
         assert exported.table("/eval/metrics/success_percent")["Scalars:scalars"] == finished
-    names = ["filled_percent", "epsilon", "step_size", "discount", "episode_length", "penalties", "returns"]
+    names = [
+        "filled_percent",
+        "epsilon",
+        "step_size",
+        "discount",
+        "mean_length",
+        "mean_penalties",
+        "mean_return",
+    ]
     for name in [*names, "reward_percent"]:
         assert exported.table(f"/train/metrics/{name}")["Scalars:scalars"]
     lengths = [row[0] for row in exported.table("/train/episodes")["Scalars:scalars"]]
@@ -211,7 +219,7 @@ def test_means_between_reports_are_of_the_episodes_that_ended_there(exported):
     reports = sorted(
         [*recording.metrics("train"), *recording.metrics("eval")], key=lambda row: row["log_time"]
     )
-    table = exported.table("/train/metrics/penalties")
+    table = exported.table("/train/metrics/mean_penalties")
     found = dict(zip(table["step"], (value for (value,) in table["Scalars:scalars"]), strict=True))
     before = 0
     for row in reports:

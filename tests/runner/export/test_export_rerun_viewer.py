@@ -29,12 +29,7 @@ from runner.export.rerun.selection import Request
 from runner.recording import schema
 from runner.recording.reader import open_recording
 
-PLOTS = {
-    "Success (% of trials)",
-    "Episode length (mean)",
-    "Return of an episode (mean)",
-    "Penalties an episode",
-}
+PLOTS = {"Success %", "Mean length", "Mean return", "Mean penalties"}
 PLOTS |= {"Q-table filled (%)", "Epsilon, step size", "Rewards (% of the last steps)"}
 TABLE = "Q-values of this state, before the move"
 

@@ -8,9 +8,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from runner.analysis.series import SHARES
 from runner.export.plots.metrics import Curve, Panel
 from runner.export.plots.svg import Scale, panel_svg
+from runner.recording.metrics import SHARES
 
 
 def curve(values, group=0, line="", spread=0.0):

@@ -1,0 +1,171 @@
+"""The metrics of a run: each measure of its evaluations and of its training, defined once, in one row.
+
+The schema, summaries, frames, plots, comparisons, exports, the index of runs, pages and commands read these
+tables: a new measure of an evaluation is a row of `METRICS`, and the rest follows from it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Better = Literal["higher", "lower", "lower_to_goal", None]
+"""Which values are better; `lower_to_goal` only where episodes have a goal, None where nobody can say."""
+LARGEST: Final = 1e300
+"""Values beyond it are left out of means: their sums, and the margins of an axis, would overflow."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A value that is read at several moments of a run."""
+
+    name: str
+    """Its public name: in frames, plots, comparisons, exports, the index of runs and commands."""
+    title: str
+    unit: str
+    better: Better = None
+    per_agent: bool = False
+    """Whether it has a value for each learner."""
+    field: str = ""
+    """Its field in a message of metrics; empty if it is derived from several."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationMetric(Metric):
+    """The mean of a value over the trials of an evaluation."""
+
+    number: int
+    """Number of its field in `EvalMetrics`."""
+    stored_as: str = ""
+    """Name of its field in files and archives, if that is another one."""
+    heading: str
+    """Its short name, above a column."""
+    requires: Literal["", "success_events", "penalty_below"] = ""
+    """What the environment must define for the metric to be known."""
+    lowest: float = -math.inf
+    highest: float = math.inf
+    of_trials: Callable[[NDArray[Any]], NDArray[Any]]
+    """Returns the value of each trial, [trials] or [trials, agents], from its `Episode` records."""
+
+    @property
+    def key(self) -> str:
+        """Its name in a record of an evaluation: `mean_returns` maps agents to their own values."""
+        return f"{self.name}s" if self.per_agent else self.name
+
+
+METRICS: Final = (
+    EvaluationMetric(
+        name="success_percent",
+        title="Evaluation trials that succeed",
+        unit="percent of trials",
+        better="higher",
+        field="success_percent",
+        number=14,
+        stored_as="finish_percent",
+        heading="success %",
+        requires="success_events",
+        lowest=0,
+        highest=100,
+        of_trials=lambda trials: 100.0 * trials["success"],
+    ),
+    EvaluationMetric(
+        name="mean_length",
+        title="Length of evaluation trials",
+        unit="steps, mean",
+        better="lower_to_goal",
+        field="eval_mean_length",
+        number=15,
+        heading="mean length",
+        lowest=0,
+        of_trials=lambda trials: trials["length"],
+    ),
+    EvaluationMetric(
+        name="mean_penalties",
+        title="Penalties in evaluation trials",
+        unit="a trial, mean",
+        better="lower",
+        field="mean_penalties",
+        number=16,
+        heading="mean penalties",
+        requires="penalty_below",
+        lowest=0,
+        of_trials=lambda trials: trials["penalties"],
+    ),
+    EvaluationMetric(
+        name="mean_return",
+        title="Return of evaluation trials",
+        unit="summed reward, mean",
+        better="higher",
+        per_agent=True,
+        field="mean_returns",
+        number=18,
+        heading="mean return",
+        of_trials=lambda trials: trials["returns"],
+    ),
+)
+"""The measures of an evaluation, in the order they are shown."""
+
+EXACT_METRICS: Final = (
+    Metric("exact.success_percent", "Start states that succeed, exactly", "percent of start states"),
+    Metric("exact.mean_length", "Length of an episode, exactly", "steps, mean over start states"),
+    Metric("exact.value", "Value of the greedy policy", "discounted, mean"),
+    Metric("exact.to_gain", "To gain by a best response", "discounted, mean", per_agent=True),
+)
+"""The measures of a greedy policy that are computed from the environment's transition table."""
+
+SHARES: Final = "training.reward"
+"""The metric whose lines are shares of a whole."""
+TRAINING_METRICS: Final = (
+    Metric(
+        "training.mean_length",
+        "Length of training episodes",
+        "steps, mean",
+        "lower_to_goal",
+        field="mean_length",
+    ),
+    Metric("training.mean_return", "Return of training episodes", "summed reward, mean", "higher", True),
+    Metric("training.mean_reward", "Reward in training", "a step, running mean", "higher"),
+    Metric(
+        "training.percent_filled",
+        "Q-table filled",
+        "percent of its cells",
+        per_agent=True,
+        field="percent_filled",
+    ),
+    Metric("training.zero_cells", "Q-table cells still zero", "cells", per_agent=True, field="zero_cells"),
+    Metric("training.schedule", "Schedules", "value"),
+    Metric(SHARES, "Training steps by reward", "percent of recent steps"),
+)
+"""The measures of training."""
+
+METRIC_OF: Final[dict[str, Metric]] = {
+    metric.name: metric for metric in (*METRICS, *EXACT_METRICS, *TRAINING_METRICS)
+}
+"""Name to metric, in the order they are shown; events come after the evaluation's, logged values last."""
+
+
+def defined_metrics(has_success: bool, has_penalties: bool) -> tuple[EvaluationMetric, ...]:
+    """Return the measures of an evaluation that an environment defines.
+
+    Args:
+        has_success: whether it states which events are a success.
+        has_penalties: whether it states which rewards are penalties.
+    """
+    defined = {"": True, "success_events": has_success, "penalty_below": has_penalties}
+    return tuple(metric for metric in METRICS if defined[metric.requires])
+
+
+def is_usable(values: NDArray[Any]) -> NDArray[Any]:
+    """Return which values are finite and small enough that sums of them stay finite."""
+    return abs(values) <= LARGEST  # false for NaN
+
+
+def finite_mean(values: NDArray[Any]) -> float | None:
+    """Return the mean of the values that are finite and no larger than `LARGEST`; None without any."""
+    usable = is_usable(values)
+    return float(values[usable].mean()) if usable.any() else None
