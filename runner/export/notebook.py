@@ -107,7 +107,8 @@ def plot(*runs: Run) -> Picture:
     from runner.analysis.groups import groups_of
     from runner.analysis.readings import read_series
     from runner.archive.places import at_hand
-    from runner.export.plots.figure import draw_figure
+    from runner.export.plots.curves import curves_sheet
+    from runner.export.plots.image import write_image
     from runner.export.plots.metrics import panels_of
     from runner.recording.reader import open_recording
 
@@ -117,7 +118,7 @@ def plot(*runs: Run) -> Picture:
             series.append(read_series(recording))
     groups = groups_of(series)
     buffer = io.BytesIO()
-    draw_figure(groups, panels_of(groups)).savefig(buffer, format="png", facecolor="white", dpi=110)
+    write_image(curves_sheet(groups, panels_of(groups)), buffer, "png", dpi=110)
     return Picture(buffer.getvalue())
 
 

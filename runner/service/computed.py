@@ -174,14 +174,15 @@ def plot(paths: Sequence[Path], form: str) -> bytes:
     import tempfile
 
     from runner.analysis.groups import groups_of
-    from runner.export.plots.figure import matplotlib_of, save_figure
+    from runner.export.plots.curves import curves_sheet
+    from runner.export.plots.image import check_suffix, save
     from runner.export.plots.metrics import panels_of
 
-    matplotlib_of("a plot")
+    check_suffix(Path(f"plot.{form}"))
     groups = groups_of(_series(paths))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"plot.{form}")
-        save_figure(path, groups, panels_of(groups))
+        save(curves_sheet(groups, panels_of(groups)), path)
         return path.read_bytes()
 
 

@@ -183,14 +183,15 @@ def _told_sections(sections: Sequence[Section], recordings: Path) -> list[dict[s
 def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
     """Return the pictures of a sweep, as JSON: its parameters, and how some of its trials learned."""
     from runner.errors import RunnerError
-    from runner.sweep.charts import parallel_svg, parameter_svgs
+    from runner.sweep.charts import parallel_chart, parameter_chart
     from runner.sweep.plots import picture_of
 
     results = _results(name, recordings, digest)
     pictures, note = [], ""
     try:
         picture = picture_of(results)
-        pictures, note = [*parameter_svgs(picture), parallel_svg(picture)], picture.footnote
+        charts = [*(parameter_chart(picture, axis) for axis in picture.axes), parallel_chart(picture)]
+        pictures, note = [chart.svg() for chart in charts], picture.footnote
     except RunnerError:  # no trial is finished yet, as the results say
         pass
     told = {
@@ -206,8 +207,7 @@ def _learning(results: Results, recordings: Path) -> dict[str, Any]:
     """Return how the best and the median trial of a sweep learned, or why that cannot be shown."""
     from runner.drawing import palette
     from runner.errors import RunnerError
-    from runner.export.plots.figure import footnote
-    from runner.export.plots.svg import panel_svgs
+    from runner.export.plots.curves import footnote, panel_plots
     from runner.sweep.plots import learning
 
     try:
@@ -215,4 +215,5 @@ def _learning(results: Results, recordings: Path) -> dict[str, Any]:
     except RunnerError as error:
         return {"note": without_folders(str(error), recordings), "legend": [], "panels": []}
     legend = [(number % len(palette.SERIES), group.described) for number, group in enumerate(groups)]
-    return {"note": footnote(groups), "legend": legend, "panels": panel_svgs(panels, len(groups))}
+    plots = [plot._asdict() for plot in panel_plots(panels, len(groups))]
+    return {"note": footnote(groups), "legend": legend, "panels": plots}

@@ -9,11 +9,10 @@ from typing import Any
 
 from runner.analysis.groups import Group
 from runner.drawing import palette
-from runner.export.plots.figure import footnote
-from runner.export.plots.svg import panel_svgs
+from runner.export.plots.curves import footnote, panel_plots
 from runner.export.reports.rendering import templates
 from runner.export.reports.report import require_packages
-from runner.sweep.charts import parallel_svg, parameter_svgs
+from runner.sweep.charts import parallel_chart, parameter_chart
 from runner.sweep.plots import learning, picture_of
 from runner.sweep.results import Results, sections
 
@@ -40,12 +39,12 @@ def render_sweep(results: Results, recordings: Path) -> str:
             title=made[0].title,
             lead=made[0].sentences,
             sections=[_section(each) for each in made],
-            parameters=parameter_svgs(picture),
-            parallel=parallel_svg(picture),
+            parameters=[parameter_chart(picture, axis).svg() for axis in picture.axes],
+            parallel=parallel_chart(picture).svg(),
             note=picture.footnote,
             best=results.best_yaml,
             legend=[(i % len(palette.SERIES), *_told(group)) for i, group in enumerate(groups)],
-            panels=panel_svgs(panels, len(groups)),
+            panels=panel_plots(panels, len(groups)),
             footnote=footnote(groups),
             moment=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
         )

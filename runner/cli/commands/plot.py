@@ -46,14 +46,14 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     from runner.analysis.series import values_left_out
     from runner.export.contents import shortcomings
     from runner.export.places import write_new
-    from runner.export.plots.figure import check_suffix, matplotlib_of, save_figure
+    from runner.export.plots.curves import curves_sheet
+    from runner.export.plots.image import check_suffix, save
     from runner.export.plots.metrics import panels_of
     from runner.recording.reader import open_recording
     from runner.runs.run import recordings_folder
     from runner.sweep.names import is_sweep
 
     check_suffix(output)
-    matplotlib_of("a plot")
     folder = recordings_folder(recordings)
     if is_sweep(run_names, folder):
         _draw_sweep(run_names[0], folder, output, force)
@@ -74,14 +74,15 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
         say(sentence)
     panels = panels_of(groups)
     with stage_line("drawing"):
-        write_new(output, force, lambda path: save_figure(path, groups, panels))
+        write_new(output, force, lambda path: save(curves_sheet(groups, panels), path))
     drawn = sum(len(group.runs) for group in groups)
     click.echo(f"{output}: {len(panels)} metrics of {drawn} run{'s' if drawn > 1 else ''}")
 
 
 def _draw_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
     from runner.export.places import write_new
-    from runner.sweep.figure import save_figure
+    from runner.export.plots.image import save
+    from runner.sweep.charts import sweep_sheet
     from runner.sweep.plots import learning, panel_of, picture_of
     from runner.sweep.results import results_of
     from runner.sweep.state import read_sweep
@@ -91,5 +92,6 @@ def _draw_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
     groups, panels = learning(results, recordings)
     panel = panel_of(results.sweep.objective.metric, panels)
     with stage_line("drawing"):
-        write_new(output, force, lambda path: save_figure(path, f"Sweep {name}", picture, groups, panel))
+        sheet = sweep_sheet(f"Sweep {name}", picture, groups, panel)
+        write_new(output, force, lambda path: save(sheet, path))
     click.echo(f"{output}: the sweep {name}, {len(picture.trials)} trials")

@@ -11,10 +11,10 @@ from runner.analysis.compare.sections import EXPLANATION, in_short, metric_secti
 from runner.analysis.groups import Group
 from runner.analysis.sections import Grid
 from runner.drawing import palette
-from runner.export.plots.compare import intervals_svg, letter, profile_svg
-from runner.export.plots.figure import footnote
+from runner.export.plots.comparisons import intervals_svg, letter, profile_svg
+from runner.export.plots.curves import footnote, plots_of
 from runner.export.reports.rendering import templates
-from runner.export.reports.report import curves, require_packages
+from runner.export.reports.report import require_packages
 from runner.util.humanize import UNKNOWN
 
 
@@ -46,7 +46,7 @@ def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
                 for i, group in enumerate(groups)
             ],
             metrics=[_metric(metric, labels) for metric in comparison.metrics],
-            panels=curves(groups),
+            panels=plots_of(groups),
             footnote=footnote(groups),
             runs=_runs(groups),
             explanation=EXPLANATION,

@@ -25,11 +25,12 @@ from runner.analysis.sections import Grid, Section
 from runner.drawing import svg, svg_maps
 from runner.environments.mdp import Mdp
 from runner.environments.naming import exploration_in_words, spoken, states_in_words
-from runner.export.plots.diff import tables_svg
+from runner.export.plots.comparisons import tables_svg
+from runner.export.plots.curves import Plot, plots_of
 from runner.export.reports.episode import deeds_in_words
 from runner.export.reports.maps import situation, situation_in_words
 from runner.export.reports.rendering import templates
-from runner.export.reports.report import curves, require_packages
+from runner.export.reports.report import require_packages
 from runner.recording.reader import Recording
 from runner.recording.run_file import run_title
 
@@ -239,6 +240,6 @@ def _map(mdp: Mdp, apart: NDArray[np.float64], agent: str) -> list[dict[str, Any
     return [{"svg": picture, "caption": caption, "high": bounds[1]}]
 
 
-def _curves(a: Recording, b: Recording) -> list[dict[str, Any]]:
+def _curves(a: Recording, b: Recording) -> list[Plot]:
     """Return both runs' metrics, a plot each."""
-    return curves([Group(name, (read_series(recording),)) for name, recording in (("A", a), ("B", b))])
+    return plots_of([Group(name, (read_series(recording),)) for name, recording in (("A", a), ("B", b))])

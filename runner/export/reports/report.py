@@ -11,17 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from runner.analysis.frames import evaluation_records, evaluation_summary
-from runner.analysis.groups import Group, groups_of
+from runner.analysis.groups import groups_of
 from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries, values_left_out
 from runner.analysis.summary import random_policy_sentence
 from runner.drawing import palette, svg
 from runner.environments.naming import event_in_words, spoken
-from runner.errors import RecordingError, RunnerError
+from runner.errors import RecordingError
 from runner.export.contents import flat_text, shortcomings, why_no_steps
-from runner.export.plots.figure import footnote
-from runner.export.plots.metrics import panels_of
-from runner.export.plots.svg import panel_svgs
+from runner.export.plots.curves import footnote, plots_of
 from runner.export.reports.episode import (
     Episode,
     last_whole_evaluation,
@@ -270,26 +268,14 @@ def _title(runs: Sequence[dict[str, Any]]) -> str:
 def _plots(series: Sequence[RunSeries]) -> dict[str, Any]:
     """Return the panels as SVG, what their colours mean, and what lines and bands are."""
     groups = groups_of(series)
-    panels = curves(groups)
+    panels = plots_of(groups)
     if not panels:
         return {}
     return {
         "panels": panels,
-        "groups": [
-            (i % len(palette.SERIES), palette.SERIES[i % len(palette.SERIES)], group.described)
-            for i, group in enumerate(groups)
-        ],
+        "groups": [(i % len(palette.SERIES), group.described) for i, group in enumerate(groups)],
         "footnote": footnote(groups),
     }
-
-
-def curves(groups: Sequence[Group]) -> list[dict[str, Any]]:
-    """Return the learning curves of groups of runs for a page, a plot a metric; none where no run has any."""
-    try:
-        panels = panels_of(groups)
-    except RunnerError:
-        return []
-    return panel_svgs(panels, len(groups))
 
 
 def _heading(event: str) -> str:

@@ -8,7 +8,6 @@ from statistics import median
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from matplotlib.figure import Figure
 
 from runner.analysis.frames import evaluation_records
 from runner.analysis.groups import groups_of
@@ -16,8 +15,9 @@ from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries
 from runner.cli import cli
 from runner.errors import RunnerError
-from runner.export.plots import figure as plots_figure
-from runner.export.plots.figure import draw_figure, draw_panel
+from runner.export.plots import image
+from runner.export.plots.chart import Text
+from runner.export.plots.curves import curves_sheet, panel_chart
 from runner.export.plots.metrics import panels_of
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
@@ -105,10 +105,9 @@ def test_groups_of_one_name_are_labelled_by_what_differs(pictured):
 def test_axes_are_honest(seeds, pictured):
     groups = groups_of(series(*seeds, pictured("taxis")))
     for panel in panels_of(groups):
-        axes = Figure().add_subplot()
-        draw_panel(axes, panel, len(groups))
-        low, high = axes.get_ylim()
-        assert axes.get_xlim()[0] == 0
+        chart = panel_chart(panel, len(groups))
+        low, high = chart.y.low, chart.y.high
+        assert chart.x.low == 0
         assert not panel.percent or (low == 0 and 100 <= high <= 105)
         assert not panel.at_least_zero or low == 0
         assert low <= min(curve.low.min() for curve in panel.curves)
@@ -117,8 +116,8 @@ def test_axes_are_honest(seeds, pictured):
 
 def test_the_figure_names_its_runs_and_what_bands_are(seeds, pictured):
     groups = groups_of(series(*seeds, pictured("taxis")))
-    figure = draw_figure(groups, panels_of(groups))
-    texts = [text.get_text() for text in (*figure.texts, *figure.legends[0].get_texts())]
+    sheet = curves_sheet(groups, panels_of(groups))
+    texts = [mark.text for mark in sheet.marks if isinstance(mark, Text)]
     assert any("median" in text and "lowest" in text for text in texts)
     assert all(any(run.run_id in text for text in texts) for run in (*seeds, pictured("taxis")))
 
@@ -159,7 +158,7 @@ def test_a_full_disk_is_no_fault_of_the_input(pictured, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(plots_figure, "save_figure", full)
+    monkeypatch.setattr(image, "save", full)
     result = plot(pictured("corridor", log=None).recording, "-o", tmp_path / "plot.svg")
     assert result.exit_code == 1
     assert "cannot be written (No space left on device)" in result.stderr

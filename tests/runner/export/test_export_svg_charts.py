@@ -8,8 +8,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from runner.export.plots.chart import Scale
+from runner.export.plots.curves import panel_chart
 from runner.export.plots.metrics import Curve, Panel
-from runner.export.plots.svg import Scale, panel_svg
 from runner.recording.metrics import SHARES
 
 
@@ -41,7 +42,7 @@ def lines_of(svg):
 )
 def test_a_chart_is_well_formed_and_its_lines_are_inside(curves):
     panel = Panel("mean_length", "A <title> & more", "steps", tuple(curves))
-    svg = panel_svg(panel, 1 + max(each.group for each in curves))
+    svg = panel_chart(panel, 1 + max(each.group for each in curves)).svg()
     assert "nan" not in svg
     drawn = lines_of(svg)
     assert len(drawn) == len(curves)
@@ -53,7 +54,7 @@ def test_a_long_line_keeps_every_spike():
     values = np.sin(np.arange(20_000) / 3_000)
     values[7_777] = 9.0
     values[12_345] = -9.0
-    (points,) = lines_of(panel_svg(Panel("mean_return", "Return", "reward", (curve(values),)), 1))
+    (points,) = lines_of(panel_chart(Panel("mean_return", "Return", "reward", (curve(values),)), 1).svg())
     assert len(points) < 4_000
     assert points[:, 1].min() == pytest.approx(32.0 + 114 / 22, abs=0.2)
     assert points[:, 1].max() == pytest.approx(146.0 - 114 / 22, abs=0.2)
@@ -64,7 +65,7 @@ def test_shares_are_stacked_up_to_the_top():
     panel = Panel(
         SHARES, "Shares", "percent", (curve([40.0, 10.0], line="-1"), curve([60.0, 90.0], line="5"))
     )
-    root = ElementTree.fromstring(panel_svg(panel, 1))
+    root = ElementTree.fromstring(panel_chart(panel, 1).svg())
     bands = [numbers(path.get("d")) for path in root.iter("path") if path.get("stroke") == "#ffffff"]
     assert [band[:, 1].min() for band in bands] == [pytest.approx(146 - 0.4 * 114, abs=0.1), 32.0]
     assert {text.text for text in root.iter("text")} >= {"reward of a step", "-1", "5"}

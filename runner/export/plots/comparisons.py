@@ -1,0 +1,126 @@
+"""Charts of a comparison and of a difference: intervals and profiles of groups, and distances of Q-tables.
+
+Groups have the colours and markers that they have in the learning curves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from runner.analysis.compare import GroupResult, MetricResult
+from runner.analysis.diff import TableDiff
+from runner.drawing import palette
+from runner.environments.naming import spoken
+from runner.export.plots.chart import Canvas, Chart, Scale, labelled, series_colour, series_marker
+from runner.export.plots.curves import HEIGHT, WIDTH, draw_legend
+
+_SPREAD: Final = 0.22
+"""Largest distance of the points of single seeds from their group's line, in rows."""
+_MEASURES: Final = (
+    ("largest", "largest difference", 1),
+    ("mean", "mean difference", 1),
+    ("greedy_share", "other greedy action, %", 100),
+)
+
+
+def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
+    """Return each group's seeds as points, its median as a tick, and its IQM with the 95 % interval.
+
+    Args:
+        metric: the metric that is drawn.
+        labels: the labels of all groups, in the order of their colours.
+    """
+    bottom = 30.0 + max(100.0, 30.0 * len(metric.groups))
+    drawn = [
+        value
+        for group in metric.groups
+        for value in (*group.values, group.median, group.iqm.low, group.iqm.high)
+        if math.isfinite(value)
+    ]
+    x = Scale.around(np.array(drawn), 40.0, WIDTH - 10)
+    y = Scale(len(metric.groups) - 0.4, -0.6, bottom, 30.0)
+    chart = Chart(x, y, WIDTH, bottom + 34, f"{metric.title}: values of the groups")
+    chart.x_ticks(labelled(x.ticks))
+    chart.shape([(x.start, bottom), (x.end, bottom)], stroke=palette.INK)
+    chart.text((x.start + x.end) / 2, chart.height - 5, metric.unit, "middle")
+    for row, group in enumerate(metric.groups):
+        number = labels.index(group.label)
+        chart.text(x.start - 8, y.at(row) + 3, letter(number), "end", bold=True)
+        _draw_group(chart, group, row, number)
+    return chart.svg()
+
+
+def profile_svg(metric: MetricResult, labels: list[str]) -> str:
+    """Return the share of each group's runs that are at least as good as a level, over the levels."""
+    levels = np.array(metric.thresholds)
+    is_lower_better = metric.higher_is_better is False
+    x, y = Scale.around(levels, 50.0, WIDTH - 10), Scale(0, 103, 146.0, 16.0)
+    chart = Chart(x, y, WIDTH, HEIGHT, f"{metric.title}: performance profile")
+    chart.x_ticks(labelled(x.ticks))
+    chart.y_ticks(labelled(range(0, 101, 20)))
+    sign = "at most" if is_lower_better else "at least"
+    chart.frame("", 14.0, f"{metric.unit}, {sign}", ["percent of runs"])
+    for group in metric.groups:
+        number = labels.index(group.label)
+        colour, share = series_colour(number), 100 * np.array(group.profile)
+        low, high = 100 * np.array(group.profile_low), 100 * np.array(group.profile_high)
+        chart.band(levels, low, high, colour, opacity=0.2)
+        steps, heights = np.repeat(levels, 2), np.repeat(share, 2)
+        if is_lower_better:  # a share holds from its level on, else up to it
+            chart.line(steps[1:], heights[:-1], colour)
+        else:
+            chart.line(steps[:-1], heights[1:], colour)
+        every = slice(None, None, max(len(levels) // 8, 1))
+        chart.markers(levels[every], share[every], colour, series_marker(number), 1.7)
+    return chart.svg()
+
+
+def tables_svg(tables: Sequence[TableDiff]) -> str:
+    """Return the largest and the mean difference, and the share of other greedy actions, over episodes."""
+    agents = list(dict.fromkeys(table.agent for table in tables))
+    colours = [series_colour(2 + i % 3) for i in range(len(agents))]
+    last = max(table.episode for table in tables) or 1
+    canvas = Canvas(WIDTH, 270.0, "Difference of the Q-tables over training episodes")
+    for row, (name, label, factor) in enumerate(_MEASURES):
+        high = factor * max(getattr(table, name) for table in tables) * 1.06 or 1.0
+        is_last = row == len(_MEASURES) - 1
+        x, y = Scale(0.0, last * 1.02, 50.0, WIDTH - 10), Scale(0.0, high, 84.0, 32.0)
+        chart = Chart(x, y, WIDTH, 119.0, "")
+        chart.x_ticks([(tick, text if is_last else "") for tick, text in labelled(x.ticks)])
+        chart.y_ticks(labelled(y.ticks[:: 1 if len(y.ticks) < 5 else 2]))
+        chart.frame(label, 27.0, "training episodes" if is_last else "")
+        for i, agent in enumerate(agents):
+            own = [(table.episode, factor * getattr(table, name)) for table in tables if table.agent == agent]
+            episodes, values = np.array(own, np.float64).T
+            chart.line(episodes, values, colours[i], i)
+            chart.markers(episodes, values, colours[i], i, 1.6)
+        canvas.place(chart, 0, 76.0 * row)
+    if len(agents) > 1:
+        legend = Chart(Scale(0, 1, 150.0, WIDTH), Scale(0, 1, 100.0, 32.0), WIDTH, 0, "")
+        draw_legend(legend, [spoken(agent) for agent in agents], colours)
+        canvas.place(legend, 0, 0)
+    return canvas.svg()
+
+
+def letter(number: int) -> str:
+    """Return the letter of a group: A, B, ...; its number if there are more than 26."""
+    return chr(ord("A") + number) if number < 26 else str(number + 1)
+
+
+def _draw_group(chart: Chart, group: GroupResult, row: int, number: int) -> None:
+    colour, height = series_colour(number), chart.y.at(row)
+    values = np.array([value for value in group.values if math.isfinite(value)])
+    spread = np.linspace(-1, 1, len(values)) if len(values) > 1 else np.zeros(len(values))
+    chart.markers(values, row + _SPREAD * spread, colour, 0, 1.2, opacity=0.45)
+    if math.isfinite(group.median):
+        median = chart.x.at(group.median)
+        chart.shape([(median, height - 7.5), (median, height + 7.5)], stroke=palette.INK, width=1.6)
+    if all(map(math.isfinite, (group.iqm.value, group.iqm.low, group.iqm.high))):
+        ends = [(chart.x.at(end), height) for end in (group.iqm.low, group.iqm.high)]
+        chart.shape(ends, stroke=colour, width=3.4)
+        middle = np.array([group.iqm.value]), np.array([float(row)])
+        chart.markers(*middle, colour, series_marker(number), 3.0, edge=palette.INK)

@@ -1,0 +1,186 @@
+"""Learning curves of groups of runs: a chart for each metric, and all of them on one sheet for print.
+
+Groups differ in colour and marker, the lines of a group in their dashes, so that nothing relies on colour
+alone. Percent goes from 0 to 100, and what cannot be negative starts at zero.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from runner.analysis.groups import Group
+from runner.analysis.series import is_loop, values_left_out
+from runner.drawing import palette
+from runner.environments.naming import spoken
+from runner.errors import RunnerError
+from runner.export.plots.chart import (
+    SMALL,
+    Canvas,
+    Chart,
+    Scale,
+    labelled,
+    series_colour,
+    series_marker,
+)
+from runner.export.plots.metrics import Curve, Panel, panels_of
+from runner.recording.metrics import SHARES
+
+WIDTH: Final = 288.0
+HEIGHT: Final = 180.0
+_TOP: Final = 32.0
+_BOTTOM: Final = 146.0
+_LETTER: Final = 0.56
+"""Width of an average letter, as a share of the text's size."""
+_LETTERS: Final = 230
+"""Letters of a note that fit on a line of a sheet of three columns."""
+
+
+class Plot(NamedTuple):
+    """A chart in a page."""
+
+    title: str
+    svg: str
+    wide: bool
+    """Whether it takes a whole row."""
+
+
+def plots_of(groups: Sequence[Group]) -> list[Plot]:
+    """Return the learning curves of groups of runs for a page; none where no run has a metric."""
+    try:
+        panels = panels_of(groups)
+    except RunnerError:
+        return []
+    return panel_plots(panels, len(groups))
+
+
+def panel_plots(panels: Sequence[Panel], groups: int) -> list[Plot]:
+    """Return panels of a number of groups for a page."""
+    return [Plot(panel.title, panel_chart(panel, groups).svg(), panel.metric == SHARES) for panel in panels]
+
+
+def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel]) -> Canvas:
+    """Return all panels on one sheet, with a legend of the groups above and notes below."""
+    columns = min(3, len(panels))
+    narrow = [panel for panel in panels if panel.metric != SHARES]
+    wide = [panel for panel in panels if panel.metric == SHARES]
+    width = WIDTH * max(columns, 2)
+    notes = textwrap.wrap(footnote(groups), round(_LETTERS * width / (3 * WIDTH)))
+    head = 32.0 + 14 * len(groups)
+    rows = math.ceil(len(narrow) / columns) + len(wide)
+    sheet = Canvas(width, head + HEIGHT * rows + 8 + 10 * len(notes), "Metrics over training episodes")
+    sheet.text(10, 20, sheet.title, size=13, bold=True)
+    for number, group in enumerate(groups):
+        colour, y = series_colour(number), 36.0 + 14 * number
+        key = Chart(Scale(0, 1, 12, 36), Scale(0, 1, y, y - 6), 0, 0, "")
+        key.line(np.array([0.0, 1.0]), np.array([0.5, 0.5]), colour)
+        key.markers(np.array([0.5]), np.array([0.5]), colour, series_marker(number), 2)
+        sheet.place(key, 0, 0)
+        sheet.text(42, y, group.described)
+    for number, panel in enumerate(narrow):
+        row, column = divmod(number, columns)
+        sheet.place(panel_chart(panel, len(groups)), WIDTH * column, head + HEIGHT * row)
+    for number, panel in enumerate(wide):
+        sheet.place(panel_chart(panel, len(groups)), 0, head + HEIGHT * (rows - len(wide) + number))
+    for number, line in enumerate(notes):
+        sheet.text(10, sheet.height - 10 * (len(notes) - number) + 2, line, size=SMALL)
+    return sheet
+
+
+def footnote(groups: Sequence[Group]) -> str:
+    """Return what lines and bands mean, and which values are not drawn."""
+    runs = [run for group in groups for run in group.runs]
+    left_out = "".join(f" {sentence}" for sentence in values_left_out(runs))
+    loops = any(is_loop(run) for run in runs)
+    greedy = "" if loops else " Evaluation trials follow the greedy policy: no exploring."
+    if max(len(group.runs) for group in groups) == 1:
+        return f"Each line is one run, as reported.{greedy}{left_out}"
+    between = " Between its points a run is interpolated." if loops else ""
+    return (
+        "Lines: median over the runs of a configuration that have come as far; bands: from the lowest run to "
+        f"the highest.{between}{greedy}{left_out}"
+    )
+
+
+def panel_chart(panel: Panel, groups: int) -> Chart:
+    """Return the chart of a metric: curves of groups of runs over training episodes."""
+    is_shares = panel.metric == SHARES
+    last = max(float(curve.episodes.max()) for curve in panel.curves) or 1.0
+    x = Scale(0.0, last * 1.02, 50.0, 461.0 if is_shares else 280.0)
+    y = _y_scale(panel)
+    width = 2 * WIDTH if is_shares else WIDTH
+    chart = Chart(x, y, width, HEIGHT, f"{panel.title} over training episodes")
+    has_legend = len(panel.lines) > 1 and not is_shares
+    largest = max(float(np.abs([curve.low, curve.high]).max()) for curve in panel.curves)
+    if is_shares:
+        _draw_shares(chart, panel)
+    chart.x_ticks(labelled([tick for tick in x.ticks if tick == int(tick)]))
+    chart.y_ticks(labelled(range(0, 101, 20) if panel.percent else y.ticks, largest >= 10_000))
+    chart.frame(panel.title, 14.0 if has_legend else 25.0, "training episodes", [panel.unit])
+    if is_shares:
+        return chart
+    if not panel.percent and not panel.at_least_zero:
+        chart.shape([(x.start, y.at(0)), (x.end, y.at(0))], stroke=palette.INK, width=0.6)
+    for curve in panel.curves:
+        _draw_curve(chart, panel, curve, groups)
+    if has_legend:
+        colours = [series_colour(i) if groups == 1 else palette.INK for i in range(len(panel.lines))]
+        draw_legend(chart, [spoken(line) or "all" for line in panel.lines], colours)
+    return chart
+
+
+def draw_legend(chart: Chart, names: Sequence[str], colours: Sequence[str]) -> None:
+    """Name lines above the axes of a chart, each with its colour and its dashes."""
+    at, y = chart.x.start, chart.y.end - 8
+    for number, (name, colour) in enumerate(zip(names, colours, strict=True)):
+        chart.shape([(at, y), (at + 18, y)], stroke=colour, width=1.5, dash=number)
+        chart.text(at + 22, y + 2.8, name, size=SMALL)
+        at += 32 + len(name) * SMALL * _LETTER
+
+
+def _y_scale(panel: Panel) -> Scale:
+    low = min(float(curve.low.min()) for curve in panel.curves)
+    high = max(float(curve.high.max()) for curve in panel.curves)
+    if panel.percent:
+        low, high = 0.0, 100.0 if panel.metric == SHARES else 103.0
+    elif panel.at_least_zero:
+        low, high = 0.0, high * 1.06 or 1.0
+    else:
+        low, high = min(low, 0.0), max(high, 0.0)
+        low, high = low - 0.05 * (high - low), high + 0.05 * (high - low)
+    return Scale(low, high, _BOTTOM, _TOP)
+
+
+def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int) -> None:
+    line = panel.lines.index(curve.line)
+    number = line if groups == 1 and len(panel.lines) > 1 else curve.group
+    colour = series_colour(number)
+    if (curve.high > curve.low).any():
+        chart.band(curve.episodes, curve.low, curve.high, colour, opacity=0.2)
+    chart.line(curve.episodes, curve.median, colour, line)
+    every = slice(None, None, max(len(curve.episodes) // 8, 1))
+    chart.markers(curve.episodes[every], curve.median[every], colour, series_marker(number), 1.7)
+
+
+def _draw_shares(chart: Chart, panel: Panel) -> None:
+    """Draw shares of a whole on top of each other, the lowest reward darkest and at the bottom."""
+    episodes = panel.curves[0].episodes
+    bottom = np.zeros_like(panel.curves[0].median)
+    colours = palette.ramp_colours(len(panel.curves))
+    for curve, colour in zip(panel.curves, colours, strict=True):
+        top = bottom + np.interp(episodes, curve.episodes, curve.median)
+        chart.band(episodes, bottom, top, colour, stroke=palette.WHITE, width=0.3)
+        bottom = top
+    left = chart.x.end + 10
+    chart.text(left, chart.y.end + 4, "reward of a step", size=8)
+    rows = math.ceil(len(colours) / (2 if len(colours) > 8 else 1))
+    entries = reversed(list(zip(panel.curves, colours, strict=True)))
+    for number, (curve, colour) in enumerate(entries):
+        column, row = divmod(number, rows)
+        x, y = left + 50 * column, chart.y.end + 10 + 104 / max(rows, 8) * row
+        chart.shape([(x, y), (x + 14, y), (x + 14, y + 7), (x, y + 7)], fill=colour)
+        chart.text(x + 18, y + 6.5, curve.line, size=SMALL)
