@@ -92,7 +92,7 @@ def measure_many(count: int) -> list[Figure]:
             ]
 
         return [
-            *measured("reindex", *command("reindex")),
+            *measured("reindex", *command("index", "rebuild")),
             *measured("first du", *command("du")),
             *measured("du", *command("du"), times=3),
             *measured("what /disk calls", sys.executable, "-c", DISK, times=3),

@@ -74,7 +74,7 @@ def run_all(
     name: str | None = None,
     recordings: str | os.PathLike[str] | None = None,
     report: Callable[[Progress], None] = lambda _: None,
-    at_once: int = 1,
+    workers: int = 1,
 ) -> Iterator[Run]:
     """Yield the runs of an experiment in the order of its seeds; arguments and errors as for `run`.
 
@@ -84,14 +84,14 @@ def run_all(
         name: as for `run`.
         recordings: as for `run`.
         report: as for `run`; with several at once it is called from their threads.
-        at_once: how many runs learn side by side, each on a thread. What they record is the same.
+        workers: number of runs to train in parallel, one thread each. What they record is the same.
     """
-    if at_once < 1:
-        raise ConfigError(f"at_once: found {at_once}, expected 1 or more.")
+    if workers < 1:
+        raise ConfigError(f"workers: found {workers}, expected 1 or more.")
     experiment = experiment_of(config, overrides)
-    if at_once == 1:
+    if workers == 1:
         return _run_jobs(experiment, name, recordings, report)
-    return _run_parallel(experiment, name, recordings, report, at_once)
+    return _run_parallel(experiment, name, recordings, report, workers)
 
 
 def experiment_of(config: Config, overrides: Sequence[str] = (), seed: int | None = None) -> ExperimentConfig:
@@ -125,7 +125,7 @@ def run_parallel(
     jobs: Iterable[Job],
     folder: Path,
     name: str | None,
-    at_once: int,
+    workers: int,
     stop: Callable[[], bool],
     report: Callable[[Progress], None] = lambda _: None,
 ) -> Iterator[Run]:
@@ -152,11 +152,11 @@ def run_parallel(
             return run_job(job, run, report, stopped)
 
     under_way: deque[Future[Run | None]] = deque()
-    with ThreadPoolExecutor(at_once, thread_name_prefix="learner") as threads:
+    with ThreadPoolExecutor(workers, thread_name_prefix="learner") as threads:
         try:
             for job in jobs:
                 under_way.append(threads.submit(do, job))
-                if len(under_way) == 2 * at_once and (run := under_way.popleft().result()):
+                if len(under_way) == 2 * workers and (run := under_way.popleft().result()):
                     yield run
             yield from (run for each in under_way if (run := each.result()))
         finally:
@@ -226,11 +226,11 @@ def _run_parallel(
     name: str | None,
     recordings: str | os.PathLike[str] | None,
     report: Callable[[Progress], None],
-    at_once: int,
+    workers: int,
 ) -> Iterator[Run]:
     called, folder = checked_name(name), recordings_folder(recordings)
     with interruptible() as interrupt:
-        for run in run_parallel(jobs_in(config, folder), folder, called, at_once, interrupt, report):
+        for run in run_parallel(jobs_in(config, folder), folder, called, workers, interrupt, report):
             if interrupt.came:
                 raise KeyboardInterrupt(f"runs were interrupted; what they recorded is in {folder}")
             yield run

@@ -17,16 +17,34 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
+from enum import IntEnum
 from typing import Final, NamedTuple
 
 MAX_MESSAGE: Final = 10_000
 """Characters of an error that are kept with a run."""
 
 
-class RunnerError(Exception):
-    """Base of every error that is a user's to mend; `exit_code` is what a command ends with."""
+class ExitCode(IntEnum):
+    """The exit codes of all commands; `dualtaxi --help` lists them with these explanations."""
 
-    exit_code = 2
+    explanation: str
+
+    def __new__(cls, code: int, explanation: str) -> ExitCode:
+        """Make a code with its explanation."""
+        member = int.__new__(cls, code)
+        member._value_, member.explanation = code, explanation
+        return member
+
+    OK = 0, "success"
+    DIFFERENT = 1, "something differs or was found; a disk is full; a server does not answer"
+    USAGE = 2, "wrong usage or input"
+    INTERRUPTED = 130, "interrupted"
+
+
+class RunnerError(Exception):
+    """Base of all errors that a user can correct; commands exit with `exit_code`."""
+
+    exit_code: int = ExitCode.USAGE
 
 
 class Located(NamedTuple):
@@ -57,7 +75,7 @@ class RecordingError(RunnerError):
 class Diverged(RunnerError):
     """A recording differs from what its job gives; the first difference stands in the attributes."""
 
-    exit_code = 1
+    exit_code = ExitCode.DIFFERENT
 
     def __init__(
         self,
@@ -85,7 +103,7 @@ class RunNotFound(RunnerError):
 class StorageError(RunnerError):
     """A file or folder cannot be written, or the disk is full."""
 
-    exit_code = 1
+    exit_code = ExitCode.DIFFERENT
 
 
 class MissingExtra(RunnerError):

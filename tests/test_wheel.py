@@ -87,12 +87,12 @@ def test_the_first_ten_minutes_need_no_clone(python: Path, folder: Path) -> None
     dualtaxi("run", "quick", *SHORT, "--seed", "1", "--name", "other")
     assert dualtaxi("diff", "quick@latest", "other@latest", "--first", code=1)
 
-    names = [each["name"] for each in json.loads(dualtaxi("config", "ls", "--json"))]
+    names = [each["name"] for each in json.loads(dualtaxi("config", "ls", "--json"))["configs"]]
     assert {"quick", "hyperparameters"} <= set(names)
     assert len(names) == len([*ROOT.glob("configs/**/*.yaml")])
     dualtaxi("config", "copy", "quick", "-o", "mine.yaml")
     dualtaxi("run", "mine.yaml", *SHORT)
-    dualtaxi("sweep", "modes", "--dry-run")
+    dualtaxi("sweep", "run", "modes", "--dry-run")
     dualtaxi("init", "start")
     typed(python, folder / "start", "run", "configs/quick.yaml", *SHORT)
     assert len([*(folder / "start" / "recordings").glob("*/recording.mcap")]) == 1

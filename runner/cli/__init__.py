@@ -17,77 +17,55 @@ from typing import Any, Final
 
 import click
 
-from runner.errors import ConfigError, Located, RunnerError, StorageError, nearest
+from runner.errors import ConfigError, ExitCode, Located, RunnerError, StorageError, nearest
 from runner.util.version import __version__
 
-COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
+COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Run": {
-        "run": ("runner.cli.commands.run", "Train, evaluate and record an experiment."),
-        "sweep": ("runner.cli.commands.sweep", "Run an experiment with many values, and rank them."),
-        "resume": (
-            "runner.cli.commands.resume",
-            "Resume an interrupted run, to the same content as an undisturbed one.",
-        ),
-        "evaluate": ("runner.cli.commands.evaluate", "Evaluate a run's Q-table at any step in new episodes."),
-        "rerecord": (
-            "runner.cli.commands.rerecord",
-            "Record the steps of a run that was recorded without them.",
-        ),
+        "run": "Train, evaluate and record an experiment.",
+        "sweep": "Run an experiment with many values, and rank them.",
+        "resume": "Resume an interrupted run, to the same content as an undisturbed one.",
+        "evaluate": "Evaluate a run's Q-table at any step in new episodes.",
+        "rerecord": "Record the steps of a run that was recorded without them.",
     },
     "Inspect": {
-        "ls": ("runner.cli.commands.ls", "List the recorded runs."),
-        "show": ("runner.cli.commands.show", "Show a run: evaluations, tables, configuration."),
-        "play": ("runner.cli.commands.play", "Replay a recorded episode in the terminal."),
-        "view": ("runner.cli.commands.view", "Open runs in the Rerun viewer."),
-        "plot": ("runner.cli.commands.plot", "Draw every metric of one or several runs over episodes."),
-        "report": ("runner.cli.commands.report", "Write one self-contained page about one or several runs."),
-        "export": ("runner.cli.commands.export", "Export a run for other programs."),
-        "qtable": ("runner.cli.commands.qtable", "Show the exact Q-table of a run at any step."),
-        "table": ("runner.cli.commands.table", "Print an environment's transition table with names."),
-    },
-    "Compare": {
-        "diff": ("runner.cli.commands.diff", "Show what differs between two runs, and where they diverge."),
-        "compare": ("runner.cli.commands.compare", "Compare groups of runs, with statistics over seeds."),
+        "ls": "List the recorded runs.",
+        "show": "Show a run: evaluations, tables, configuration.",
+        "play": "Replay a recorded episode in the terminal.",
+        "view": "Open runs in the Rerun viewer.",
+        "plot": "Draw every metric of one or several runs over episodes.",
+        "report": "Write one self-contained page about one or several runs.",
+        "diff": "Show what differs between two runs, and where they diverge.",
+        "compare": "Compare groups of runs, with statistics over seeds.",
+        "verify": "Check every step of a run by training it again.",
+        "qtable": "Show the exact Q-table of a run at any step.",
+        "table": "Print an environment's transition table with names.",
     },
     "Manage": {
-        "tag": ("runner.cli.commands.tag", "Add tags to a run, or remove them."),
-        "note": ("runner.cli.commands.note", "Write a note on a run."),
-        "rename": ("runner.cli.commands.rename", "Rename a run."),
-        "du": ("runner.cli.commands.du", "Show what uses disk space, and what could be freed."),
-        "rm": ("runner.cli.commands.rm", "Remove runs."),
-        "prune": ("runner.cli.commands.prune", "Remove old, unfinished or unwanted runs."),
-        "reindex": ("runner.cli.commands.reindex", "Rebuild the index of runs."),
-    },
-    "Check": {
-        "verify": ("runner.cli.commands.verify", "Check every step of a run by training it again."),
-        "repair": ("runner.cli.commands.repair", "Repair a damaged recording, and report what was lost."),
+        "label": "Change the name, note and tags of a run.",
+        "rm": "Remove runs.",
+        "prune": "Remove old, unfinished or unwanted runs.",
+        "du": "Show what uses disk space, and what could be freed.",
+        "repair": "Repair a damaged recording, and report what was lost.",
+        "index": "Rebuild the index of runs.",
+        "init": "Create a folder to start in, with the shipped experiments.",
+        "config": "List, copy and check configurations; print their schema.",
+        "completion": "Print the completion script of a shell.",
     },
     "Archive": {
-        "archive": ("runner.cli.commands.archive", "Archive runs as Parquet files, losslessly."),
-        "restore": ("runner.cli.commands.restore", "Restore the recording of an archived run."),
+        "archive": "Archive runs as Parquet files, losslessly.",
+        "restore": "Restore the recording of an archived run.",
     },
     "Share": {
-        "import": (
-            "runner.cli.commands.import_",
-            "Import a recording into the folder of runs.",
-        ),
-        "push": ("runner.cli.commands.push", "Upload runs to a server."),
-        "pull": ("runner.cli.commands.pull", "Download a run from a server."),
-        "submit": ("runner.cli.commands.submit", "Submit an experiment or a sweep to a server."),
-    },
-    "Serve": {
-        "serve": ("runner.cli.commands.serve", "Serve the runs to browsers and programs over HTTP."),
-        "token": ("runner.cli.commands.token", "Create, list and revoke access tokens of a server."),
-    },
-    "Set up": {
-        "init": ("runner.cli.commands.init", "Create a folder to start in, with the shipped experiments."),
-        "config": ("runner.cli.commands.config", "List, copy and check configurations; print their schema."),
-        "completion": ("runner.cli.commands.completion", "Print the completion script of a shell."),
+        "export": "Export a run for other programs.",
+        "import": "Import a recording into the folder of runs.",
+        "remote": "Upload and download runs; submit and control jobs.",
+        "serve": "Serve the runs to browsers and programs over HTTP.",
+        "token": "Create, list and revoke access tokens of a server.",
     },
 }
-"""Section -> command -> its module, which has it as `command`, and its short help."""
+"""Section -> command -> its short help."""
 
-INTERRUPTED: Final = 130
 _DISK_FULL: Final = tuple(getattr(errno, name) for name in ("ENOSPC", "EDQUOT") if hasattr(errno, name))
 
 _WRONG_PLACE: Final = (
@@ -104,7 +82,7 @@ _WRONG_PLACE: Final = (
 """Of errors in writing: the place was the wrong one, not the disk full or broken."""
 _AS_JSON: Final = "runner.as_json"
 
-_EPILOG = """\b
+_EPILOG = f"""\b
 First steps:
   dualtaxi run quick        learn for a second, recording every step
   dualtaxi show @latest     evaluations, tables and configuration of that run
@@ -119,12 +97,9 @@ A RUN is named by its id, a prefix of it, its name, a path, or @latest
 \b
 Results go to stdout, everything else to stderr; NO_COLOR is respected.
 With --json an error is an object in the last line of stderr:
-  {"error": {"message": "...", "exit_code": 2, "problems": [...]}}
+  {{"error": {{"message": "...", "exit_code": 2, "problems": [...]}}}}
 Exit codes:
-  0    fine
-  1    something differs or was found; a disk is full; a server does not answer
-  2    wrong usage or input
-  130  interrupted
+{chr(10).join(f"  {code:<4} {code.explanation}" for code in ExitCode)}
 """
 
 
@@ -180,36 +155,40 @@ def error_as_json(message: str, exit_code: int, problems: Sequence[Located] = ()
     return json.dumps({"error": {"message": message, "exit_code": exit_code, **more, "problems": located}})
 
 
-class LazyGroup(click.Group):
+class Group(click.Group):
+    """A group of commands that suggests the nearest name for an unknown one."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find a command, or suggest one."""
+        known = self.list_commands(ctx)
+        if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
+            ctx.fail(f"there is no command {args[0]!r}.{nearest(args[0], known)}")
+        return super().resolve_command(ctx, args)
+
+
+class LazyGroup(Group):
     """The commands of `COMMANDS`, imported one by one when asked for."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """Return the names, section by section."""
         return [name for section in COMMANDS.values() for name in section]
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command."""
-        for section in COMMANDS.values():
-            if cmd_name in section:
-                command: click.Command = importlib.import_module(section[cmd_name][0]).command
-                return command
-        return None
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command that is meant, or suggest one."""
-        known = self.list_commands(ctx)
-        if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
-            ctx.fail(f"there is no command {args[0]!r}.{nearest(args[0], known)}")
-        return super().resolve_command(ctx, args)
+        if cmd_name not in self.list_commands(ctx):
+            return None
+        module = "import_" if cmd_name == "import" else cmd_name
+        command: click.Command = importlib.import_module(f"runner.cli.commands.{module}").command
+        return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections of commands, from their short help alone."""
         width = max(len(name) for name in self.list_commands(ctx))
         for title, section in COMMANDS.items():
             with formatter.section(title):
-                formatter.write_dl([(f"{name:{width}}", text) for name, (_, text) in section.items()])
+                formatter.write_dl([(f"{name:{width}}", text) for name, text in section.items()])
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; what a user can mend, or wanted, is no traceback."""
@@ -217,10 +196,10 @@ class LazyGroup(click.Group):
             result = self._invoke(ctx)
             sys.stdout.flush()
         except (KeyboardInterrupt, click.Abort):
-            raise click.exceptions.Exit(INTERRUPTED) from None
+            raise click.exceptions.Exit(ExitCode.INTERRUPTED) from None
         except BrokenPipeError:
             _forget_stdout()
-            raise click.exceptions.Exit(0) from None
+            raise click.exceptions.Exit(ExitCode.OK) from None
         except OSError as error:
             if error.errno not in _DISK_FULL:
                 raise

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from runner.cli.options import all_option
 from runner.cli.output import say
 from runner.cli.parameters import EpisodeRanges, NumberList
 
@@ -17,14 +18,13 @@ if TYPE_CHECKING:
 def choice_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that choose steps."""
     for option in (
-        click.option("--all", "everything", is_flag=True, help="Every step of the run."),
+        all_option,
         click.option("--every", type=click.IntRange(1), metavar="N", help="Every Nth training episode."),
         click.option(
-            "--eval",
-            "evaluations",
+            "--evaluations",
             type=NumberList(),
             metavar="N[,N]",
-            help="The trials of the evaluation after N training episodes.",
+            help="The trials of the evaluations after N training episodes.",
         ),
         click.option(
             "--episodes",

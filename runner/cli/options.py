@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
 
@@ -70,33 +71,46 @@ trial_option: Final = click.option(
     help="A trial, counted from 0, of the evaluation after N training episodes.",
 )
 
-token_option: Final = click.option(
-    "--token",
-    metavar="TOKEN",
-    help="The access token.  [default: $DUALTAXI_TOKEN, or the file $DUALTAXI_TOKEN_FILE]",
-)
+force_option: Final = click.option("--force", is_flag=True, help="Replace existing output.")
 
-token_file_option: Final = click.option(
-    "--token-file",
-    type=click.Path(dir_okay=False, path_type=Path),
-    metavar="FILE",
-    help="A file with the token; unlike --token, no other user can see it.",
-)
+markdown_option: Final = click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
 
-server_option: Final = click.option(
-    "--server",
-    metavar="URL",
-    envvar="DUALTAXI_SERVER",
-    help="The server, such as http://localhost:8000.  [default: $DUALTAXI_SERVER]",
+all_option: Final = click.option(
+    "--all", "everything", is_flag=True, help="Include everything, not only a selection."
 )
 
 
-def required(server: str | None) -> str:
-    """Return the server that was named.
+def limit_option(default: int | None, described: str = "") -> Callable[[Callable[..., Any]], Any]:
+    """Return the option --limit: the maximum number of rows, 0 for all."""
+    return click.option(
+        "--limit",
+        type=click.IntRange(min=0),
+        default=default,
+        show_default=described or default is not None,
+        metavar="N",
+        help="Maximum number of rows, 0 for all.",
+    )
 
-    Raises:
-        UsageError: none was.
-    """
-    if not server:
-        raise click.UsageError("missing option '--server', such as --server http://localhost:8000.")
-    return server
+
+def workers_option(default: int | None, described: str = "") -> Callable[[Callable[..., Any]], Any]:
+    """Return the option --workers: the number of runs done in parallel."""
+    return click.option(
+        "--workers",
+        type=click.IntRange(1, 1024),
+        default=default,
+        show_default=described or True,
+        metavar="N",
+        help="Number of runs to do in parallel.",
+    )
+
+
+def target_option(multiple: bool) -> Callable[[Callable[..., Any]], Any]:
+    """Return the option --target: a level of a metric, and when a run first reaches it."""
+    return click.option(
+        "--target",
+        "targets" if multiple else "target",
+        multiple=multiple,
+        metavar="METRIC=LEVEL",
+        help="Compare when this level is first reached, such as success_percent=80"
+        + ("; may be repeated." if multiple else "."),
+    )

@@ -24,7 +24,7 @@ __all__ = [
     "draw",
     "duration",
     "facts",
-    "json_lines",
+    "json_list",
     "number",
     "print_json",
     "say",
@@ -45,17 +45,18 @@ def print_json(value: Any, indent: int | None = 1) -> None:
     click.echo(json.dumps(finite(value), indent=indent, allow_nan=False))
 
 
-def json_lines(rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield the text of a JSON array of objects in parts, so that it never has to be in memory as a whole.
+def json_list(name: str, rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield the text of a JSON object with one named list in parts, so that it is never in memory as a whole.
 
     Each value stands on a line of its own.
     """
-    encode = json.JSONEncoder(allow_nan=False, separators=(",\n  ", ": ")).encode  # indent= is far slower
-    separator = "["
+    encode = json.JSONEncoder(allow_nan=False, separators=(",\n   ", ": ")).encode  # indent= is far slower
+    yield f'{{\n "{name}": ['
+    separator = ""
     for row in rows:
-        yield separator + "\n {\n  " + encode(finite(row))[1:-1] + "\n }"
+        yield separator + "\n  {\n   " + encode(finite(row))[1:-1] + "\n  }"
         separator = ","
-    yield "[]\n" if separator == "[" else "\n]\n"
+    yield "\n ]\n}\n" if separator else "]\n}\n"
 
 
 def say(text: str) -> None:

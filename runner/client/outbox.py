@@ -114,7 +114,7 @@ class Follower:
         except RunnerError as error:
             warnings.warn(
                 f"run {run.run_id} was not pushed: {error} It is kept in {run.folder}; "
-                "`dualtaxi push --outbox` sends it.",
+                "`dualtaxi remote push --outbox` sends it.",
                 stacklevel=4,
             )
         finally:

@@ -72,7 +72,7 @@ def from_text(text: str, source: str, overrides: Sequence[str] = ()) -> Experime
         raise ConfigError(f"{source}:1:1: the file is empty, expected at least `episodes`")
     if isinstance(document.value, Mapping) and {"base", "parameters"} <= document.value.keys():
         raise ConfigError(
-            f"{source}: found a sweep, expected an experiment: `dualtaxi sweep {source}` runs it."
+            f"{source}: found a sweep, expected an experiment: `dualtaxi sweep run {source}` runs it."
         )
     return experiment_in(document, overrides, stem, named_by=f"the file's name, {stem!r},")
 

@@ -30,7 +30,7 @@ class Shipped(NamedTuple):
     @property
     def command(self) -> str:
         """What runs it."""
-        return f"dualtaxi {'sweep' if self.kind == 'sweep' else 'run'} {self.name}"
+        return f"dualtaxi {'sweep run' if self.kind == 'sweep' else 'run'} {self.name}"
 
 
 def shipped_folder() -> Path:

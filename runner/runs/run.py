@@ -15,7 +15,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
@@ -27,7 +27,7 @@ from runner.recording.labels import Labels, change_labels, read_labels
 from runner.recording.liveness import lives, owner
 from runner.recording.run_file import RUN_ID, ArchiveReference, RunFile, Summary, parse_run_file, run_title
 from runner.util.files import read_object, storage_errors, write_object
-from runner.util.values import as_utf8, is_utf8
+from runner.util.values import as_utf8, checked_run_name, is_utf8
 
 if TYPE_CHECKING:  # listing runs is to be quick
     from runner.config import ExperimentConfig
@@ -361,16 +361,41 @@ def runs_in(folder: Path) -> Iterator[Run]:
             yield _from_recording(folder / RECORDING_FILE)
 
 
-def relabel(run: Run, change: Callable[[Labels], Labels]) -> Labels:
-    """Change what people say of a run, beside its recording, and return it.
+def label(
+    run: Run,
+    name: str | None = None,
+    note: str | None = None,
+    tag: Iterable[str] = (),
+    untag: Iterable[str] = (),
+) -> Labels:
+    """Change the labels of a run, and return them.
+
+    Args:
+        run: the run, in a folder of its own.
+        name: its new name; empty restores the original one, None keeps the present one.
+        note: its new note; empty removes it, None keeps the present one.
+        tag: tags to add.
+        untag: tags to remove.
 
     Raises:
-        RunnerError: its recording stands alone, or what is to be said cannot be.
+        ConfigError: the name is not valid.
+        RunnerError: the recording is not in a folder of its own, a tag is not valid, or there are too many.
+        StorageError: the run's folder cannot be written.
     """
     if run.stands_alone:
         raise RunnerError(
             f"{run.recording}: found a recording that stands alone, expected a run in a folder of its own."
         )
+    if name:
+        checked_run_name(name)
+
+    def change(labels: Labels) -> Labels:
+        return Labels(
+            labels.name if name is None else "" if name == run.file.name else name,
+            tuple(sorted({*labels.tags, *tag} - {*untag})),
+            labels.note if note is None else note.strip(),
+        )
+
     return change_labels(run.folder, change)
 
 

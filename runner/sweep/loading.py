@@ -12,7 +12,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from runner.config import ConfigError, ExperimentConfig, load
-from runner.config.document import Document, Problem, read_yaml
+from runner.config.document import Document, Problem, read_yaml, write_yaml
 from runner.config.loading import experiment_in, put, read_text
 from runner.config.model import SECTION_OF
 from runner.config.problems import found, problems_in, refuse
@@ -65,6 +65,19 @@ def from_values(values: Mapping[str, Any]) -> Sweep:
         ConfigError: they do not.
     """
     return _sweep(Document(dict(values)), None, "sweep", Path())
+
+
+def self_contained_text(path: str | os.PathLike[str]) -> str:
+    """Return the text of an experiment or a sweep, with a base that is another file written out.
+
+    Raises:
+        ConfigError: the file or its base cannot be read.
+    """
+    text = read_text(Path(path))
+    values = read_yaml(text, str(path)).value
+    if isinstance(values, Mapping) and isinstance(values.get("base"), str):
+        return write_yaml(load_sweep(path).to_mapping())
+    return text
 
 
 @cache

@@ -47,7 +47,7 @@ def read_sweep(name: str, recordings: Path) -> Sweep:
     """
     known = sweeps_in(recordings)
     if name not in known:
-        listed = f" There are {', '.join(known)}." if known else " `dualtaxi sweep FILE` begins one."
+        listed = f" There are {', '.join(known)}." if known else " `dualtaxi sweep run FILE` starts one."
         raise RunnerError(f"no sweep {name!r} in {recordings}.{nearest(name, known) or listed}")
     path = folder_of(name, recordings) / FILE
     try:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.finding import find_all_recorded
-from runner.cli.options import json_option, recordings_option, runs_argument
+from runner.cli.options import json_option, markdown_option, recordings_option, runs_argument, target_option
 from runner.cli.output import print_json, say
 from runner.cli.sections import print_sections, require_one_form, require_page
 
@@ -35,15 +35,11 @@ if TYPE_CHECKING:
     default="last",
     show_default=True,
     metavar="last|best|area|EPISODE",
-    help="The last evaluation, each run's best, the mean over training, or the evaluation after EPISODE.",
+    help="The point in training: the last evaluation, each run's best, the mean over all, or after EPISODE.",
 )
-@click.option(
-    "--target",
-    metavar="METRIC=LEVEL",
-    help="Compare instead after how many episodes a level is first reached, such as success_percent=80.",
-)
+@target_option(multiple=False)
 @json_option
-@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
+@markdown_option
 @click.option("--html", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML page instead.")
 @click.option("--force", is_flag=True, help="Replace the page if it exists.")
 @recordings_option

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
+from runner.cli import Group
 from runner.cli.options import config_argument, json_option, set_option
 from runner.cli.output import draw, print_json, say, table
 from runner.cli.parameters import ShippedName
 
 
-@click.group("config")
+@click.group("config", cls=Group)
 def command() -> None:
     """List, copy and check configurations; print their schema.
 
@@ -36,12 +37,11 @@ def ls(as_json: bool) -> None:
     from runner.config.shipped import shipped
 
     if as_json:
-        print_json(
-            [
-                {"name": each.name, "kind": each.kind, "about": each.about, "path": str(each.path)}
-                for each in shipped().values()
-            ]
-        )
+        configs = [
+            {"name": each.name, "kind": each.kind, "about": each.about, "path": str(each.path)}
+            for each in shipped().values()
+        ]
+        print_json({"configs": configs})
         return
     made = table("name", "kind", "about", left=("name", "kind", "about"), shrinking=("about",))
     for each in shipped().values():

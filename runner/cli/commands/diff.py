@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.finding import find_recorded
-from runner.cli.options import json_option, recordings_option
+from runner.cli.options import all_option, json_option, markdown_option, recordings_option, target_option
 from runner.cli.output import print_json, say, size
 from runner.cli.parameters import RunName
 from runner.cli.sections import print_sections, require_one_form, require_page
+from runner.errors import ExitCode
 
 if TYPE_CHECKING:
     from runner.analysis.diff import RunDiff
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 @click.argument("b", metavar="B", type=RunName())
 @recordings_option
 @json_option
-@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
+@markdown_option
 @click.option("--html", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML page instead.")
 @click.option("--force", is_flag=True, help="Replace the page if it exists.")
 @click.option(
@@ -32,19 +33,13 @@ if TYPE_CHECKING:
     metavar="GLOB",
     help="Ignore settings and provenance whose path matches this pattern.",
 )
-@click.option("--all", "everything", is_flag=True, help="Also list what is the same.")
+@all_option
 @click.option(
     "--first",
     is_flag=True,
     help="Compare only settings and where training first diverges, not the tables.",
 )
-@click.option(
-    "--target",
-    "targets",
-    multiple=True,
-    metavar="METRIC=LEVEL",
-    help="Show which run reaches a level first, such as success_percent=80.",
-)
+@target_option(multiple=True)
 @click.pass_context
 def command(
     ctx: click.Context,
@@ -95,7 +90,7 @@ def command(
         print_json(told(difference))
     elif html is None or as_markdown:
         _print(difference, everything, as_markdown)
-    ctx.exit(0 if difference.same_content else 1)
+    ctx.exit(ExitCode.OK if difference.same_content else ExitCode.DIFFERENT)
 
 
 def _write_page(path: Path, force: bool, difference: RunDiff, a: Recording, b: Recording) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli.options import filter_argument, folders_option, json_option
+from runner.cli.options import filter_argument, folders_option, json_option, limit_option
 from runner.cli.output import UNKNOWN, draw, facts, print_json, say, size, table, title
 
 if TYPE_CHECKING:
@@ -18,14 +18,7 @@ if TYPE_CHECKING:
 @click.command("du")
 @filter_argument
 @folders_option
-@click.option(
-    "--limit",
-    type=click.IntRange(min=0),
-    default=20,
-    show_default=True,
-    metavar="N",
-    help="Show the N largest runs, 0 for all.",
-)
+@limit_option(20)
 @json_option
 def command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as_json: bool) -> None:
     """Show the disk usage of the runs that match FILTER (as in `dualtaxi ls`), or of all, largest first.

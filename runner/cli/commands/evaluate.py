@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli import INTERRUPTED
 from runner.cli.finding import find_recorded, suggested
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, print_json, say
 from runner.cli.working import at_work, run_as_json, run_in_words
+from runner.errors import ExitCode
 
 if TYPE_CHECKING:
+    from runner.execution.rerecord import Start
     from runner.runs.run import Run
 
 TRIALS = 200
@@ -30,9 +31,12 @@ TRIALS = 200
 @click.option(
     "--trials", type=click.IntRange(1), metavar="K", help=f"Number of episodes.  [default: {TRIALS}]"
 )
-@click.option("--all", "every_start", is_flag=True, help="Play one episode from each start state.")
 @click.option(
-    "--start", type=click.IntRange(0), metavar="STATE", help="The state that all episodes start in."
+    "--start",
+    default="random",
+    show_default=True,
+    metavar="random|each|STATE",
+    help="Start states: random ones, each one once, or this one.",
 )
 @click.option(
     "--seed",
@@ -50,8 +54,7 @@ def command(
     run_name: str,
     step: int | None,
     trials: int | None,
-    every_start: bool,
-    start: int | None,
+    start: str,
     seed: int,
     recordings: Path | None,
     as_json: bool,
@@ -65,19 +68,20 @@ def command(
     Examples:
       dualtaxi evaluate @latest
       dualtaxi evaluate k3v9m2xq --step 50000 --trials 1000 --seed 7
-      dualtaxi evaluate k3v9m2xq --all
+      dualtaxi evaluate k3v9m2xq --start each
     """  # noqa: D301 - Click wants the backspace itself
-    if every_start and (trials is not None or start is not None):
-        raise click.UsageError("--all plays each start state once: leave out --trials and --start.")
+    if start not in ("random", "each") and not start.isdecimal():
+        raise click.UsageError(f"--start: found {start!r}, expected random, each, or a state from 0.")
+    if start == "each" and trials is not None:
+        raise click.UsageError("--start each plays one episode per state: leave out --trials.")
     from runner.execution.rerecord import evaluate
     from runner.runs.run import recordings_folder
 
     source, folder = find_recorded(run_name, recordings), recordings_folder(recordings)
-    count = None if every_start else trials or TRIALS
+    count = None if start == "each" else trials or TRIALS
+    start_state: Start = int(start) if start.isdecimal() else "random"
     with at_work("", 0) as (report, interrupt):
-        run = evaluate(
-            source, folder, step, count, "random" if start is None else start, seed, report, interrupt
-        )
+        run = evaluate(source, folder, step, count, start_state, seed, report, interrupt)
     origin = run.file.config["initial_q"]
     if as_json:
         print_json(run_as_json(run) | {"origin": origin}, indent=None)
@@ -85,7 +89,7 @@ def command(
         _summarise(run, origin)
     if interrupt.came and run.status == "interrupted":
         say(f"Interrupted: what was played is kept; `{suggested(run, 'resume')}` plays the rest.")
-        ctx.exit(INTERRUPTED)
+        ctx.exit(ExitCode.INTERRUPTED)
 
 
 def _summarise(run: Run, origin: dict[str, object]) -> None:

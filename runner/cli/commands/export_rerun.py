@@ -42,7 +42,7 @@ def command(
     \b
     Examples:
       dualtaxi export rerun @latest
-      dualtaxi export rerun k3v9m2xq -o look.rrd --episodes 0:20,49980: --eval 49000
+      dualtaxi export rerun k3v9m2xq -o look.rrd --episodes 0:20,49980: --evaluations 49000
       dualtaxi export rerun k3v9m2xq --all --force
     """  # noqa: D301 - Click wants the backspace itself
     import time

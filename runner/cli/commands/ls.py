@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.cli.options import filter_argument, folders_option, json_option
-from runner.cli.output import json_lines, say
+from runner.cli.options import filter_argument, folders_option, json_option, limit_option
+from runner.cli.output import json_list, say
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.filters import Filter
@@ -36,12 +36,7 @@ _SPOOL_BYTES: Final = 8 << 20
     "--sort", default="", metavar="FIELD,...", help="Sort by these fields; -FIELD for descending order."
 )
 @click.option("--columns", metavar="FIELD,...", help="Show these fields.")
-@click.option(
-    "--limit",
-    type=click.IntRange(min=0),
-    metavar="N",
-    help=f"Maximum number of runs, 0 for all.  [default: {ON_A_TERMINAL} in a terminal's table, else all]",
-)
+@limit_option(None, f"{ON_A_TERMINAL} in a terminal's table, else all")
 @click.option("--offset", type=click.IntRange(min=0), default=0, metavar="N", help="Skip the first N.")
 @click.option("-q", "--quiet", is_flag=True, help="Print ids only.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print CSV.")
@@ -125,7 +120,7 @@ def _ids(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> Iterator[str
 def _objects(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> Iterator[str]:
     from runner.runs.catalogue.columns import as_json
 
-    return json_lines(as_json(row, columns) for row in rows)
+    return json_list("runs", (as_json(row, columns) for row in rows))
 
 
 def _stream(

@@ -12,6 +12,7 @@ from runner.cli.finding import suggested
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, size
 from runner.cli.working import recording_of
+from runner.errors import ExitCode
 
 if TYPE_CHECKING:
     from runner.recording.repair import Repair
@@ -73,7 +74,7 @@ def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json:
     else:
         draw(facts(_in_words(done, run)))
     if not done.lossless:
-        ctx.exit(1)
+        ctx.exit(ExitCode.DIFFERENT)
 
 
 def _kept(run: Run | None) -> contextlib.AbstractContextManager[Any]:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from runner.cli import INTERRUPTED
 from runner.cli.finding import find, suggested
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, say
 from runner.cli.working import at_work, run_as_json, run_in_words
+from runner.errors import ExitCode
 
 
 @click.command("resume")
@@ -54,4 +54,4 @@ def command(
         say(f"Run {run.run_id} is finished; there is nothing to do.")
     if interrupt.came and run.status == "interrupted":
         say(f"Interrupted again; `{suggested(run, 'resume')}` goes on from what is kept.")
-        ctx.exit(INTERRUPTED)
+        ctx.exit(ExitCode.INTERRUPTED)

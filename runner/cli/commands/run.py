@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.cli import INTERRUPTED
 from runner.cli.finding import suggested
-from runner.cli.options import config_argument, json_option, recordings_option, set_option
+from runner.cli.options import config_argument, json_option, recordings_option, set_option, workers_option
 from runner.cli.output import amount, print_json, say, size
 from runner.cli.working import announcing, run_as_json, run_in_words
+from runner.errors import ExitCode
 
 if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
     from rich.console import RenderableType
@@ -48,14 +48,7 @@ LIVE_EPISODES: Final = 200
     metavar="URL",
     help="Connect to a running viewer at this URL instead of starting one.",
 )
-@click.option(
-    "--at-once",
-    type=click.IntRange(1, 1024),
-    default=1,
-    show_default=True,
-    metavar="N",
-    help="Number of seeds to train in parallel, one thread each.",
-)
+@workers_option(1)
 @recordings_option
 @json_option
 @click.pass_context
@@ -68,14 +61,14 @@ def command(
     live: bool,
     live_every: int | None,
     live_url: str | None,
-    at_once: int,
+    workers: int,
     recordings: Path | None,
     as_json: bool,
 ) -> None:
     """Train, evaluate and record the experiment CONFIG: a file, or a shipped one (`dualtaxi config ls`).
 
     Each run gets a folder with a recording of every step. Several seeds make one run each, one after the
-    other or in parallel with --at-once; the recordings are the same. Ctrl-C ends a run properly and keeps
+    other or in parallel with --workers; the recordings are the same. Ctrl-C ends a run properly and keeps
     what it recorded; a second Ctrl-C kills it.
 
     Steps and disk are estimated first. The estimate assumes that evaluation trials and the first 500 training
@@ -91,7 +84,7 @@ def command(
       dualtaxi run mine.yaml
       dualtaxi run cooperative --seed 7 --set discount=0.9 --name patient
       dualtaxi run quick --set 'seeds={count: 3}' --json
-      dualtaxi run quick --set 'seeds={count: 100}' --set recording.steps=none --at-once 2
+      dualtaxi run quick --set 'seeds={count: 100}' --set recording.steps=none --workers 2
       dualtaxi run cooperative --live --live-every 100
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import experiment_of, jobs_in
@@ -100,10 +93,10 @@ def command(
 
     experiment = experiment_of(config, overrides, seed)
     called, folder = checked_name(name), recordings_folder(recordings)
-    if at_once > 1:
+    if workers > 1:
         if live or live_every or live_url:
-            raise click.UsageError("--live shows one run at a time: leave out --at-once.")
-        _run_parallel(ctx, experiment, folder, called, at_once, as_json)
+            raise click.UsageError("--live shows one run at a time: leave out --workers.")
+        _run_parallel(ctx, experiment, folder, called, workers, as_json)
         return
     watch = _watcher(experiment, live, live_every, live_url)
     for number, job in enumerate(jobs_in(experiment, folder)):
@@ -111,7 +104,7 @@ def command(
         _tell(run, number, as_json)
         if interrupted:
             _tell_interrupted(run, experiment, begun=number + 1)
-            ctx.exit(INTERRUPTED)
+            ctx.exit(ExitCode.INTERRUPTED)
 
 
 def _tell(run: Run, number: int, as_json: bool) -> None:
@@ -123,7 +116,7 @@ def _tell(run: Run, number: int, as_json: bool) -> None:
 
 
 def _run_parallel(
-    ctx: click.Context, config: ExperimentConfig, folder: Path, name: str | None, at_once: int, as_json: bool
+    ctx: click.Context, config: ExperimentConfig, folder: Path, name: str | None, workers: int, as_json: bool
 ) -> None:
     """Run an experiment's seeds side by side, and tell of each run."""
     from runner.api import interruptible, jobs_in, run_parallel
@@ -138,7 +131,7 @@ def _run_parallel(
         announcing(),
         counting("runs", len(config.seeds)) as done,
     ):
-        for run in run_parallel(jobs_in(config, folder), folder, name, at_once, interrupt):
+        for run in run_parallel(jobs_in(config, folder), folder, name, workers, interrupt):
             runs.append(run)
             done(len(runs))
             _tell(run, len(runs) - 1, as_json)
@@ -147,7 +140,7 @@ def _run_parallel(
             if run.status == "interrupted":
                 say(f"Interrupted: {run.recording}; `{suggested(run, 'resume')}` goes on from there.")
         _tell_left(config, len(runs))
-        ctx.exit(INTERRUPTED)
+        ctx.exit(ExitCode.INTERRUPTED)
 
 
 def _watcher(config: ExperimentConfig, live: bool, every: int | None, url: str | None) -> Watch | None:
@@ -228,7 +221,7 @@ def _announce(config: ExperimentConfig, folder: Path) -> None:
         return
     say(f"The disk of {folder} has {size(free)} left, which may be too little.")
     if _someone_answers() and not click.confirm("Go on?", err=True):
-        raise click.exceptions.Exit(1)
+        raise click.exceptions.Exit(ExitCode.DIFFERENT)
 
 
 def _someone_answers() -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import folders_option
+from runner.cli.options import folders_option, workers_option
 from runner.cli.output import say
 
 
@@ -39,14 +39,7 @@ from runner.cli.output import say
     help="Trust X-Forwarded-* headers from this proxy.",
 )
 @click.option("--require-token", is_flag=True, help="Require a token for reading too, on any host.")
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 64),
-    default=2,
-    show_default=True,
-    metavar="N",
-    help="Number of jobs to run in parallel.",
-)
+@workers_option(2)
 @click.option(
     "--ray",
     metavar="ADDRESS",

@@ -9,14 +9,15 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli import INTERRUPTED
-from runner.cli.options import json_option, recordings_option
+from runner.cli import Group
+from runner.cli.options import all_option, json_option, markdown_option, recordings_option, workers_option
 from runner.cli.output import amount, draw, facts, print_json, say, size
 from runner.cli.parameters import ConfigName
+from runner.errors import ExitCode
 
 if TYPE_CHECKING:
     from runner.sweep.local import Workers
@@ -24,54 +25,22 @@ if TYPE_CHECKING:
     from runner.sweep.plan import Plan
     from runner.sweep.trials import SweepStatus, Trials
 
-START: Final = "start"
 
-
-class _StartsUnlessTold(click.Group):
-    """What is no command of its own is the file of a sweep to start."""
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command that is meant; a word that is neither a file nor a shipped sweep is misspelt."""
-        from runner.config.shipped import shipped
-        from runner.errors import nearest
-
-        word = args[0]
-        sweeps = [each.name for each in shipped().values() if each.kind == "sweep"]
-        if word in self.commands:
-            return super().resolve_command(ctx, args)
-        is_path = word.startswith("-") or Path(word).suffix or Path(word).exists()
-        if not is_path and word not in sweeps and not ctx.resilient_parsing:
-            ctx.fail(
-                f"{word!r} is neither a file, a shipped sweep, nor one of {', '.join(self.commands)}."
-                f"{nearest(word, [*self.commands, *sweeps])}"
-            )
-        return START, self.commands[START], args
-
-
-@click.group("sweep", cls=_StartsUnlessTold, context_settings={"ignore_unknown_options": True})
+@click.group("sweep", cls=Group)
 def command() -> None:
     """Run an experiment with many values, and rank them.
 
-    `dualtaxi sweep FILE` is short for `dualtaxi sweep start FILE`.
-
     \b
     Examples:
-      dualtaxi sweep start hyperparameters --dry-run
-      dualtaxi sweep start hyperparameters --workers 2
+      dualtaxi sweep run hyperparameters --dry-run
+      dualtaxi sweep run hyperparameters --workers 2
       dualtaxi sweep show hyperparameters
     """  # noqa: D301 - Click wants the backspace itself
 
 
-@command.command(START)
+@command.command("run")
 @click.argument("file", metavar="FILE", type=ConfigName("sweep"))
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 1024),
-    metavar="N",
-    help="Number of processes.  [default: one per processor]",
-)
+@workers_option(None, "one per processor")
 @click.option(
     "--ray",
     "ray",
@@ -88,7 +57,7 @@ def command() -> None:
 @json_option
 @recordings_option
 @click.pass_context
-def start(
+def run(
     ctx: click.Context,
     file: Path,
     workers: int | None,
@@ -114,9 +83,9 @@ def start(
 
     \b
     Examples:
-      dualtaxi sweep start hyperparameters --dry-run
-      dualtaxi sweep start hyperparameters --workers 2
-      dualtaxi sweep start hyperparameters --resume
+      dualtaxi sweep run hyperparameters --dry-run
+      dualtaxi sweep run hyperparameters --workers 2
+      dualtaxi sweep run hyperparameters --resume
     """  # noqa: D301 - Click wants the backspace itself
     from runner.api import interruptible
     from runner.runs.run import recordings_folder
@@ -158,12 +127,12 @@ def start(
             )
     _tell(sweep, trials, status, as_json)
     if status.stopped or status.failed:
-        ctx.exit(INTERRUPTED if interrupt.came else 1)
+        ctx.exit(ExitCode.INTERRUPTED if interrupt.came else ExitCode.DIFFERENT)
 
 
 @command.command("show")
 @click.argument("name")
-@click.option("--all", "every", is_flag=True, help="Show every trial, not only the best.")
+@all_option
 @click.option(
     "--best",
     type=click.Path(path_type=Path),
@@ -171,12 +140,12 @@ def start(
     help="Write the best configuration, with fresh seeds.",
 )
 @click.option("--force", is_flag=True, help="Replace the file if it exists.")
-@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
+@markdown_option
 @json_option
 @recordings_option
 def show(
     name: str,
-    every: bool,
+    everything: bool,
     best: Path | None,
     force: bool,
     as_markdown: bool,
@@ -221,7 +190,7 @@ def show(
             }
         )
     else:
-        print_sections(sections(results, None if every else SHOWN), as_markdown)
+        print_sections(sections(results, None if everything else SHOWN), as_markdown)
         if best is None and results.best is not None:
             number = results.best.number
             say(f"--best FILE writes the configuration of trial {number}, with fresh seeds to confirm it.")
@@ -247,11 +216,11 @@ def ls(recordings: Path | None, as_json: bool) -> None:
 
     names = sweeps_in(recordings_folder(recordings))
     if as_json:
-        print_json(names)
+        print_json({"sweeps": names})
     elif names:
         click.echo("\n".join(names))
     else:
-        say("No sweeps yet. `dualtaxi sweep FILE` begins one.")
+        say("No sweeps yet. `dualtaxi sweep run FILE` starts one.")
 
 
 @contextlib.contextmanager

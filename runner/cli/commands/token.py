@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import click
 
+from runner.cli import Group
 from runner.cli.options import json_option
 from runner.cli.output import print_json, say
 
 
-@click.group("token")
+@click.group("token", cls=Group)
 def command() -> None:
     """Create, list and revoke access tokens.
 
@@ -67,7 +68,7 @@ def ls(as_json: bool) -> None:
 
     tokens = Tokens(tokens_file()).all()
     if as_json:
-        print_json([token.as_json() for token in tokens])
+        print_json({"tokens": [token.as_json() for token in tokens]})
     elif tokens:
         headings = ("id", "name", "scopes", "created")
         drawn = table(*headings, left=headings, shrinking=("name",))

@@ -10,6 +10,7 @@ import click
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import UNKNOWN, draw, facts, print_json
 from runner.cli.working import at_work, recording_of, refuse_running
+from runner.errors import ExitCode
 
 if TYPE_CHECKING:
     from runner.errors import Diverged
@@ -57,7 +58,7 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
     else:
         draw(facts(_in_words(found, rerun)))
     if not found.sound:
-        ctx.exit(1)
+        ctx.exit(ExitCode.DIFFERENT)
 
 
 def _verdict(found: Verification, rerun: bool) -> str:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     "spot",
     type=StepReference(),
     metavar="EPISODE:T",
-    help="The step to show: EPISODE:T of training, or eval:N:TRIAL:T of an evaluation. "
+    help="The point in training to show: EPISODE:T, or eval:N:TRIAL:T of an evaluation. "
     "T and TRIAL default to 0.",
 )
 @click.option("--web", is_flag=True, help="Serve the web viewer on 127.0.0.1 instead of opening a window.")

@@ -256,8 +256,8 @@ def _tell(
     if len(wanted) < len(evaluations):
         rest = [one.after for one in evaluations if one not in wanted]
         selection.left_out.append(
-            f"the trials of {len(rest):,} evaluations (--eval {rest[-1]} includes the one after {rest[-1]:,} "
-            "episodes; --all: everything)"
+            f"the trials of {len(rest):,} evaluations "
+            f"(--evaluations {rest[-1]} includes the one after {rest[-1]:,} episodes; --all: everything)"
         )
 
 

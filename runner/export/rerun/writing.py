@@ -219,7 +219,7 @@ class RunExporter:
             rr.Points2D,
             n,
             positions=place(n, self._scene.columns / 2, self._scene.rows / 2),
-            labels=texts(["no steps exported here: see --episodes, --eval and --all"] * n),
+            labels=texts(["no steps exported here: see --episodes, --evaluations and --all"] * n),
             radii=np.zeros((n, 1), np.float32),
             colors=ink(n),
         )

@@ -252,7 +252,7 @@ def _protected(run: Run) -> str:
     if run.status == "running":
         return "it is running; wait for its end, or interrupt it"
     if KEEP in run.tags:
-        return f"it is tagged {KEEP}; `dualtaxi tag {run.run_id} --remove {KEEP}` lets it go"
+        return f"it is tagged {KEEP}; `dualtaxi label {run.run_id} --untag {KEEP}` unlocks it"
     return _unreadable(run.folder)
 
 

@@ -11,18 +11,16 @@ from pydantic import BaseModel, Field
 
 from runner.analysis.summary import described
 from runner.recording.labels import MAX_NOTE, MAX_TAGS
-from runner.recording.labels import Labels as Said
 from runner.runs.catalogue.columns import PROGRAMS, columns_of, with_originals
 from runner.runs.catalogue.columns import as_json as row_as_json
 from runner.runs.catalogue.filters import parse
 from runner.runs.catalogue.index import order_of
-from runner.runs.run import Run, relabel
+from runner.runs.run import Run, label
 from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json
 from runner.service.dependencies import CacheOf, CatalogueOf, FoundRun, SettingsOf
 from runner.service.errors import Refused
 from runner.service.problems import answers
-from runner.util.values import checked_run_name
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index
@@ -87,8 +85,8 @@ class Labels(BaseModel):
     name: Annotated[
         str | None, Field(max_length=100, description="What it is called; empty: as at first.")
     ] = None
-    add_tags: Annotated[list[str], Field(max_length=MAX_TAGS)] = []
-    remove_tags: Annotated[list[str], Field(max_length=MAX_TAGS)] = []
+    tag: Annotated[list[str], Field(max_length=MAX_TAGS, description="Tags to add.")] = []
+    untag: Annotated[list[str], Field(max_length=MAX_TAGS, description="Tags to remove.")] = []
     note: Annotated[str | None, Field(max_length=MAX_NOTE, description="Empty: none.")] = None
 
 
@@ -151,27 +149,12 @@ def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
     summary="Rename, tag, and note.",
 )
 def label_run(run: FoundRun, labels: Labels, catalogue: CatalogueOf) -> dict[str, Any]:
-    """Change what people say of a run, as `dualtaxi rename`, `tag` and `note` do; return what they say."""
+    """Change the labels of a run as `dualtaxi label` does, and return them."""
     return relabelled(run, labels, catalogue)
 
 
 def relabelled(run: Run, labels: Labels, catalogue: Catalogue) -> dict[str, Any]:
-    """Change what people say of a run, and return it.
-
-    Raises:
-        ConfigError: the name cannot be one.
-        RunnerError: a tag cannot be one, or there are too many.
-        StorageError: the run's folder cannot be written.
-    """
-    first = run.file.name
-    name = checked_run_name(labels.name) if labels.name else labels.name
-
-    def change(was: Said) -> Said:
-        called = was.name if name is None else "" if name == first else name
-        tags = (set(was.tags) | set(labels.add_tags)) - set(labels.remove_tags)
-        note = was.note if labels.note is None else labels.note.strip()
-        return Said(called, tuple(sorted(tags)), note)
-
-    said = relabel(run, change)
+    """Change the labels of a run, and return them; errors as of `label`."""
+    now = label(run, labels.name, labels.note, labels.tag, labels.untag)
     catalogue.changed()
-    return {"run_id": run.run_id, "name": said.name or first, "tags": list(said.tags), "note": said.note}
+    return {"run_id": run.run_id, "name": now.name or run.file.name, "tags": list(now.tags), "note": now.note}

@@ -82,8 +82,8 @@ def label(
     tags = form.get("tags", "").split()
     changed = Labels.model_construct(
         name=form.get("name", "").strip(),
-        add_tags=tags,
-        remove_tags=sorted(set(run.tags) - set(tags)),
+        tag=tags,
+        untag=sorted(set(run.tags) - set(tags)),
         note=form.get("note", ""),
     )
     try:

@@ -54,7 +54,7 @@ def test_archived_and_removed_a_run_is_listed_and_restored_the_same(run, recordi
     left = find_run(run.run_id, recordings)
     assert left.status == "archived"
     assert not left.recording.exists()
-    assert [row["status"] for row in json.loads(done(command("ls", "--json")))] == ["archived"]
+    assert [row["status"] for row in json.loads(done(command("ls", "--json")))["runs"]] == ["archived"]
 
     done(command("restore", run.run_id))
     back = find_run(run.run_id, recordings)
@@ -218,11 +218,11 @@ def test_a_killed_run_is_archived_and_restored(run, recordings, command):
     with open_recording(folder / "recording.mcap") as recording:
         came = {"episodes": recording.count(schema.TRAIN_EPISODE)}
         came["train_steps"] = recording.count(schema.TRAIN_STEP)
-    (before,) = json.loads(done(command("ls", "--json")))
+    (before,) = json.loads(done(command("ls", "--json")))["runs"]
     assert {key: before[key] for key in came} == came
     done(command("archive", run.run_id, "--remove"))
-    done(command("reindex"))
-    (row,) = json.loads(done(command("ls", "--json")))
+    done(command("index", "rebuild"))
+    (row,) = json.loads(done(command("ls", "--json")))["runs"]
     assert row["status"] == "archived"
     assert {key: row[key] for key in came} == came
     done(command("show", run.run_id))
@@ -307,7 +307,7 @@ def test_a_pipe_in_place_of_a_manifest_is_refused(run, recordings, command):
 
 
 def test_a_renamed_run_keeps_its_name_where_only_its_archive_is_left(run, recordings, command):
-    done(command("rename", run.run_id, "patient"))
+    done(command("label", run.run_id, "--name", "patient"))
     done(command("archive", run.run_id))
     shutil.rmtree(recordings / run.run_id)
     done(command("restore", recordings.parent / "archive" / run.run_id))

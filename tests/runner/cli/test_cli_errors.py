@@ -60,7 +60,7 @@ def test_problems_of_a_configuration_are_listed_as_json(command, bad):
 
 
 def test_runs_that_cannot_be_pushed_are_errors_too(command):
-    words = ["push", "nosuch", "--server", "http://127.0.0.1:9"]
+    words = ["remote", "push", "nosuch", "--server", "http://127.0.0.1:9"]
     assert command(*words).exit_code == 2
     assert json.loads(command(*words, "--json").stderr)["error"]["run"] == "nosuch"
 

@@ -14,7 +14,7 @@ def test_a_run_goes_on_when_its_viewer_takes_nothing(command, tiny, monkeypatch)
         done = command("run", tiny, "--live-url", url)
     assert done.exit_code == 0
     assert "not all was shown live" in done.stderr
-    assert [run["status"] for run in command.json("ls")] == ["finished"]
+    assert [run["status"] for run in command.json("ls")["runs"]] == ["finished"]
 
 
 def test_a_run_without_its_viewer_does_not_begin(command, tiny):

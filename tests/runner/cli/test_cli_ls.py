@@ -11,7 +11,7 @@ from runner.runs.run import RUN_FILE, create_run
 
 
 def test_json_lists_the_runs(recorded, recorded_run):
-    (told,) = recorded.json("ls")
+    (told,) = recorded.json("ls")["runs"]
     assert told["run_id"] == recorded_run.run_id
     assert (told["name"], told["config"], told["seed"]) == ("tiny", "tiny", 3)
     assert (told["status"], told["episodes"], told["episodes_to_do"]) == ("finished", 30, 30)
@@ -34,7 +34,7 @@ def test_a_run_of_another_name_shows_its_configuration(command, tiny):
 
 def test_the_newest_comes_first(command, tiny):
     ids = [command.json("run", tiny, "--seed", seed)["run_id"] for seed in (1, 2)]
-    assert [run["run_id"] for run in command.json("ls")] == ids[::-1]
+    assert [run["run_id"] for run in command.json("ls")["runs"]] == ids[::-1]
 
 
 @pytest.mark.parametrize("made", [False, True])
@@ -44,14 +44,14 @@ def test_no_runs_yet(command, made):
     result = command("ls")
     assert (result.exit_code, result.stdout) == (0, "")
     assert "No runs" in result.stderr
-    assert command.json("ls") == []
+    assert command.json("ls")["runs"] == []
 
 
 def test_a_run_that_never_recorded_and_one_that_runs(command, tiny):
     running = create_run(command.recordings, experiment_of(tiny), 3)
     died = create_run(command.recordings, experiment_of(tiny), 4)
     died.update(owner=died.facts["owner"] | {"process_started": 1.0})
-    told = {run["run_id"]: run["status"] for run in command.json("ls")}
+    told = {run["run_id"]: run["status"] for run in command.json("ls")["runs"]}
     assert told == {running.run_id: "running", died.run_id: "interrupted"}
     assert command("ls").exit_code == 0
     assert "– of 30" in command("ls").stdout
@@ -62,19 +62,19 @@ def test_what_is_no_run_is_left_alone(command, tiny, content):
     (command.recordings / "stray").mkdir(parents=True)
     (command.recordings / "stray" / RUN_FILE).write_text(content, encoding="latin-1")
     (command.recordings / "note.txt").write_text("mine")
-    assert command.json("ls") == []
+    assert command.json("ls")["runs"] == []
 
 
 def test_values_of_the_wrong_kind_make_a_damaged_run(command, tiny):
     run = create_run(command.recordings, experiment_of(tiny), 3)
     for key, wrong in (("created", "soon"), ("seed", "x"), ("summary", []), ("config", 3), ("owner", "me")):
         (run.folder / RUN_FILE).write_text(json.dumps(run.facts | {"status": "finished", key: wrong}))
-        (told,) = command.json("ls")
+        (told,) = command.json("ls")["runs"]
         assert (told["run_id"], told["status"]) == (run.run_id, "damaged"), key
 
 
 def test_the_folder_may_be_given(recorded, recorded_run, command):
-    assert command.json("ls", "--recordings", recorded.recordings)[0]["run_id"] == recorded_run.run_id
+    assert command.json("ls", "--recordings", recorded.recordings)["runs"][0]["run_id"] == recorded_run.run_id
 
 
 def test_a_folder_that_is_none(command, tmp_path):
@@ -97,7 +97,11 @@ def test_the_folder_is_the_working_directorys_by_default(recorded_run, tmp_path,
 
 
 def test_json_of_no_run_and_of_two_is_an_array(command):
-    assert command.json("ls") == []
+    assert command.json("ls")["runs"] == []
     runs = [create_run(command.recordings, from_mapping({"name": "some", "episodes": 5}), n) for n in (1, 2)]
-    assert {run["run_id"] for run in command.json("ls")} == {run.run_id for run in runs}
-    assert len(command.json("ls", "--offset", "1")) == len(command.json("ls", "--limit", "1")) == 1
+    assert {run["run_id"] for run in command.json("ls")["runs"]} == {run.run_id for run in runs}
+    assert (
+        len(command.json("ls", "--offset", "1")["runs"])
+        == len(command.json("ls", "--limit", "1")["runs"])
+        == 1
+    )

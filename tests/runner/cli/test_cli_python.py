@@ -85,12 +85,12 @@ def test_several_seeds_are_for_run_all(tiny, tmp_path):
     assert [run.seed for run in runs] == [2]
 
 
-@pytest.mark.parametrize("at_once", [1, 2])
-def test_each_of_several_seeds_has_the_name_and_reports(tiny, tmp_path, at_once):
+@pytest.mark.parametrize("workers", [1, 2])
+def test_each_of_several_seeds_has_the_name_and_reports(tiny, tmp_path, workers):
     told = []
     several = ["seeds=[1, 2]", "recording.steps=none"]
     runs = runner.run_all(
-        tiny, overrides=several, name="both", recordings=tmp_path, report=told.append, at_once=at_once
+        tiny, overrides=several, name="both", recordings=tmp_path, report=told.append, workers=workers
     )
     assert [(run.seed, run.name) for run in runs] == [(1, "both"), (2, "both")]
     assert {progress.episodes for progress in told} == {30}
@@ -99,7 +99,7 @@ def test_each_of_several_seeds_has_the_name_and_reports(tiny, tmp_path, at_once)
 
 def test_seeds_side_by_side_record_what_each_records_alone(tiny, tmp_path):
     several = ["seeds=[1, 2, 3, 4, 5]", "recording.steps=none"]
-    abreast = list(runner.run_all(tiny, overrides=several, recordings=tmp_path / "abreast", at_once=3))
+    abreast = list(runner.run_all(tiny, overrides=several, recordings=tmp_path / "abreast", workers=3))
     alone = list(runner.run_all(tiny, overrides=several, recordings=tmp_path / "alone"))
     digests = [run.summary["content_digest"] for run in alone]
     assert [run.seed for run in abreast] == [1, 2, 3, 4, 5]
@@ -109,11 +109,11 @@ def test_seeds_side_by_side_record_what_each_records_alone(tiny, tmp_path):
 
 def test_seeds_side_by_side_that_are_interrupted_or_left_are_closed(tiny, tmp_path):
     long = ["seeds={count: 50}", "episodes=100000", "recording.steps=none"]
-    runs = runner.run_all(tiny, overrides=long, recordings=tmp_path, at_once=2)
+    runs = runner.run_all(tiny, overrides=long, recordings=tmp_path, workers=2)
     threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
         next(runs)
-    short = runner.run_all(tiny, overrides=["seeds={count: 50}"], recordings=tmp_path / "left", at_once=2)
+    short = runner.run_all(tiny, overrides=["seeds={count: 50}"], recordings=tmp_path / "left", workers=2)
     next(short)
     short.close()
     for folder in (tmp_path, tmp_path / "left"):
@@ -122,9 +122,9 @@ def test_seeds_side_by_side_that_are_interrupted_or_left_are_closed(tiny, tmp_pa
         assert {run.status for run in begun} <= {"interrupted", "finished"}
 
 
-def test_at_once_is_one_or_more(tiny, tmp_path):
-    with pytest.raises(ConfigError, match="at_once: found 0"):
-        runner.run_all(tiny, recordings=tmp_path, at_once=0)
+def test_workers_is_one_or_more(tiny, tmp_path):
+    with pytest.raises(ConfigError, match="workers: found 0"):
+        runner.run_all(tiny, recordings=tmp_path, workers=0)
 
 
 def test_progress_is_reported(tiny, tmp_path):

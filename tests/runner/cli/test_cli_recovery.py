@@ -98,12 +98,12 @@ def test_what_a_missing_recording_leaves_to_do_depends_on_the_run(command, copie
 
 def test_ls_says_how_far_a_killed_run_got(command, copied):
     cut(copied, 0.7)
-    (told,) = command.json("ls")
+    (told,) = command.json("ls")["runs"]
     with open_recording(copied.recording) as recording:
         assert told["episodes"] == recording.count(schema.TRAIN_EPISODE) < told["episodes_to_do"]
     assert f"{told['episodes']:,} of {told['episodes_to_do']:,}" in command("ls").stdout
     copied.recording.write_bytes(b"nothing that can be read")
-    assert command.json("ls")[0]["episodes"] is None
+    assert command.json("ls")["runs"][0]["episodes"] is None
 
 
 def test_a_run_is_told_by_the_path_that_it_was_found_by(command, copied, monkeypatch):
@@ -117,11 +117,11 @@ def test_a_run_is_told_by_the_path_that_it_was_found_by(command, copied, monkeyp
 
 def test_resume(command, copied, recorded_run):
     cut(copied)
-    assert command.json("ls")[0]["status"] == "interrupted"
+    assert command.json("ls")["runs"][0]["status"] == "interrupted"
     told = command.json("resume", "@latest")
     assert told["status"] == "finished"
     assert told["content_digest"] == recorded_run.summary["content_digest"]
-    assert command.json("ls")[0]["status"] == "finished"
+    assert command.json("ls")["runs"][0]["status"] == "finished"
 
 
 def test_resume_in_words(command, copied):
@@ -163,7 +163,7 @@ def test_accepted_changes(command, copied, monkeypatch):
     assert result.exit_code == 2
     assert "9.9 now" in result.stderr
     assert "--accept-changes" in result.stderr
-    assert command.json("ls")[0]["status"] == "interrupted"
+    assert command.json("ls")["runs"][0]["status"] == "interrupted"
     assert command("resume", "@latest", "--accept-changes").exit_code == 0
 
 
@@ -234,7 +234,7 @@ def test_repair_tells_what_was_lost_and_resume_brings_it_back(command, copied, r
     assert f"dualtaxi resume {copied.run_id}" in result.stdout
     (kept,) = copied.folder.glob("*.damaged-1.mcap")
     assert kept.read_bytes() == damaged
-    assert command.json("ls")[0]["status"] == "interrupted"
+    assert command.json("ls")["runs"][0]["status"] == "interrupted"
     assert command("show", copied.run_id).exit_code == 0
     assert command("verify", copied.run_id).exit_code == 1
     again = command("repair", copied.run_id)
@@ -357,7 +357,7 @@ def test_evaluate(command, copied):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--all", "--trials", 3), "--all plays each start state once"),
+        (("--start", "each", "--trials", 3), "leave out --trials"),
         (("--step", 10**9), "expected at least"),
         (("--start", 10**7), "--start: found state 10000000, expected one of 0 to 6143."),
         (("--seed", -1), "-1"),

@@ -16,9 +16,9 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="file names are 
 @pytest.mark.parametrize(
     "words",
     [
-        ("note", "@latest", LATIN),
-        ("tag", "@latest", LATIN),
-        ("rename", "@latest", LATIN),
+        ("label", "@latest", "--note", LATIN),
+        ("label", "@latest", "--tag", LATIN),
+        ("label", "@latest", "--name", LATIN),
         ("ls", LATIN),
         ("show", LATIN),
     ],

@@ -1,4 +1,4 @@
-"""Labels, du, rm, prune and reindex: what people keep in order, and what must not go."""
+"""Labels, du, rm, prune and index rebuild: what people keep in order, and what must not go."""
 
 from __future__ import annotations
 
@@ -63,40 +63,39 @@ def there(command):
 def test_tags_notes_and_names_stand_beside_the_recording(command, make):
     run = make()
     before = (run.folder / RUN_FILE).read_bytes()
-    assert command("tag", run.run_id, "keep", "fig-3").stdout == "fig-3 keep\n"
-    assert command.json("tag", run.run_id, "--remove", "fig-3") == {"run_id": run.run_id, "tags": ["keep"]}
-    assert command("note", run.run_id, "first\nsecond").exit_code == 0
-    assert command("note", "some").stdout == "first\nsecond\n"
-    assert command("rename", "some", "patient").stdout == f"{run.run_id}  patient, was some\n"
+    assert "fig-3 keep" in command("label", run.run_id, "--tag", "keep", "--tag", "fig-3").stdout
+    labels = {"run_id": run.run_id, "name": "some", "tags": ["keep"], "note": ""}
+    assert command.json("label", run.run_id, "--untag", "fig-3") == labels
+    assert command("label", run.run_id, "--note", "first\nsecond").exit_code == 0
+    assert command.json("label", "some")["note"] == "first\nsecond"
+    assert command.json("label", "some", "--name", "patient")["name"] == "patient"
     assert (run.folder / RUN_FILE).read_bytes() == before
     assert json.loads((run.folder / LABELS_FILE).read_text()) == {
         "name": "patient",
         "tags": ["keep"],
         "note": "first\nsecond",
     }
-    (told,) = command.json("ls", "patient", "tag:keep", "note:SECOND")
+    (told,) = command.json("ls", "patient", "tag:keep", "note:SECOND")["runs"]
     assert (told["name"], told["tags"], told["note"]) == ("patient", ["keep"], "first\nsecond")
     assert command.json("show", "patient")["name"] == "patient"
-    command("rename", "patient", "--original")
-    assert command("note", "some", "--clear").exit_code == 0
-    assert command.json("ls")[0]["note"] == ""
+    command("label", "patient", "--name", "")
+    assert command("label", "some", "--note", "").exit_code == 0
+    assert command.json("ls")["runs"][0]["note"] == ""
 
 
 def test_a_note_from_stdin(command, make):
     run = make()
-    command("note", run.run_id, "-", input="observed\n")
-    assert command.json("note", run.run_id) == {"run_id": run.run_id, "note": "observed"}
+    command("label", run.run_id, "--note", "-", input="observed\n")
+    assert command.json("label", run.run_id)["note"] == "observed"
 
 
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("tag", "some", "two words"), "expected 1 to 64 letters"),
-        (("tag", "some", *map(str, range(101))), "at most 100"),
-        (("note", "some", "x" * 10_001), "at most 10,000"),
-        (("rename", "some", "../x"), "expected 1 to 100 letters"),
-        (("rename", "some"), "expected a NAME"),
-        (("note", "some", "x", "--clear"), "expected one of them"),
+        (("label", "some", "--tag", "two words"), "expected 1 to 64 letters"),
+        (("label", "some", *(f"--tag={i}" for i in range(101))), "at most 100"),
+        (("label", "some", "--note", "x" * 10_001), "at most 10,000"),
+        (("label", "some", "--name", "../x"), "expected 1 to 100 letters"),
     ],
 )
 def test_what_cannot_be_said_of_a_run(command, make, words, told):
@@ -119,17 +118,16 @@ def test_filters_sorting_columns_and_paging(command, make):
     assert "Shown are 2 of 5 runs" in result.stderr
     assert "--offset 3" in result.stderr
     assert command("ls", "-q", "age:>2.5d").stdout.split() == [run.run_id for run in runs[3:]]
-    told = command.json("ls", "--columns", "id,config.episodes,bytes", "--limit", 1)
+    told = command.json("ls", "--columns", "id,config.episodes,bytes", "--limit", 1)["runs"]
     assert told == [{"id": runs[0].run_id, "config.episodes": 5, "bytes": 5000}]
     assert command("ls", "bytes:>1MB").stderr == f"No run in {command.recordings} fits.\n"
 
 
 def test_csv_has_what_json_has(command, make):
     run = make()
-    command("tag", run.run_id, "a", "b")
-    command("note", run.run_id, 'with "quotes", and\nlines')
+    command("label", run.run_id, "--tag", "a", "--tag", "b", "--note", 'with "quotes", and\nlines')
     (row,) = csv.DictReader(io.StringIO(command("ls", "--csv").stdout))
-    (told,) = command.json("ls")
+    (told,) = command.json("ls")["runs"]
     assert list(row) == list(told)
     assert (row["note"], row["tags"]) == (told["note"], "a b")
     assert command("ls", "--csv", "--quiet").exit_code == 2
@@ -137,7 +135,7 @@ def test_csv_has_what_json_has(command, make):
 
 def test_ids_are_never_cut(command, make, monkeypatch):
     run = make()
-    command("rename", run.run_id, "n" * 100)
+    command("label", run.run_id, "--name", "n" * 100)
     monkeypatch.setenv("COLUMNS", "40")
     assert run.run_id in command("ls").stdout
 
@@ -169,7 +167,10 @@ def test_the_same_content_is_shown_as_such(recorded, command, recorded_run):
         facts = json.loads((command.recordings / name / RUN_FILE).read_text())
         later = {"run_id": name, "created": f"2026-01-0{len(name) - 2}T00:00:0{int(name == 'two')}+00:00"}
         (command.recordings / name / RUN_FILE).write_text(json.dumps(facts | later))
-    assert {run["run_id"]: run["same_as"] for run in command.json("ls")} == {"one": None, "two": "one"}
+    assert {run["run_id"]: run["same_as"] for run in command.json("ls")["runs"]} == {
+        "one": None,
+        "two": "one",
+    }
     assert "same as" in command("ls").stdout
     assert "same as" not in recorded("ls").stdout
     told = command.json("du")
@@ -179,12 +180,12 @@ def test_the_same_content_is_shown_as_such(recorded, command, recorded_run):
 
 def test_an_archived_run_stays_listed(command, make):
     run = make().update(archive={"target": "/archives/a", "digest": "d", "bytes": 3})
-    assert command.json("ls")[0]["status"] == "finished"
+    assert command.json("ls")["runs"][0]["status"] == "finished"
     run.recording.unlink()
     for _ in range(2):
-        (told,) = command.json("ls", "status:archived archive:*")
+        (told,) = command.json("ls", "status:archived archive:*")["runs"]
         assert (told["status"], told["archive"], told["bytes"]) == ("archived", "/archives/a", None)
-        assert command("reindex").exit_code == 0
+        assert command("index", "rebuild").exit_code == 0
     assert command("prune", "--older-than", "0s", "--yes").stderr.startswith("Left alone: 1 archived.")
     result = command("rm", run.run_id, "--yes")
     assert "was archived at /archives/a, but is not there: nothing of it will be left" in result.stderr
@@ -210,8 +211,8 @@ def test_rm_tells_asks_and_frees(command, make, answer):
 
 def test_rm_refuses_what_is_to_stay_and_then_removes_nothing(command, make):
     free, kept, busy, running = make(), make(), make(), create_run(command.recordings, CONFIG, 1)
-    command("tag", kept.run_id, "keep")
-    for run, told in ((kept, "--remove keep"), (running, "is running")):
+    command("label", kept.run_id, "--tag", "keep")
+    for run, told in ((kept, "--untag keep"), (running, "is running")):
         result = command("rm", free.run_id, run.run_id, "--yes")
         assert result.exit_code == 2
         assert told in result.stderr
@@ -270,7 +271,7 @@ def test_what_a_cut_off_removal_left_is_cleaned_later(command, make):
     stray = command.recordings / ".removed-abc-01234567"
     run.folder.rename(stray)
     assert there(command) == {other.run_id}
-    assert [each["run_id"] for each in command.json("ls")] == [other.run_id]
+    assert [each["run_id"] for each in command.json("ls")["runs"]] == [other.run_id]
     assert command.json("du")["freeable"]["half_removed"] > 1000
     os.utime(stray, (time.time() - 3600,) * 2)
     command("rm", other.run_id, "--yes")
@@ -308,7 +309,7 @@ def test_prune_keeps_the_last_of_each_configuration(command, make):
 def test_prune_leaves_what_is_protected_and_says_so(command, make):
     kept, strange, goes = make(9), make(9), make(9)
     running = create_run(command.recordings, CONFIG, 1)
-    command("tag", kept.run_id, "keep")
+    command("label", kept.run_id, "--tag", "keep")
     (strange.folder / "mine.txt").write_text("")
     result = command("prune", "name:some", "--yes")
     assert result.exit_code == 0
@@ -330,7 +331,7 @@ def test_prune_wants_to_know_which(command, make, words, told):
     assert len(there(command)) == 1
 
 
-# --- du and reindex --------------------------------------------------------------------------------
+# --- du and index ---------------------------------------------------------------------------------
 
 
 def test_du_adds_up_by_kind(command, make, tmp_path, monkeypatch):
@@ -354,14 +355,14 @@ def test_du_adds_up_by_kind(command, make, tmp_path, monkeypatch):
     assert "1 more" in text
 
 
-def test_reindex_says_what_it_found(command, make):
+def test_index_rebuild_says_what_it_found(command, make):
     make()
     make(status="failed")
-    told = command.json("reindex")
+    told = command.json("index", "rebuild")
     assert (told["runs"], told["statuses"], told["problems"]) == (2, {"failed": 1, "finished": 1}, [])
     (command.recordings / "stray").mkdir()
     (command.recordings / "stray" / RUN_FILE).write_text("{")
-    result = command("reindex")
+    result = command("index", "rebuild")
     assert result.exit_code == 1
     assert "stray" in result.stderr
     assert "2: 1 failed, 1 finished" in result.stdout
@@ -370,9 +371,9 @@ def test_reindex_says_what_it_found(command, make):
 def test_several_folders_are_one_list(command, make, recorded, recorded_run):
     run = make()
     both = ("--recordings", command.recordings, "--recordings", recorded.recordings)
-    assert {each["run_id"] for each in command.json("ls", *both)} == {run.run_id, recorded_run.run_id}
+    assert {each["run_id"] for each in command.json("ls", *both)["runs"]} == {run.run_id, recorded_run.run_id}
     assert str(recorded.recordings) in command("ls", *both).stdout
-    assert command.json("reindex", *both)["runs"] == 2
+    assert command.json("index", "rebuild", *both)["runs"] == 2
 
 
 def documented():
@@ -389,4 +390,4 @@ def test_the_documented_examples_run(command, make, monkeypatch, tmp_path):
     for words in documented():
         result = command(*words)
         assert result.exit_code == 0, (words, result.stderr)
-    assert command.json("ls")[0]["note"] == "the step size of the paper"
+    assert command.json("ls")["runs"][0]["note"] == "the step size of the paper"

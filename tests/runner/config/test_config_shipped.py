@@ -44,7 +44,7 @@ def test_a_file_of_that_name_comes_first(tmp_path):
     [
         ("quik", "Did you mean 'quick'?"),
         ("configs/quick.yaml", "`dualtaxi run quick`"),
-        ("sweeps/modes.yaml", "`dualtaxi sweep modes`"),
+        ("sweeps/modes.yaml", "`dualtaxi sweep run modes`"),
         ("nothing", "`dualtaxi config ls`"),
     ],
 )
@@ -85,14 +85,14 @@ def test_a_folder_to_start_in_is_made_and_nothing_in_it_replaced(tmp_path):
 def test_a_sweep_and_an_experiment_name_the_command_of_the_other(tmp_path):
     Path("many.yaml").write_text("base: {episodes: 5}\nstrategy: grid\nparameters: {discount: [0.5]}\n")
     Path("one.yaml").write_text("episodes: 5\n")
-    assert "`dualtaxi sweep many.yaml`" in type_in("run", "many.yaml", code=2).stderr
-    assert "`dualtaxi run`" in type_in("sweep", "one.yaml", code=2).stderr
+    assert "`dualtaxi sweep run many.yaml`" in type_in("run", "many.yaml", code=2).stderr
+    assert "`dualtaxi run`" in type_in("sweep", "run", "one.yaml", code=2).stderr
 
 
 def test_mistakes_of_a_sweep_and_of_its_base_are_found_together():
     Path("bad.yaml").write_text(
         "base: {episodes: -1, epsilon: 7}\nstrategy: gird\nparameters: {discount: []}\nsides: 3\n"
     )
-    said = type_in("sweep", "bad.yaml", code=2).stderr
+    said = type_in("sweep", "run", "bad.yaml", code=2).stderr
     for key in ("episodes", "epsilon", "strategy", "parameters", "sides"):
         assert f": {key}" in said or f".{key}" in said

@@ -41,7 +41,7 @@ class TestChoice:
         assert [one.after for one, _ in selection.evaluations] == [40]
         assert "20 of 40 training episodes, evenly spread from 0 to 39" in selection.chosen[0]
         assert any("--all" in left and "20 training episodes" in left for left in selection.left_out)
-        assert any("--eval 20" in left for left in selection.left_out)
+        assert any("--evaluations 20" in left for left in selection.left_out)
         assert not selection.warnings
 
     def test_everything(self, rivals):

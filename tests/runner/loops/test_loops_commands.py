@@ -58,7 +58,7 @@ def dualtaxi(folder: Path, *words: str) -> Any:
 
 
 def test_ls_and_show_tell_of_loops(folder):
-    listed = json.loads(dualtaxi(folder, "ls", "--json").stdout)
+    listed = json.loads(dualtaxi(folder, "ls", "--json").stdout)["runs"]
     assert {run["name"] for run in listed} == {"lake", "again", "other", "pole", "rooms"}
     told = json.loads(dualtaxi(folder, "show", "pole", "--json").stdout)
     assert (told["train_steps"], told["eval_steps"]) == (400, 60)
@@ -71,7 +71,9 @@ def test_ls_and_show_have_the_returns_of_a_loop_and_what_it_logged(folder, name)
     with open_recording(runner.find_run(name, folder).recording) as recording:
         trials = recording.episodes("eval", 0, None)
         episodes = recording.episodes("train", 0, None)[-100:]
-    row = next(run for run in json.loads(dualtaxi(folder, "ls", "--json").stdout) if run["name"] == name)
+    row = next(
+        run for run in json.loads(dualtaxi(folder, "ls", "--json").stdout)["runs"] if run["name"] == name
+    )
     assert row["mean_return"] == pytest.approx(trials["returns"].sum(axis=1).mean())
     assert row["mean_length"] == pytest.approx(trials["length"].mean())
     assert row["logged"].keys() == {"loss"}
@@ -501,7 +503,7 @@ def test_values_that_are_not_finite_are_left_out_of_curves_and_counted(value, tm
 
 def test_a_new_name_is_in_every_picture_report_and_export(folder, tmp_path):
     shutil.copytree(folder, tmp_path / "runs")
-    dualtaxi(tmp_path / "runs", "rename", "lake", "mountain")
+    dualtaxi(tmp_path / "runs", "label", "lake", "--name", "mountain")
     run = runner.find_run("mountain", tmp_path / "runs")
     with open_recording(run.recording) as recording:
         assert recording.name == read_series(recording).name == "mountain"

@@ -226,7 +226,10 @@ def test_a_loop_without_a_seed_is_listed_without_one(tmp_path):
     for seed in (None, 0):
         runner.record(make("CartPole-v1"), tmp_path, name=f"seed-{seed}", seed=seed).close()
     listed = CliRunner().invoke(cli, ["ls", "--recordings", str(tmp_path), "--json"])
-    assert {row["name"]: row["seed"] for row in json.loads(listed.output)} == {"seed-None": None, "seed-0": 0}
+    assert {row["name"]: row["seed"] for row in json.loads(listed.output)["runs"]} == {
+        "seed-None": None,
+        "seed-0": 0,
+    }
     run = runner.find_run("seed-None", tmp_path)
     assert run.title == "seed-None"
     (run.folder / "run.json").unlink()  # the recording says it too

@@ -91,7 +91,7 @@ def test_no_value_in_a_run_file_hides_the_run_from_lists_or_keeps_it(recordings,
         (many / run_id / RUN_FILE).write_text(json.dumps(facts | {"run_id": run_id}))
         ids.append(run_id)
     listed = shown(many, "ls", "--json")
-    assert sorted(run["run_id"] for run in json.loads(listed.stdout)) == sorted(ids)
+    assert sorted(run["run_id"] for run in json.loads(listed.stdout)["runs"]) == sorted(ids)
     assert shown(many, "ls").exit_code == 0
     assert shown(many, "prune", "--keep-last", "0", "--dry-run").exit_code == 0
     damaged = shown(many, "ls", "--quiet", "status:damaged").stdout.split()
@@ -112,7 +112,9 @@ def test_a_damaged_run_says_what_of_it_is_wrong(recordings, client):
     assert "damaged" in flat
     assert what in client.get(f"/runs/{first.run_id}").text.replace("&#39;", "'")
     assert what in shown(recordings, "ls").stderr
-    (told,) = (run for run in json.loads(shown(recordings, "ls", "--json").stdout) if run["name"] == "first")
+    (told,) = (
+        run for run in json.loads(shown(recordings, "ls", "--json").stdout)["runs"] if run["name"] == "first"
+    )
     assert (told["status"], told["train_steps"]) == ("damaged", None)
 
 
@@ -145,7 +147,9 @@ def test_a_result_that_cannot_be_is_refused(recordings, tmp_path, key, wrong):
     assert shown(recordings, "show", made).exit_code == 0
     shutil.copy(made, first.recording)
     (first.folder / RUN_FILE).unlink()
-    (told,) = (run for run in json.loads(shown(recordings, "ls", "--json").stdout) if run["name"] == "first")
+    (told,) = (
+        run for run in json.loads(shown(recordings, "ls", "--json").stdout)["runs"] if run["name"] == "first"
+    )
     assert told["status"] == ("interrupted" if wrong == "running" else "damaged")
     assert shown(recordings, "show", first.run_id).exit_code == 0
     assert shown(recordings, "rm", "--yes", first.run_id).exit_code == 0

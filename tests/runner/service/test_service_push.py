@@ -98,13 +98,13 @@ def copies(run, folder, count):
 
 def test_a_run_is_pushed_and_pulled_with_all_that_is_known_of_it(server, run, recordings, tmp_path):
     change_labels(run.folder, lambda labels: replace(labels, name="renamed", tags=("good",), note="seen"))
-    push = ("push", run.run_id, "--recordings", recordings, "--server", server.url, "--json")
+    push = ("remote", "push", run.run_id, "--recordings", recordings, "--server", server.url, "--json")
     pushed = json.loads(dualtaxi(*push).stdout)
-    assert pushed == [
-        {"run_id": run.run_id, "name": "renamed", "bytes": run.summary["bytes"], "already": False}
-    ]
-    assert json.loads(dualtaxi(*push).stdout)[0]["already"]
-    pull = ("pull", "renamed", "--recordings", tmp_path / "back", "--server", server.url, "--json")
+    (stored,) = pushed["runs"]
+    expected = {"run_id": run.run_id, "name": "renamed", "bytes": run.summary["bytes"], "already": False}
+    assert stored == expected
+    assert json.loads(dualtaxi(*push).stdout)["runs"][0]["already"]
+    pull = ("remote", "pull", "renamed", "--recordings", tmp_path / "back", "--server", server.url, "--json")
     assert json.loads(dualtaxi(*pull).stdout)["content_digest"] == run.summary["content_digest"]
     assert json.loads(dualtaxi(*pull).stdout)["already"]
     back, run = find_run(run.run_id, tmp_path / "back"), find_run(run.run_id, recordings)
@@ -118,20 +118,22 @@ def test_an_exported_file_is_pushed_like_its_run(server, recordings, tmp_path):
     run = find_run("second", recordings)
     change_labels(run.folder, lambda labels: replace(labels, note="seen"))
     packed = export_mcap(run, tmp_path / "a.mcap").path
-    result = dualtaxi("push", packed, "--server", server.url)
+    result = dualtaxi("remote", "push", packed, "--server", server.url)
     assert (result.exit_code, "stored" in result.stdout) == (0, True)
     assert find_run(run.run_id, server.recordings).recording.read_bytes() == run.recording.read_bytes()
 
 
 def test_what_cannot_be_pushed_is_said_and_the_others_are_pushed(server, run, recordings):
-    result = dualtaxi("push", "nosuch", run.run_id, "--recordings", recordings, "--server", server.url)
+    result = dualtaxi(
+        "remote", "push", "nosuch", run.run_id, "--recordings", recordings, "--server", server.url
+    )
     assert result.exit_code == 2
     assert "nosuch" in result.stderr
     assert run.run_id in result.stdout
-    assert dualtaxi("push", run.run_id, "--recordings", recordings).exit_code == 2
-    assert dualtaxi("push", "--server", server.url).exit_code == 2
-    assert dualtaxi("pull", "x", "--server", "ftp://there").exit_code == 2
-    missing = dualtaxi("pull", "nosuch", "--server", server.url, "--recordings", recordings)
+    assert dualtaxi("remote", "push", run.run_id, "--recordings", recordings).exit_code == 2
+    assert dualtaxi("remote", "push", "--server", server.url).exit_code == 2
+    assert dualtaxi("remote", "pull", "x", "--server", "ftp://there").exit_code == 2
+    missing = dualtaxi("remote", "pull", "nosuch", "--server", server.url, "--recordings", recordings)
     assert (missing.exit_code, "nosuch" in missing.stderr) == (2, True)
 
 
@@ -148,7 +150,7 @@ def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recor
     token = dualtaxi("token", "create", "pusher", "--scope", "write").stdout.strip()
     own_server.options = ("--require-token",)
     own_server.start()
-    push = ("push", run.run_id, "--recordings", recordings, "--server", own_server.url)
+    push = ("remote", "push", run.run_id, "--recordings", recordings, "--server", own_server.url)
     refused = dualtaxi(*push, "--token", "dualtaxi_wrong")
     assert (refused.exit_code, "token" in refused.stderr) == (2, True)
     (tmp_path / "token").write_text(token + "\n")
@@ -358,17 +360,17 @@ def test_a_loop_that_failed_at_length_is_pushed_with_the_beginning_of_its_error(
 
 def test_a_loop_whose_server_is_away_waits_in_the_outbox(own_server, outbox, monkeypatch):
     monkeypatch.setattr("runner.client.outbox.LAST_SECONDS", 0.5)
-    with pytest.warns(UserWarning, match="dualtaxi push --outbox"):  # noqa: SIM117
+    with pytest.warns(UserWarning, match="dualtaxi remote push --outbox"):  # noqa: SIM117
         with runner.record(gymnasium.make("FrozenLake-v1"), own_server.url, name="away") as rec:
             drive(rec, 500)
     assert find_run(rec.run.run_id, outbox).status == "finished"
     own_server.start()
-    result = dualtaxi("push", "--outbox", "--json")
-    assert [run["run_id"] for run in json.loads(result.stdout)] == [rec.run.run_id]
+    result = dualtaxi("remote", "push", "--outbox", "--json")
+    assert [run["run_id"] for run in json.loads(result.stdout)["runs"]] == [rec.run.run_id]
     stored = find_run(rec.run.run_id, own_server.recordings)
     assert stored.summary["content_digest"] == rec.run.summary["content_digest"]
     assert list(outbox.iterdir()) == []
-    assert "empty" in dualtaxi("push", "--outbox").stderr
+    assert "empty" in dualtaxi("remote", "push", "--outbox").stderr
 
 
 def test_a_loop_that_is_killed_leaves_what_it_recorded(server, outbox):
@@ -379,7 +381,7 @@ def test_a_loop_that_is_killed_leaves_what_it_recorded(server, outbox):
     (run,) = list_runs(outbox)
     assert run.status == "interrupted"
     data = run.recording.read_bytes()
-    result = dualtaxi("push", "--outbox")
+    result = dualtaxi("remote", "push", "--outbox")
     assert result.exit_code == 0, result.stderr
     stored = find_run(run.run_id, server.recordings)
     assert (stored.status, stored.recording.read_bytes()) == ("interrupted", data)

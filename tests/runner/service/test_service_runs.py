@@ -13,7 +13,7 @@ from runner.cli import cli
 def _ls(recordings, *words):
     result = CliRunner().invoke(cli, ["ls", *words, "--json", "--recordings", str(recordings)])
     assert result.exit_code == 0, result.output
-    return json.loads(result.stdout)
+    return json.loads(result.stdout)["runs"]
 
 
 def test_the_list_is_that_of_ls(client, recordings):

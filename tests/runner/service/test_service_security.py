@@ -254,14 +254,14 @@ def test_no_path_names_a_run(client, name):
 
 
 def test_a_note_and_tags_are_checked_as_by_the_commands(client):
-    for wrong in ({"name": "<script>"}, {"add_tags": ["a b"]}, {"note": "x" * 10_001}, {"name": "../x"}):
+    for wrong in ({"name": "<script>"}, {"tag": ["a b"]}, {"note": "x" * 10_001}, {"name": "../x"}):
         assert client.patch(RUN, json=wrong).status_code in (400, 422)
-    said = {"name": "renamed", "add_tags": ["keep", "a"], "note": "<script>alert(1)</script>"}
+    said = {"name": "renamed", "tag": ["keep", "a"], "note": "<script>alert(1)</script>"}
     told = client.patch(RUN, json=said).json()
     assert (told["name"], told["tags"], told["note"]) == ("renamed", ["a", "keep"], said["note"])
     (row,) = client.get(RUNS, params={"filter": "tag:keep"}).json()["runs"]
     assert row["name"] == "renamed"
-    back = client.patch(f"{RUNS}/renamed", json={"name": "", "remove_tags": ["a"], "note": ""}).json()
+    back = client.patch(f"{RUNS}/renamed", json={"name": "", "untag": ["a"], "note": ""}).json()
     assert (back["name"], back["tags"], back["note"]) == ("first", ["keep"], "")
 
 
@@ -343,7 +343,7 @@ def test_tokens_are_made_listed_and_revoked_by_the_command(monkeypatch, tmp_path
     kept = Tokens(tokens_file())
     assert kept.find(secret).scopes == (READ,)
     assert kept.find(writes["token"]).scopes == (READ, WRITE)
-    listed = json.loads(said("ls", "--json").stdout)
+    listed = json.loads(said("ls", "--json").stdout)["tokens"]
     assert [token["name"] for token in listed] == ["laptop", "pusher"]
     assert secret not in said("ls").stdout
     assert said("revoke", "nobody").exit_code == 2

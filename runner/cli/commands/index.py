@@ -1,4 +1,4 @@
-"""`dualtaxi reindex`: the index of runs, made anew."""
+"""`dualtaxi index`: the index of runs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from runner.cli import Group
 from runner.cli.options import folders_option, json_option
 from runner.cli.output import duration, facts, print_json, say
+from runner.errors import ExitCode
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index
@@ -25,11 +27,21 @@ class _Found:
     problems: list[str]
 
 
-@click.command("reindex")
+@click.group("index", cls=Group)
+def command() -> None:
+    """Manage the index of runs, which makes listing them quick.
+
+    \b
+    Example:
+      dualtaxi index rebuild
+    """  # noqa: D301 - Click wants the backspace itself
+
+
+@command.command("rebuild")
 @folders_option
 @json_option
 @click.pass_context
-def command(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> None:
+def rebuild(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> None:
     """Rebuild the index from the runs in the recordings folder.
 
     This is never required: commands notice changes by themselves, and the index holds nothing of its own.
@@ -37,8 +49,8 @@ def command(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
 
     \b
     Examples:
-      dualtaxi reindex
-      dualtaxi reindex --recordings /data/runs --recordings recordings
+      dualtaxi index rebuild
+      dualtaxi index rebuild --recordings /data/runs --recordings recordings
     """  # noqa: D301 - Click wants the backspace itself
     from runner.runs.catalogue.database import index_path
     from runner.runs.catalogue.index import look
@@ -51,7 +63,7 @@ def command(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
         print_json(told | {"problems": found.problems, "seconds": round(took, 3), "index": str(index_path())})
     else:
         _print(found, took, str(index_path()))
-    ctx.exit(1 if found.problems else 0)
+    ctx.exit(ExitCode.DIFFERENT if found.problems else ExitCode.OK)
 
 
 def _found(index: Index) -> _Found:

@@ -1,0 +1,363 @@
+"""`dualtaxi remote`: runs and jobs on a server."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.cli import Group, error_as_json, exit_code_of
+from runner.cli.finding import find_recorded
+from runner.cli.options import json_option, limit_option, recordings_option
+from runner.cli.output import UNKNOWN, draw, facts, print_json, say, size, table
+from runner.cli.parameters import ConfigName, RunName
+from runner.errors import ExitCode, RunnerError
+
+if TYPE_CHECKING:
+    from runner.client.client import Client
+    from runner.client.connection import Report
+    from runner.client.jobs import JobEvent, RemoteJob
+    from runner.client.upload_source import UploadStatus
+    from runner.runs.run import Run
+
+    Push = Callable[[Report], tuple[UploadStatus, str, int]]
+    """Uploads a run; returns the upload, the run's name and its bytes."""
+
+
+@dataclass(frozen=True)
+class Server:
+    """The server that the options name, and the token for it."""
+
+    url: str | None
+    token: str | None
+
+    def client(self, default_url: str | None = None) -> Client:
+        """Return a client of the server.
+
+        Raises:
+            UsageError: no server was named.
+        """
+        from runner.client.client import Client
+
+        url = self.url or default_url
+        if not url:
+            raise click.UsageError("missing option '--server', such as --server http://localhost:8000.")
+        return Client(url, self.token, tell=say)
+
+
+def _server_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add --server, --token and --token-file to a command, which receives a `Server`."""
+
+    @click.option(
+        "--server",
+        "url",
+        metavar="URL",
+        envvar="DUALTAXI_SERVER",
+        help="The server, such as http://localhost:8000.  [default: $DUALTAXI_SERVER]",
+    )
+    @click.option(
+        "--token",
+        metavar="TOKEN",
+        help="The access token.  [default: $DUALTAXI_TOKEN, or the file $DUALTAXI_TOKEN_FILE]",
+    )
+    @click.option(
+        "--token-file",
+        type=click.Path(dir_okay=False, path_type=Path),
+        metavar="FILE",
+        help="A file with the token; unlike --token, no other user can see it.",
+    )
+    @functools.wraps(command)
+    def with_server(
+        *args: Any, url: str | None, token: str | None, token_file: Path | None, **rest: Any
+    ) -> Any:
+        from runner.client.address import find_token
+
+        return command(*args, server=Server(url, find_token(token, token_file)), **rest)
+
+    return with_server
+
+
+_job_argument = click.argument("number", metavar="JOB", type=click.IntRange(1))
+
+
+@click.group("remote", cls=Group)
+def command() -> None:
+    """Upload and download runs, and submit and control jobs on a server (`dualtaxi serve`).
+
+    \b
+    Examples:
+      dualtaxi remote push @latest --server http://localhost:8000
+      dualtaxi remote submit quick --server http://localhost:8000 --watch
+      dualtaxi remote jobs --server http://localhost:8000
+    """  # noqa: D301 - Click wants the backspace itself
+
+
+# --- runs -------------------------------------------------------------------------------------------------
+
+
+@command.command("push")
+@click.argument("names", metavar="[RUN]...", nargs=-1, type=RunName())
+@click.option(
+    "--outbox",
+    is_flag=True,
+    help="Upload the runs that could not be sent while they were recorded, each to its server.",
+)
+@_server_options
+@recordings_option
+@json_option
+def push(
+    names: tuple[str, ...], outbox: bool, server: Server, recordings: Path | None, as_json: bool
+) -> None:
+    """Upload runs to a server, which lists them once it has verified every byte.
+
+    RUN may also be the path of a recording. An upload resumes after a broken connection, and a run that the
+    server already has is left as it is. With --outbox, the runs that `runner.record(env, "http://...")` could
+    not send are sent now.
+
+    \b
+    Examples:
+      dualtaxi remote push @latest --server http://localhost:8000
+      dualtaxi remote push k3v9m2xq 7wd2qhmz --server https://runs.example.org --token-file ~/.dualtaxi-token
+      dualtaxi remote push --outbox
+    """  # noqa: D301 - Click wants the backspace itself
+    if bool(names) == outbox:
+        raise click.UsageError("expected either runs or --outbox.")
+    runs: list[dict[str, Any]] = []
+    codes: list[int] = []
+    for name, push_run in _outbox(server) if outbox else _runs(names, server, recordings):
+        try:
+            runs.append(_pushed(name, push_run))
+        except RunnerError as error:
+            codes.append(exit_code_of(error))
+            message = f"{name}: {error}"
+            say(error_as_json(message, codes[-1], run=name) if as_json else f"Error: {message}")
+    if as_json:
+        print_json({"runs": runs})
+    elif runs:
+        drawn = table("run", "name", "size", "", left=("run", "name", ""))
+        for run in runs:
+            outcome = "was there already" if run["already"] else "stored"
+            drawn.add_row(run["run_id"], run["name"], size(run["bytes"]), outcome)
+        draw(drawn)
+    if codes:
+        raise click.exceptions.Exit(max(codes))
+
+
+def _runs(names: tuple[str, ...], server: Server, recordings: Path | None) -> Iterator[tuple[str, Push]]:
+    """Yield the named runs, and the function that uploads each."""
+    from runner.client.upload_source import UploadSource
+
+    def push_run(name: str, report: Report) -> tuple[UploadStatus, str, int]:
+        source = UploadSource.of(find_recorded(name, recordings))
+        return client.push(source, report), source.name, source.path.stat().st_size
+
+    with server.client() as client:
+        for name in names:
+            yield name, functools.partial(push_run, name)
+
+
+def _outbox(server: Server) -> Iterator[tuple[str, Push]]:
+    """Yield the runs in the outbox, and the function that uploads each."""
+    from runner.client.outbox import deliver, outbox_folder, waiting
+
+    def push_run(run: Run, url: str, report: Report) -> tuple[UploadStatus, str, int]:
+        run_bytes = run.recording.stat().st_size
+        with server.client(url) as client:
+            return deliver(run, client, report), run.name, run_bytes
+
+    found = waiting(outbox_folder())
+    if not found:
+        say(f"The outbox {outbox_folder()} is empty; there is nothing to do.")
+    for run, url in found:
+        yield run.run_id, functools.partial(push_run, run, url)
+
+
+def _pushed(name: str, push_run: Push) -> dict[str, Any]:
+    from runner.cli.progress import bytes_line
+
+    with bytes_line(f"pushing {name}") as report:
+        sent, run_name, run_bytes = push_run(report)
+    return {"run_id": sent.run_id, "name": run_name, "bytes": run_bytes, "already": sent.already}
+
+
+@command.command("pull")
+@click.argument("run_name", metavar="RUN")
+@_server_options
+@recordings_option
+@json_option
+def pull(run_name: str, server: Server, recordings: Path | None, as_json: bool) -> None:
+    """Download RUN from a server into the folder of runs, with its tags and note.
+
+    RUN is named as the server knows it: its id, the beginning of one, its name, or @latest. Every byte is
+    checked before the run appears; a run that is here already with the same content is left as it is.
+
+    \b
+    Examples:
+      dualtaxi remote pull @latest --server http://localhost:8000
+      dualtaxi remote pull k3v9m2xq --server https://runs.example.org --token-file ~/.dualtaxi-token
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.progress import bytes_line
+    from runner.cli.working import tell_received
+    from runner.runs.run import recordings_folder
+
+    with server.client() as client, bytes_line(f"pulling {run_name}") as report:
+        pulled = client.pull(run_name, recordings_folder(recordings), report)
+    already = "this content" if pulled.already else ""
+    tell_received(pulled.run, pulled.content_digest, already, as_json)
+
+
+# --- jobs -------------------------------------------------------------------------------------------------
+
+
+@command.command("submit")
+@click.argument("file", metavar="FILE", type=ConfigName())
+@click.option(
+    "--watch", "is_watched", is_flag=True, help="Wait until the job is over, and show its progress."
+)
+@_server_options
+@json_option
+@click.pass_context
+def submit(ctx: click.Context, file: Path, is_watched: bool, server: Server, as_json: bool) -> None:
+    """Submit the experiment or sweep in FILE to a server.
+
+    The server checks it as `dualtaxi run` would, and queues it. The server's pages and `dualtaxi remote
+    watch` show its progress.
+
+    Exit code 0 when it is queued, or with --watch finished; 1 when it failed or was cancelled.
+
+    \b
+    Examples:
+      dualtaxi remote submit quick --server http://localhost:8000
+      dualtaxi remote submit hyperparameters --server http://localhost:8000 --watch
+    """  # noqa: D301 - Click wants the backspace itself
+    from runner.config.shipped import config_path
+    from runner.sweep.loading import self_contained_text
+
+    with server.client() as client:
+        file = config_path(file)
+        job = client.submit(self_contained_text(file), file.name)
+        runs = "1 run" if job.runs == 1 else f"{job.runs:,} runs"
+        say(f"Job {job.number}: {job.name}, {runs}; {client.url}/queue/{job.number}")
+        if is_watched:
+            job = _watched(client, job.number)
+    _print_job(job, as_json)
+    if is_watched and job.state != "finished":
+        ctx.exit(ExitCode.DIFFERENT)
+
+
+@command.command("jobs")
+@limit_option(20)
+@_server_options
+@json_option
+def jobs(limit: int, server: Server, as_json: bool) -> None:
+    """List the jobs of a server, newest first.
+
+    \b
+    Example:
+      dualtaxi remote jobs --server http://localhost:8000
+    """  # noqa: D301 - Click wants the backspace itself
+    with server.client() as client:
+        found = client.jobs(limit or 1000)
+    if as_json:
+        print_json({"jobs": [_job_as_json(job) for job in found]})
+    elif found:
+        drawn = table(
+            "job", "kind", "name", "state", "runs", left=("kind", "name", "state"), shrinking=("name",)
+        )
+        for job in found:
+            drawn.add_row(str(job.number), job.kind, job.name, job.state, f"{job.runs:,}")
+        draw(drawn)
+    else:
+        say("No jobs yet. `dualtaxi remote submit FILE` submits one.")
+
+
+@command.command("watch")
+@_job_argument
+@_server_options
+@json_option
+@click.pass_context
+def watch(ctx: click.Context, number: int, server: Server, as_json: bool) -> None:
+    """Show the progress of JOB until it is over; Ctrl-C ends the watching, not the job.
+
+    A broken connection is restored. Exit code 0 when the job finished, 1 when it failed or was cancelled.
+
+    \b
+    Example:
+      dualtaxi remote watch 12 --server http://localhost:8000
+    """  # noqa: D301 - Click wants the backspace itself
+    with server.client() as client:
+        job = _watched(client, number)
+    _print_job(job, as_json)
+    if job.state != "finished":
+        ctx.exit(ExitCode.DIFFERENT)
+
+
+@command.command("cancel")
+@_job_argument
+@_server_options
+@json_option
+def cancel(number: int, server: Server, as_json: bool) -> None:
+    """Cancel JOB, whether queued or running; what it has recorded is kept.
+
+    \b
+    Example:
+      dualtaxi remote cancel 12 --server http://localhost:8000
+    """  # noqa: D301 - Click wants the backspace itself
+    with server.client() as client:
+        _print_job(client.cancel(number), as_json)
+
+
+@command.command("resume")
+@_job_argument
+@click.option("--accept-changes", is_flag=True, help="Resume although the code has changed.")
+@_server_options
+@json_option
+def resume(number: int, accept_changes: bool, server: Server, as_json: bool) -> None:
+    """Resume JOB, which failed or was cancelled, as if it had never stopped.
+
+    \b
+    Example:
+      dualtaxi remote resume 12 --server http://localhost:8000
+    """  # noqa: D301 - Click wants the backspace itself
+    with server.client() as client:
+        _print_job(client.resume(number, accept_changes), as_json)
+
+
+def _watched(client: Client, number: int) -> RemoteJob:
+    """Print the events of a job on stderr until it is over, and return it."""
+    _print_events(client.watch(number))
+    return client.job(number)
+
+
+def _print_events(events: Iterable[JobEvent]) -> None:
+    for event in events:
+        if event.kind == "log":
+            seed = f"seed {event.data['seed']}: " if "seed" in event.data else ""
+            say(f"{seed}{event.data['text']}")
+        elif event.kind == "state":
+            say(event.data["state"])
+
+
+def _print_job(job: RemoteJob, as_json: bool) -> None:
+    if as_json:
+        print_json(_job_as_json(job))
+        return
+    runs = "\n".join(f"{run_id}  seed {seed}" for seed, run_id in job.begun.items())
+    rows = {"job": f"{job.number}  {job.name}, {job.state}", "runs": runs or UNKNOWN, "error": job.error}
+    draw(facts({key: text for key, text in rows.items() if text}))
+
+
+def _job_as_json(job: RemoteJob) -> dict[str, Any]:
+    return {
+        "number": job.number,
+        "kind": job.kind,
+        "name": job.name,
+        "state": job.state,
+        "runs": job.runs,
+        "begun": [{"seed": seed, "run_id": run_id} for seed, run_id in job.begun.items()],
+        "error": job.error,
+    }
