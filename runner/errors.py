@@ -36,7 +36,7 @@ class ExitCode(IntEnum):
         return member
 
     OK = 0, "success"
-    DIFFERENT = 1, "something differs or was found; a disk is full; a server does not answer"
+    DIFFERENT = 1, "a difference or a problem was found, a disk is full, or a server does not respond"
     USAGE = 2, "wrong usage or input"
     INTERRUPTED = 130, "interrupted"
 
