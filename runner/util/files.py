@@ -13,8 +13,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from blake3 import blake3
-
 from runner.errors import StorageError
 from runner.util.values import without_surrogates
 
@@ -58,6 +56,8 @@ def hash_of(path: Path) -> tuple[int, str]:
     Raises:
         OSError: it cannot be read.
     """
+    from blake3 import blake3  # listing runs does not need it
+
     with open_regular(path) as stream:
         digest = hashlib.file_digest(stream, blake3)  # type: ignore[arg-type] # its update returns itself
         return stream.tell(), digest.hexdigest()
