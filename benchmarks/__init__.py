@@ -1,4 +1,4 @@
-"""Benchmarks: how fast, how small, compared with the textbook way in the same run.
+"""Benchmarks of speed, size and memory, each against a reference in the same run.
 
     python -m benchmarks [NAME ...] [--json FILE] [--quick]
 
@@ -6,6 +6,6 @@ A benchmark is a file `bench_NAME.py` with
 
     def measure(quick: bool) -> list[Figure]
 
-where `quick` asks for fewer repetitions and shorter work. Nothing fails for being slow: the table puts
-each figure beside what is to be reached, and the reader judges.
+where `quick` means fewer repetitions and shorter work. No benchmark fails for being slow: the table lists
+each figure with its targets.
 """

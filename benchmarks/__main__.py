@@ -19,11 +19,11 @@ from benchmarks.machine import OtherWork, machine
 
 PREFIX = "bench_"
 DISTURBING = 0.1
-"""Cores that others may use before the table says so."""
+"""Cores used by other processes from which the table notes it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the benchmarks and print their table; return 0, however slow they are."""
+    """Run the benchmarks and print their table; always return 0."""
     names = sorted(
         module.name.removeprefix(PREFIX)
         for module in pkgutil.iter_modules(benchmarks.__path__)
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         prog="python -m benchmarks", description="Measure speed, size and memory."
     )
     parser.add_argument(
-        "names", nargs="*", metavar="NAME", help=f"which ones, all unless given: {', '.join(names)}"
+        "names", nargs="*", metavar="NAME", help=f"the benchmarks to run, by default all: {', '.join(names)}"
     )
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures to FILE")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions, shorter work")
@@ -55,9 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             rows.append({"benchmark": name, **dataclasses.asdict(figure), "standing": figure.standing})
             rows[-1]["other_work_cores"] = round(other.cores, 2)
         if other.cores > DISTURBING:
-            print(
-                f"    disturbed: other work on the machine took {other.cores:.1f} cores meanwhile", flush=True
-            )
+            print(f"    disturbed: other processes used {other.cores:.1f} cores", flush=True)
     if options.json:
         text = json.dumps({"machine": facts, "figures": rows}, indent=1, ensure_ascii=False)
         options.json.write_text(text + "\n", encoding="utf-8")
@@ -72,6 +70,6 @@ def _measure(name: str, quick: bool) -> list[Figure]:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory(prefix="dualtaxi-benchmarks-") as folder:
-        tempfile.tempdir = folder  # recordings go there, and are gone at the end whatever happens
+        tempfile.tempdir = folder  # recordings are written there and always removed
         os.environ["NUMBA_CACHE_DIR"] = str(Path(folder, "kernels"))  # before anything imports numba
         sys.exit(main())

@@ -1,4 +1,4 @@
-"""The archive of the cooperative tutorial: bytes a step, seconds each way, peak memory; also when longer."""
+"""Archives of the cooperative tutorial: bytes per step, time, peak memory, also of a longer run."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class RoundTrip:
 
     archive: Process
     checked: Process
-    """The same with `--remove`: packed, read back and compared."""
+    """The same with `--remove`: written, read back and compared."""
     restore: Process
     steps: int
     archive_bytes: int
@@ -29,16 +29,16 @@ class RoundTrip:
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return them; twice as long is enough for a quick look, else ten times."""
+    """Return size, times and peak memory; the longer run has ten times the episodes, or two if quick."""
     times = 2 if quick else 10
     run_config("quick")  # compiles
     trips = [round_trip() for _ in range(1 if quick else 3)]
     longer = round_trip(f"episodes={times * EPISODES}")
     size = [trip.archive_bytes / trip.steps for trip in trips]
     first = trips[0]
-    told = f"{first.steps / 1e6:.1f} M steps, {first.recording_bytes / 1e6:.0f} MB before"
+    detail = f"{first.steps / 1e6:.1f} M steps, {first.recording_bytes / 1e6:.0f} MB before"
     return [
-        figure("archive, bytes a step", size, "bytes", (4, 2.7), higher_is_better=False, detail=told),
+        figure("archive, bytes per step", size, "bytes", (4, 2.7), higher_is_better=False, detail=detail),
         *_times("archive", [trip.archive for trip in trips]),
         *_times("archive --remove", [trip.checked for trip in trips]),
         *_times("restore", [trip.restore for trip in trips]),
@@ -78,11 +78,11 @@ def _size(files: list[Path]) -> int:
 def _times(what: str, processes: list[Process]) -> list[Figure]:
     cpu = sum(process.cpu_seconds for process in processes) / len(processes)
     wall = [process.seconds for process in processes]
-    detail = f"the whole command; {cpu:.1f} s of processor time"
+    detail = f"whole command; {cpu:.1f} s of processor time"
     return [figure(f"{what}, tutorial", wall, "s", (15, 5), higher_is_better=False, detail=detail)]
 
 
-def _peak(what: str, trips: list[RoundTrip], detail: str = "resident, all of it") -> Figure:
+def _peak(what: str, trips: list[RoundTrip], detail: str = "resident") -> Figure:
     peaks = [
         max(process.peak_megabytes for process in (trip.archive, trip.checked, trip.restore))
         for trip in trips

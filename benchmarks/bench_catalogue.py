@@ -1,6 +1,6 @@
-"""How long the catalogue takes: `ls` over ten thousand runs, and reading a thousand recordings anew.
+"""The catalogue: `ls` over ten thousand runs, and rebuilding the index of a thousand recordings.
 
-`python -m benchmarks.bench_catalogue 100000` measures commands over so many runs, and their peak memory.
+`python -m benchmarks.bench_catalogue 100000` measures time and peak memory of commands over 100,000 runs.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ place = Path(sys.argv[2])
 _, sums = usage_of(lambda work: look([place], work, as_known=True), Filter(None), 50)
 sums.freeable([place])
 """
-"""The work of the page `/disk` in a process of its own; what the service looked at before is not repeated."""
+"""The work of the page `/disk` in a separate process, with an index that is up to date."""
 OLD = 1_700_000_000
-"""When the files were last changed, as far as can be seen: an index need not read them twice."""
+"""Modification time of the files: old enough for the index to trust it."""
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return seconds of whole commands; clock and processor time, since others' work disturbs the clock."""
+    """Return the processor time of whole commands."""
     repetitions = 3 if quick else 10
     with tempfile.TemporaryDirectory() as folder:
         environment = {CACHE_VARIABLE: f"{folder}/cache", "COLUMNS": "120"}
@@ -59,19 +59,19 @@ def measure(quick: bool) -> list[Figure]:
         filtered = timed("ls", "--limit", "50", "--sort", "-success_percent", FILTER, place=described)
         shown = timed("show", "r00042", place=described)
         reindexed = timed("reindex", place=recorded)
-    note = f"{LISTED:,} runs, each in its folder; processor time of the whole command"
+    note = f"{LISTED:,} runs; processor time of the whole command"
     return [
         figure("ls", lists, "s", (0.8, 0.4), higher_is_better=False, detail=note),
         figure("ls with a filter, sorted", filtered, "s", (0.8, 0.4), higher_is_better=False, detail=FILTER),
-        figure("ls that makes the index first", first, "s", higher_is_better=False),
-        figure("show of a run by the beginning of its id", shown, "s", higher_is_better=False),
+        figure("ls without an index", first, "s", higher_is_better=False),
+        figure("show of a run by a prefix of its id", shown, "s", higher_is_better=False),
         figure(
             f"reindex of {RECORDED:,} recordings",
             reindexed,
             "s",
             (20, 5),
             higher_is_better=False,
-            detail="small ones, copied; half of them without run.json, so that they are opened",
+            detail="small copies, half of them without run.json, which have to be opened",
         ),
     ]
 
@@ -95,7 +95,7 @@ def measure_many(count: int) -> list[Figure]:
             *measured("reindex", *command("index", "rebuild")),
             *measured("first du", *command("du")),
             *measured("du", *command("du"), times=3),
-            *measured("what /disk calls", sys.executable, "-c", DISK, times=3),
+            *measured("the page /disk", sys.executable, "-c", DISK, times=3),
             *measured("prune --dry-run", *command("prune", "--older-than", "1d", "--dry-run")),
             *measured("ls --json", *command("ls", "--json")),
         ]
@@ -109,7 +109,7 @@ def one_run(folder: Path) -> Path:
 
 
 def many(small: Path, folder: Path, count: int, recordings: bool) -> Path:
-    """Return a folder with runs like one, but with ids, seeds, settings and results of their own."""
+    """Return a folder with copies of a run that have different ids, seeds, settings and results."""
     facts = json.loads((small / RUN_FILE).read_text())
     rng = random.Random(0)
     for number in range(count):
@@ -130,7 +130,7 @@ def many(small: Path, folder: Path, count: int, recordings: bool) -> Path:
 
 
 def age(paths: Iterable[Path]) -> None:
-    """Make files look as if they had last changed long ago."""
+    """Set an old modification time."""
     for path in paths:
         os.utime(path, (OLD, OLD))
 

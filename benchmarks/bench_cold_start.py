@@ -1,4 +1,4 @@
-"""How long the command line takes to answer when it has little to do."""
+"""Start-up time of the command line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ RUNS = 5
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return seconds of `dualtaxi --help`, and of `dualtaxi ls` in a folder with a few runs."""
+    """Return the time of `dualtaxi --help`, and of `dualtaxi ls` in a folder with a few runs."""
     repetitions = 3 if quick else 10
     with tempfile.TemporaryDirectory() as recordings:
         for _ in range(RUNS):
@@ -25,7 +25,7 @@ def measure(quick: bool) -> list[Figure]:
         figure(
             "dualtaxi ls", lists, "s", (0.6, 0.2), higher_is_better=False, detail=f"{RUNS} runs in the folder"
         ),
-        figure("  Python itself, doing nothing", bare, "s", higher_is_better=False),
+        figure("  Python itself", bare, "s", higher_is_better=False),
     ]
 
 

@@ -1,4 +1,4 @@
-"""`dualtaxi diff` of two tutorial runs, the whole command: seconds, and memory at ten times the length."""
+"""`dualtaxi diff` of two tutorial runs: time of the whole command, and memory for longer runs."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ OTHERS = {"another discount": "discount=0.8", "another seed": "seed=1"}
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return seconds and megabytes; of runs ten times as long as well."""
+    """Return times and peak memory, also for runs ten times as long."""
     repetitions, times = (3, 2) if quick else (7, 10)
     figures = []
     with tempfile.TemporaryDirectory() as folder:
         record(folder)
-        for told, other in OTHERS.items():
+        for name, other in OTHERS.items():
             whole = [compared(folder, other) for _ in range(repetitions)]
             first = [compared(folder, other, "--first") for _ in range(repetitions)]
             figures += [
-                _seconds(f"diff, {told}", whole, (8, 3)),
-                _seconds(f"diff --first, {told}", first, (0.7, 0.3)),
-                _peak(f"  peak memory, {told}", whole),
+                _seconds(f"diff, {name}", whole, (8, 3)),
+                _seconds(f"diff --first, {name}", first, (0.7, 0.3)),
+                _peak(f"  peak memory, {name}", whole),
             ]
     with tempfile.TemporaryDirectory() as folder:
         record(folder, f"episodes={50_000 * times}")
         longer = [compared(folder, other) for other in OTHERS.values()]
-    return [*figures, _peak(f"  of runs {times} times as long", longer)]
+    return [*figures, _peak(f"  for runs {times} times as long", longer)]
 
 
 def _seconds(what: str, processes: Sequence[Process], targets: tuple[float, float]) -> Figure:
     cpu = statistics.median(process.cpu_seconds for process in processes)
     seconds = [process.seconds for process in processes]
-    detail = f"{cpu:.2f} s of processor time, of all threads"
+    detail = f"{cpu:.2f} s of processor time in all threads"
     return figure(what, seconds, "s", targets, higher_is_better=False, detail=detail)
 
 
@@ -47,7 +47,7 @@ def _peak(what: str, processes: Sequence[Process]) -> Figure:
 
 
 def record(folder: str, *overrides: str) -> None:
-    """Record the tutorial's run, and those it is compared with."""
+    """Record the tutorial's run and those to compare it with."""
     for other in ("name=base", *(f"name={named(other)}" for other in OTHERS.values())):
         sets = [text for text in OTHERS.values() if other == f"name={named(text)}"]
         run(run_command(CONFIG, folder, *overrides, *sets, other))
@@ -55,12 +55,12 @@ def record(folder: str, *overrides: str) -> None:
 
 
 def named(override: str) -> str:
-    """Return what the run with another value is called."""
+    """Return the name of the run with an override."""
     return override.replace("=", "_").replace(".", "_")
 
 
 def compared(folder: str, other: str, *options: str) -> Process:
-    """Compare the base run with another, and return what it took."""
+    """Compare the base run with another and return time and memory."""
     names = ["base", named(other)]
     return run([sys.executable, "-c", PROGRAM, "diff", *names, "--recordings", folder, *options])
 
@@ -73,4 +73,4 @@ try:
 except SystemExit as exit:
     sys.exit(exit.code != 1)
 """
-"""Calls the command; that the runs differ, its exit code 1, is what is expected."""
+"""Calls the command, whose expected exit code is 1: the runs differ."""

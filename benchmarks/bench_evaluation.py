@@ -1,4 +1,4 @@
-"""The evaluation kernel filling step records, on tables trained as the tutorial trains them."""
+"""The evaluation kernel, filling step records, with the tables of the trained tutorial."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from benchmarks.learners import NO_LIMIT, blocks, train, tutorial_learner
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return evaluation steps a second, on one core."""
+    """Return evaluation steps per second on one core."""
     repetitions, wanted = (3, 2_000_000) if quick else (9, 20_000_000)
     learner = tutorial_learner()
     train(learner, learner.config.episodes)

@@ -1,4 +1,4 @@
-"""The Rerun export: the default choice and every step as commands, and against `rr.log` called a step."""
+"""The Rerun export: the default selection, every step, and against one `rr.log` call per step."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Export:
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return time, size and memory of exports; the whole tutorial, a tenth of it for a quick look."""
+    """Return time, size and memory of exports of the tutorial, or of a tenth of it if quick."""
     episodes = 5_000 if quick else 50_000
     repetitions = 2 if quick else 3
     with tempfile.TemporaryDirectory() as folder:
@@ -51,34 +51,34 @@ def measure(quick: bool) -> list[Figure]:
     growth = 100 * (figure("", peaks, "").value / _peak(short) - 1)
     times = figure("", [one.process.cpu_seconds for one in whole], "").value
     return [
-        _lower("export of the default choice", [one.process.seconds for one in chosen], "s", (15, 5)),
+        _lower("export of the default selection", [one.process.seconds for one in chosen], "s", (15, 5)),
         figure(
             "export of every step",
             rates,
             "steps/s",
             (150_000, 400_000),
-            detail=f"{steps / 1e6:.2f} M steps, process start to end; {times:.1f} s of processor time",
+            detail=f"{steps / 1e6:.2f} M steps, whole process; {times:.1f} s of processor time",
         ),
-        _lower("  the file a step", [size / steps], "bytes", (250, 250), detail=f"{size / 1e9:.2f} GB"),
+        _lower("  file size per step", [size / steps], "bytes", (250, 250), detail=f"{size / 1e9:.2f} GB"),
         figure(
-            "  against rr.log a step",
+            "  against rr.log per step",
             [rate / logged for rate in rates],
             "times",
-            detail=f"rr.log: {logged:,.0f} steps/s, without any of the computing",
+            detail=f"rr.log: {logged:,.0f} steps/s, without computing anything",
         ),
-        _lower("  peak memory", peaks, "MB", (1000, 400), detail="resident, all of it"),
+        _lower("  peak memory", peaks, "MB", (1000, 400), detail="resident"),
         _lower(
             "  growth of the peak",
             [growth],
             "%",
-            detail=f"over a run a {TIMES}th as long: {short[0].steps / 1e6:.2f} M steps, "
+            detail=f"compared with a run of a {TIMES}th of the length: {short[0].steps / 1e6:.2f} M steps, "
             f"{_peak(short):.0f} MB",
         ),
     ]
 
 
 def export(folder: str, episodes: int, *options: str) -> Export:
-    """Export the run of so many episodes by command, and remove the file."""
+    """Export the run with this number of episodes by command, and remove the file."""
     recording = recording_in(folder, episodes)
     facts = json.loads(recording.with_name("run.json").read_bytes())["summary"]
     path = Path(folder, "export.rrd")
@@ -89,13 +89,13 @@ def export(folder: str, episodes: int, *options: str) -> Export:
 
 
 def recording_in(folder: str, episodes: int) -> Path:
-    """Return the recording of the run of so many episodes."""
+    """Return the recording of the run with this number of episodes."""
     (recording,) = Path(folder, str(episodes)).glob("*/recording.mcap")
     return recording
 
 
 def logged_rate(recording: Path, path: Path) -> float:
-    """Return steps a second of logging the same archetypes one by one, without any of the computing."""
+    """Return steps a second of logging the same archetypes one by one, without computing anything."""
     import rerun as rr
 
     from runner.export.rerun.columns import new_stream

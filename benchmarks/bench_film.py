@@ -1,4 +1,4 @@
-"""Frames of a film: put together from parts, against each rendered whole from its SVG."""
+"""Frames of a film: composed of cached parts, against each rendered completely from its SVG."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runner.recording.reader import open_recording
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return processor milliseconds a frame of both ways, over the same frames of one episode."""
+    """Return the processor time per frame of both methods, over the same frames of one episode."""
     count = 20 if quick else 100
     config = {"name": "film", "mode": "cooperative", "episodes": 5, "seed": 0}
     with tempfile.TemporaryDirectory() as folder:
@@ -37,6 +37,6 @@ def measure(quick: bool) -> list[Figure]:
                 )
                 whole.append(1000 * (time.process_time() - began))
     return [
-        figure("a frame put together from parts", composed, "ms", higher_is_better=False),
-        figure("its grid alone rendered whole by resvg", whole, "ms", higher_is_better=False),
+        figure("a frame composed of parts", composed, "ms", higher_is_better=False),
+        figure("its grid alone, rendered completely by resvg", whole, "ms", higher_is_better=False),
     ]

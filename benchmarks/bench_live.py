@@ -1,4 +1,4 @@
-"""What it costs to watch a run in the viewer while it trains."""
+"""The cost of watching a run in the viewer while it trains."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from runner.export.rerun import viewer
 
 CONFIG = "tutorial_cooperative"
 LONGER = "episodes=500000"
-"""Ten times the tutorial's: starting costs the same two seconds of the other core however long a job is."""
+"""Ten times the tutorial's episodes, because starting takes two seconds of one core regardless of length."""
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return how many percent longer the same job takes when it is watched; alone and watched in turn."""
+    """Return the slowdown of a watched job in percent, alternating between watched and alone."""
     port = viewer.free_port()
     watched = ("--live-url", f"rerun+http://{viewer.LOOPBACK}:{port}/proxy")
     with viewer.viewer(port, "--serve-grpc"):
@@ -23,12 +23,12 @@ def measure(quick: bool) -> list[Figure]:
         ]
     return [
         figure(
-            "slower by being watched live",
+            "slowdown by watching live",
             [_percent(with_view.seconds, alone.seconds) for alone, with_view in pairs],
             "%",
             (5, 5),
             higher_is_better=False,
-            detail=f"{_steps(pairs[0][0])}, a viewer that stores what it gets on the same machine",
+            detail=f"{_steps(pairs[0][0])}, a viewer without window on the same machine",
         ),
         figure(
             "  processor time",
@@ -38,7 +38,7 @@ def measure(quick: bool) -> list[Figure]:
             ],
             "%",
             higher_is_better=False,
-            detail="loading Rerun included",
+            detail="including the loading of Rerun",
         ),
     ]
 

@@ -1,4 +1,4 @@
-"""Peak memory of the cooperative tutorial, and of the same ten times as long."""
+"""Peak memory of the cooperative tutorial, and with ten times the episodes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ EPISODES = 50_000
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return the peaks, and how much more the longer run takes; twice as long is enough for a quick look."""
+    """Return the peaks and their growth; the longer run has ten times the episodes, or two if quick."""
     times = 2 if quick else 10
     run_config("quick")  # compiles
     short = [run_config(CONFIG).process.peak_megabytes for _ in range(3)]
@@ -24,7 +24,7 @@ def measure(quick: bool) -> list[Figure]:
             "MB",
             (400, 250),
             higher_is_better=False,
-            detail="resident, all of it",
+            detail="resident",
         ),
         figure(
             f"peak memory, {times} times as long",

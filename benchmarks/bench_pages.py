@@ -1,4 +1,4 @@
-"""How long until a browser that has never been here shows the first page, over ten thousand runs."""
+"""Time until a browser with an empty cache shows the first page, with ten thousand runs."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from typing import Final
 
 from benchmarks.bench_catalogue import LISTED, many, one_run
 from benchmarks.figures import Figure, figure
-from benchmarks.serving import asked, serving
+from benchmarks.serving import response_times, serving
 from runner.util.files import CACHE_VARIABLE
 
 COLD: Final = (1000, 300)
-"""Milliseconds: at least, and aim."""
+"""Targets in milliseconds: at least, and aim."""
 LOADED: Final = "return performance.getEntriesByType('navigation')[0].loadEventEnd"
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return milliseconds from asking for the page until it is loaded, each time in a new browser."""
+    """Return the milliseconds until the page is loaded, each time in a new browser."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {CACHE_VARIABLE: f"{folder}/cache"}
         recordings = many(one_run(Path(folder, "one")), Path(folder, "many"), LISTED, recordings=False)
         with serving(recordings, environment=environment) as service:
-            asked(service, ["/api/v1/runs"], clients=1, seconds=0.5)
+            response_times(service, ["/api/v1/runs"], clients=1, seconds=0.5)
             times = [_loaded(f"{service.url}/runs") for _ in range(3 if quick else 7)]
-    detail = f"{LISTED:,} runs; Chromium, its cache empty; until the page and what belongs to it are loaded"
+    detail = f"{LISTED:,} runs; Chromium with an empty cache, until completely loaded"
     return [figure("first page, cold", times, "ms", COLD, higher_is_better=False, detail=detail)]
 
 

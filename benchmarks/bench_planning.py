@@ -1,4 +1,4 @@
-"""What is known because the environment is: value iteration, and the exact evaluation of a policy."""
+"""Planning: value iteration, and the exact evaluation of a policy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DISCOUNT = 0.99
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return seconds of value iteration to 1e-10, and milliseconds of evaluating a learned policy exactly."""
+    """Return the time of value iteration to 1e-10 and of exact evaluations."""
     learner = tutorial_learner()
     mdp = learner.mdp
     train(learner, learner.config.episodes)
@@ -38,9 +38,9 @@ def measure(quick: bool) -> list[Figure]:
     ]
 
 
-def _exactly(told: str, mdp: Mdp, policy: NDArray[np.int32], repetitions: int) -> Figure:
+def _exactly(policy_name: str, mdp: Mdp, policy: NDArray[np.int32], repetitions: int) -> Figure:
     return figure(
-        f"exact evaluation of {told}",
+        f"exact evaluation of {policy_name}",
         [1e3 * seconds(lambda: evaluate_policy(mdp, policy, 1, DISCOUNT)) for _ in range(repetitions)],
         "ms",
         (5, 1),

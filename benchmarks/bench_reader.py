@@ -1,4 +1,4 @@
-"""The reader: a full read against the official library, and one episode out of the middle of a recording."""
+"""The reader: a full read against the official library, and one episode in the middle of a recording."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FIELDS = tuple(field.name for field in schema.STEP.fields)
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return steps a second of both, their ratio, and milliseconds for an episode."""
+    """Return steps per second of both, their ratio, and milliseconds for an episode."""
     repetitions, theirs = (3, 20_000) if quick else (7, 100_000)
     with tempfile.TemporaryDirectory() as folder:
         path = tutorial(folder)
@@ -36,14 +36,14 @@ def measure(quick: bool) -> list[Figure]:
             ratios,
             "x",
             (50, 100),
-            detail="every field of every step summed; theirs decodes protobuf, with checksums, as ours",
+            detail="sum of every field of every step; both check checksums, and theirs decodes Protobuf",
         ),
         figure(
             "  full read, every field summed",
             [rate / 1e6 for rate in rates],
             "M steps/s",
             (8, 15),
-            detail=f"{steps / 1e6:.2f} M steps, {size / 1e6:.0f} MB, in the system's cache",
+            detail=f"{steps / 1e6:.2f} M steps, {size / 1e6:.0f} MB, in the page cache",
         ),
         figure("  official reader", [rate / 1e6 for rate in official], "M steps/s"),
         figure(
@@ -52,20 +52,20 @@ def measure(quick: bool) -> list[Figure]:
             "ms",
             (50, 10),
             higher_is_better=False,
-            detail=f"of {steps / 1e6:.1f} M steps; nothing kept from before",
+            detail=f"of {steps / 1e6:.1f} M steps; nothing cached",
         ),
     ]
 
 
 def tutorial(folder: str) -> Path:
-    """Return the recording of the cooperative tutorial, made anew."""
+    """Record the cooperative tutorial and return the recording."""
     run(run_command("tutorial_cooperative", folder))
     (path,) = Path(folder).glob("*/recording.mcap")
     return path
 
 
 def read_all(path: Path) -> int:
-    """Sum every field of every step, block by block; return how many steps there are."""
+    """Sum every field of every step, block by block; return the number of steps."""
     steps, total = 0, 0.0
     with open_recording(path) as recording:
         for topic in STEP_TOPICS:
@@ -77,7 +77,7 @@ def read_all(path: Path) -> int:
 
 
 def read_officially(path: Path, steps: int) -> None:
-    """Sum every field of the first steps, by the official library."""
+    """Sum every field of the first steps with the official library."""
     total = 0.0
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])

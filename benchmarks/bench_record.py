@@ -1,8 +1,8 @@
-"""What recording somebody's own loop costs: against the loop alone, and against Minari's DataCollector.
+"""The cost of recording a user's loop: against the loop alone, and against Minari's DataCollector.
 
-All in one run, turn by turn: the same environment, seed and actions. Time is the process's processor time
-for a loop and its ending, so that other threads count too; `added` is the calling thread's own.
-Minari is no part of the project: `pip install "minari[create]"` for its figures.
+The sides alternate in one run, with the same environment, seed and actions. Times are processor times of the whole
+process, from the first step to the end of the file; `added` is that of the calling thread.
+Minari's figures need `pip install "minari[create]"`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from benchmarks.processes import run
 
 Env = gymnasium.Env[Any, Any]
 TARGETS = {"Taxi-v4": (36, 30), "CartPole-v1": (60, 45)}
-"""Bytes a step: at least, aim."""
+"""Targets in bytes per step: at least, aim."""
 
 MEMORY = """
 import sys, runner
@@ -56,7 +56,7 @@ with runner.record(Quick(), sys.argv[1]) as env:
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return added time and bytes a step, the ratios to Minari, and the memory of a long loop."""
+    """Return overhead and bytes per step, the ratios to Minari, and the memory of a long loop."""
     steps, repetitions = (20_000, 3) if quick else (100_000, 5)
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -85,7 +85,7 @@ def drive(env: Env, steps: int) -> None:
 
 
 def _environment(name: str, folder: Path, steps: int, repetitions: int) -> list[Figure]:
-    """Return what recording an environment adds to a step, and takes on disk."""
+    """Return the overhead per step of recording an environment, and its size on disk."""
     added, whole, size = [], [], 0.0
     for _ in range(repetitions):
         with contextlib.closing(gymnasium.make(name)) as env:
@@ -98,12 +98,12 @@ def _environment(name: str, folder: Path, steps: int, repetitions: int) -> list[
     targets = (5, 2) if name == "Taxi-v4" else None
     return [
         figure(
-            f"added to a step, {name}",
+            f"added per step, {name}",
             added,
             "us",
             targets,
             higher_is_better=False,
-            detail=f"processor time of the loop's thread; of all threads {statistics.median(whole):.2f} us",
+            detail=f"processor time of the loop's thread; all threads {statistics.median(whole):.2f} us",
         ),
         figure(f"  on disk, {name}", [size], "bytes/step", TARGETS[name], higher_is_better=False),
     ]
@@ -117,7 +117,7 @@ def _times(work: Callable[[], object]) -> tuple[float, float]:
 
 
 def _against_minari(name: str, kind: str, folder: Path, steps: int, repetitions: int) -> list[Figure]:
-    """Return how many times less recording costs than Minari's collector, to the file's end."""
+    """Return by which factor recording is cheaper than Minari's collector, including the end of the file."""
     try:
         import jax.tree_util  # noqa: F401 - the collector imports it with its first step
         import minari
@@ -133,11 +133,11 @@ def _against_minari(name: str, kind: str, folder: Path, steps: int, repetitions:
         ratios.append(theirs[-1] / ours[-1])
     return [
         figure(
-            f"less than Minari's collector, {kind} episodes",
+            f"cheaper than Minari's collector, {kind} episodes",
             ratios,
             "x",
             (8, 20),
-            detail=f"{name}: {statistics.median(ours):.2f} us added to a step, all threads and closing; "
+            detail=f"{name}: {statistics.median(ours):.2f} us added per step, all threads and closing; "
             f"Minari {statistics.median(theirs):.1f} us",
         )
     ]
@@ -162,9 +162,9 @@ def _whole(make: Callable[[], Any], steps: int) -> float:
 
 
 class Prepared(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """Vector environments that take no time: arrays made before, in which one step in 22 ends an episode."""
+    """Vector environments that take no time: prepared arrays, in which one step in 22 ends an episode."""
 
-    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as Gymnasium has it
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as in Gymnasium
 
     def __init__(self, count: int) -> None:
         self.num_envs = count
@@ -190,7 +190,7 @@ class Prepared(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
 
 def _vector(count: int, folder: Path, steps: int, repetitions: int) -> Figure:
-    """Return what recording adds to a step of a vector environment."""
+    """Return the overhead of recording per step of a vector environment."""
     added, whole = [], []
     for _ in range(repetitions):
         alone = _times(partial(_drive_vector, Prepared(count), steps))
@@ -204,7 +204,7 @@ def _vector(count: int, folder: Path, steps: int, repetitions: int) -> Figure:
         "us",
         (20, 6),
         higher_is_better=False,
-        detail=f"processor time of the loop's thread; of all threads {statistics.median(whole):.2f} us",
+        detail=f"processor time of the loop's thread; all threads {statistics.median(whole):.2f} us",
     )
 
 
@@ -216,7 +216,7 @@ def _drive_vector(envs: Any, steps: int) -> None:
 
 
 def _short(folder: Path, loops: int, repetitions: int) -> list[Figure]:
-    """Return what the start and the end of a recorded loop cost, of loops that log one value."""
+    """Return the cost of starting and ending a recorded loop that logs one value."""
     spent, lasted = [], []
     for _ in range(repetitions):
         begin, began = time.process_time(), time.perf_counter()
@@ -237,7 +237,7 @@ def _short(folder: Path, loops: int, repetitions: int) -> list[Figure]:
             "s",
             (10, 4),
             higher_is_better=False,
-            detail="elapsed time of loops that log one value, each made durable by one fsync",
+            detail="elapsed time of loops that log one value, each with one fsync",
         ),
     ]
 

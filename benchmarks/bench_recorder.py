@@ -1,4 +1,4 @@
-"""The recorder, blocks in and file out, against `mcap.writer.Writer` given the same messages."""
+"""The recorder, from blocks to file, against `mcap.writer.Writer` with the same messages."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from runner.util.packing import Packing
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return messages a second of both, and their ratio, for the steps of the tutorial's training.
+    """Return messages per second of both, and their ratio, for the training steps of the tutorial.
 
-    The library compresses with zstd level 3 and cannot be told otherwise; ours as a run does. So both sizes
-    are told too.
+    The library always compresses with zstd level 3, ours with the options of a run. So both sizes are
+    reported too.
     """
     repetitions, ours, theirs = (3, 500_000, 50_000) if quick else (5, 4_000_000, 200_000)
     packing = tutorial_learner().config.recording.packing

@@ -1,4 +1,4 @@
-"""The report of one run: how long the command takes and how large the page is."""
+"""The report of one run: time of the command and size of the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long the service takes to tell of ten thousand runs, to twenty who ask at the same time."""
+"""Response times of the service with ten thousand runs and twenty concurrent clients."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from typing import Final
 
 from benchmarks.bench_catalogue import LISTED, many, one_run
 from benchmarks.figures import Figure
-from benchmarks.serving import Service, asked, memory_of, percentile, serving
+from benchmarks.serving import Service, memory_of, percentile, response_times, serving
 from runner.util.files import CACHE_VARIABLE
 
 CLIENTS: Final = 20
 MEDIAN: Final = (60, 20)
 NINETY_NINTH: Final = (300, 100)
-"""Milliseconds: at least, and aim."""
+"""Targets in milliseconds: at least, and aim."""
 SEARCHES: Final = [
     f"/api/v1/runs?filter=name:experiment{k}%20config.discount:%3E0.{k}&sort=-success_percent"
     for k in range(1, 38)
 ]
-"""Each found in ten thousand runs anew: an answer is kept for five seconds."""
+"""Different searches, because a response is cached for five seconds."""
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return milliseconds until an answer is there whole, as clients see it."""
+    """Return the milliseconds until a client has the complete response."""
     seconds = 2 if quick else 8
     with tempfile.TemporaryDirectory() as folder:
         environment = {CACHE_VARIABLE: f"{folder}/cache"}
         recordings = many(one_run(Path(folder, "one")), Path(folder, "many"), LISTED, recordings=False)
         with serving(recordings, environment=environment) as service:
-            asked(service, ["/api/v1/runs"], clients=1, seconds=1)
+            response_times(service, ["/api/v1/runs"], clients=1, seconds=1)
             found = _figures(service, "API list", ["/api/v1/runs"], CLIENTS, seconds)
             found += _figures(service, "runs page", ["/runs"], CLIENTS, seconds)
             alone, _ = _figures(service, "a search, one client", SEARCHES, 1, seconds)
@@ -41,7 +41,7 @@ def measure(quick: bool) -> list[Figure]:
 
 
 def _figures(service: Service, what: str, paths: list[str], clients: int, seconds: float) -> list[Figure]:
-    times = [1000 * taken for taken in asked(service, paths, clients, seconds)]
+    times = [1000 * taken for taken in response_times(service, paths, clients, seconds)]
     rate = len(times) / seconds
     detail = (
         f"{LISTED:,} runs; {clients} clients, who ask again as soon as answered, {rate:,.0f} answers a second"

@@ -1,4 +1,4 @@
-"""A sweep of many short runs: the whole study, what a run costs besides learning, one worker against two."""
+"""A sweep of many short runs: the whole study, the overhead per run, one worker against two."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ STUDY = 1000
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return seconds of the study, what a run costs besides its own time, and the gain of a second worker."""
+    """Return the time of the study, the overhead per run, and the speed-up of a second worker."""
     runs, few, repetitions = (40, 10, 1) if quick else (STUDY, 60, 3)
     pairs = [(_study(2 * few, 1), _study(2 * few, 2)) for _ in range(repetitions)]  # the first one compiles
     whole = _study(runs, 2)
     here = [_besides(few, LocalWorkers(1)) for _ in range(repetitions)]
     remote = [_besides(few, RayWorkers(1, None, few)) for _ in range(repetitions)]
-    told = "the time of a study by one worker, less what its runs say that they took, over their number"
+    detail = "(time of a study with one worker - recorded times of its runs) / number of runs"
     return [
         figure(
             f"a study of {runs:,} runs, two workers",
@@ -46,7 +46,7 @@ def measure(quick: bool) -> list[Figure]:
         figure(
             "  two workers against one", [one.seconds / two.seconds for one, two in pairs], "x", (1.7, 1.9)
         ),
-        figure("  a run besides its own time", here, "ms", (50, 10), higher_is_better=False, detail=told),
+        figure("  overhead per run", here, "ms", (50, 10), higher_is_better=False, detail=detail),
         figure("  ... on Ray", remote, "ms", (200, 100), higher_is_better=False),
         figure(
             "  memory of a worker, the most", whole.peak_megabytes, "MB", (400, 250), higher_is_better=False
@@ -75,17 +75,17 @@ def _sweep(runs: int) -> Sweep:
 
 @dataclass(frozen=True)
 class Study:
-    """What a study took."""
+    """Time and memory of a study."""
 
     seconds: float
     processor_seconds: float
-    """Of its workers and of the process that leads them: what other work on the machine changes little."""
+    """Processor time of the workers and the main process, which other processes hardly disturb."""
     peak_megabytes: list[float]
-    """The most memory that each worker had resident at once, in units of 10**6 bytes."""
+    """Peak resident memory of each worker, in units of 10**6 bytes."""
 
 
 def _study(runs: int, workers: int) -> Study:
-    """Do a study by workers of this machine that are started, and have loaded what they need, before."""
+    """Run a study with local workers that have been started and have loaded their modules before."""
     sweep, warm = _sweep(runs), _sweep(2 * workers)
     with tempfile.TemporaryDirectory() as folder, LocalWorkers(workers) as those:
         _begin(Path(folder), sweep, warm)
@@ -103,7 +103,7 @@ def _processor_seconds(children: list[psutil.Process]) -> float:
 
 
 def _besides(runs: int, workers: LocalWorkers | RayWorkers) -> float:
-    """Return the milliseconds that a run takes besides its own time, on a worker that has loaded all."""
+    """Return the overhead per run in milliseconds, on a worker that has loaded its modules."""
     sweep, warm = _sweep(runs), _sweep(2)
     with tempfile.TemporaryDirectory() as folder, workers:
         _begin(Path(folder), sweep, warm)
@@ -119,7 +119,7 @@ def _begin(folder: Path, *sweeps: Sweep) -> None:
 
 
 def _peak_megabytes(pid: int) -> float:
-    """Return the most memory that a process had resident at once, in units of 10**6 bytes."""
+    """Return the peak resident memory of a process, in units of 10**6 bytes."""
     status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
     (line,) = (line for line in status.splitlines() if line.startswith("VmHWM:"))
     return int(line.split()[1]) * 1024 / 1e6

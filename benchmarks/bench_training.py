@@ -19,7 +19,7 @@ DISCOUNT = 0.7
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return steps a second of both, and their ratio, each repetition's two sides one after the other."""
+    """Return steps per second of both, and their ratio, alternating between them."""
     repetitions, textbook_steps = (3, 20_000) if quick else (7, 100_000)
     train(tutorial_learner(), 100)  # compiles
     textbook, kernel = [], []
@@ -49,7 +49,7 @@ def measure(quick: bool) -> list[Figure]:
 
 
 def algorithms(repetitions: int) -> list[Figure]:
-    """Return steps a second of processor time of each algorithm, all of them in turn in each repetition."""
+    """Return steps per second of processor time of each algorithm, alternating between them."""
     cases = [("mode=cooperative", name) for name in ALGORITHMS if name != "hysteretic_q_learning"]
     cases += [("mode=competitive", name) for name in ALGORITHMS]
     speeds: dict[tuple[str, str], list[float]] = {case: [] for case in cases}
@@ -69,7 +69,7 @@ def algorithms(repetitions: int) -> list[Figure]:
 
 
 def textbook_q_learning(steps: int) -> None:
-    """Q-learning as tutorials write it: Sutton and Barto, 2nd edition, section 6.5."""
+    """Textbook Q-learning: Sutton and Barto, 2nd edition, section 6.5."""
     env = gymnasium.make("dualtaxi:DualTaxi-v1")
     states, actions = env.observation_space.n, env.action_space.n  # type: ignore[attr-defined]
     q = np.zeros((states, actions))

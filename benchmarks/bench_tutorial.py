@@ -9,13 +9,13 @@ CONFIG = "tutorial_cooperative"
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return seconds from the start of the process to its end, and bytes of the file a step."""
+    """Return the time of the whole process, and the size of the file per step."""
     run_config("quick")  # compiles
     runs = [run_config(CONFIG) for _ in range(3 if quick else 5)]
     steps = runs[0].steps
     return [
         figure(
-            "tutorial, process start to end",
+            "tutorial, whole process",
             [run.process.seconds for run in runs],
             "s",
             (4, 2),
@@ -24,7 +24,7 @@ def measure(quick: bool) -> list[Figure]:
         ),
         figure("  processor time", [run.process.cpu_seconds for run in runs], "s", higher_is_better=False),
         figure(
-            "the whole file a step",
+            "file size per step",
             [run.file_bytes / run.steps for run in runs],
             "bytes",
             (34, 28),

@@ -1,8 +1,8 @@
-"""Uploads into the service, over loopback: how quick, beside a plain copy; how much memory the server takes.
+"""Uploads to the service over loopback: speed, compared with a plain copy, and memory of the server.
 
-Each repetition uploads the same bytes and copies the file, in turn, each until `fsync` has returned. The
-verification that follows is told by itself. For the memory, a large recording is uploaded, verified and read
-back while processes record loops and push them, all at once; every digest is compared at the end.
+Each repetition uploads the same bytes and copies the file, each until `fsync` has returned. The verification
+that follows is reported separately. To measure memory, a large recording is uploaded, verified and downloaded
+while processes record and push loops; every digest is compared at the end.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def measure(quick: bool) -> list[Figure]:
 
 
 def _large_recording(folder: Path, megabytes: int) -> UploadSource:
-    """Return a run that takes so much on disk: uncompressed, of steps at random."""
+    """Return a run of this size: uncompressed, with random steps."""
     sets = ["recording.compression=none", f"episodes={megabytes * 13}", "epsilon=1"]
     sets += ["evaluation.every=1000000", "snapshots.every=1000000"]
     run(run_command("quick", str(folder), *sets))
@@ -105,7 +105,7 @@ def _digest(path: Path) -> str:
 
 
 def _memory(source: UploadSource, folder: Path, service: Service, steps: int) -> list[Figure]:
-    """Return the server's memory while much is asked of it, and see that nothing was lost."""
+    """Return the server's memory under load, and check that nothing was lost."""
     shutil.rmtree(folder / "theirs" / source.run_id)
     own, children, over = [], [], threading.Event()
     server = psutil.Process(service.process)
@@ -119,11 +119,11 @@ def _memory(source: UploadSource, folder: Path, service: Service, steps: int) ->
     watcher = threading.Thread(target=watch)
     watcher.start()
     begin = time.perf_counter()
-    told = _load(source, folder, service.url, steps)
+    pushed = _load(source, folder, service.url, steps)
     took = time.perf_counter() - begin
     over.set()
     watcher.join()
-    for run_id, digest in told:
+    for run_id, digest in pushed:
         stored = find_run(run_id, folder / "theirs")
         assert verify(stored.recording).content_digest == digest == stored.summary["content_digest"], run_id
     early, late = max(own[: len(own) // 2]), max(own[len(own) // 2 :])
@@ -134,16 +134,16 @@ def _memory(source: UploadSource, folder: Path, service: Service, steps: int) ->
             "MB",
             (400, 250),
             higher_is_better=False,
-            detail=f"with {source.path.stat().st_size / 1e6:,.0f} MB uploaded and read; {took:.0f} s; "
+            detail=f"with {source.path.stat().st_size / 1e6:,.0f} MB uploaded and downloaded; {took:.0f} s; "
             f"at most {early:.0f} MB in the first half and {late:.0f} MB in the second; "
-            f"its other processes at most {max(children):.0f} MB",
+            f"its child processes at most {max(children):.0f} MB",
         ),
-        figure("  runs recorded and pushed, digests equal", [len(told)], f"of {PROCESSES}"),
+        figure("  runs recorded and pushed, digests equal", [len(pushed)], f"of {PROCESSES}"),
     ]
 
 
 def _load(source: UploadSource, folder: Path, url: str, steps: int) -> list[tuple[str, str]]:
-    """Record and push by many processes, upload and read a large recording; return the digests."""
+    """Record and push in many processes, upload and download a large recording; return the digests."""
     with contextlib.ExitStack() as stack:
         environment = os.environ | {"XDG_STATE_HOME": str(folder / "state")}
         loops = [
@@ -161,6 +161,6 @@ def _load(source: UploadSource, folder: Path, url: str, steps: int) -> list[tupl
             client.push(source)
             pulled = client.pull(source.run_id, folder / "back")
         assert pulled.content_digest == source.content_digest
-        told = [loop.communicate()[0].split() for loop in loops]
+        outputs = [loop.communicate()[0].split() for loop in loops]
     assert not list((folder / "state").rglob("recording.mcap")), "a run was left in the outbox"
-    return [(run_id, digest) for run_id, digest in told]
+    return [(run_id, digest) for run_id, digest in outputs]

@@ -1,4 +1,4 @@
-"""Verification of the tutorial's recording, the exact table at a random step, and the memory of reading."""
+"""Verification of the tutorial's recording, the exact table at a random step, and memory of reading."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ assert verify(Path(sys.argv[1])).sound"
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return seconds and megabytes; of a recording ten times as long as well."""
+    """Return times and peak memory, also for a recording ten times as long."""
     repetitions, times = (3, 2) if quick else (7, 10)
     rng = random.Random(0)
     with tempfile.TemporaryDirectory() as folder:
@@ -45,16 +45,16 @@ def measure(quick: bool) -> list[Figure]:
             "s",
             (0.6, 0.2),
             higher_is_better=False,
-            detail="opening included; snapshots as shipped, every 10,000 episodes",
+            detail="including opening; with the shipped snapshots, every 10,000 episodes",
         ),
         figure("peak memory, full read and verify", [max(memory)], "MB", (400, 200), higher_is_better=False),
         figure(
-            f"  of a recording {times} times as long",
+            f"  for a recording {times} times as long",
             [max(longer)],
             "MB",
             (400, 200),
             higher_is_better=False,
-            detail="resident, all of it: Python, NumPy and the compiled kernels are some 170 MB",
+            detail="resident; about 170 MB are Python, NumPy and the compiled kernels",
         ),
     ]
 
@@ -71,5 +71,5 @@ def sound(path: Path) -> None:
 
 
 def peak(program: str, path: Path) -> float:
-    """Return the most memory that a program takes for a recording, in MB."""
+    """Return the peak memory of a program that reads a recording, in MB."""
     return run([sys.executable, "-c", program, str(path)]).peak_megabytes

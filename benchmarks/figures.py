@@ -1,4 +1,4 @@
-"""A measured figure beside its targets, and the table of them."""
+"""Measured figures with their targets, and the table that lists them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Figure:
-    """One measured figure, the target it must reach (`at_least`) and the one it should (`aim`)."""
+    """A measured figure, the target it must reach (`at_least`) and the one it should reach (`aim`)."""
 
     what: str
     value: float
@@ -19,13 +19,13 @@ class Figure:
     aim: float | None = None
     higher_is_better: bool = True
     spread: tuple[float, float] | None = None
-    """Lowest and highest value seen."""
+    """Lowest and highest measured value."""
     detail: str = ""
     """How it was measured, and the absolute figures behind a ratio."""
 
     @property
     def standing(self) -> str:
-        """Where the figure stands: `aim`, `at least` or `short`; empty without targets."""
+        """The target reached: `aim`, `at least` or `short` for neither; empty without targets."""
         for name, target in (("aim", self.aim), ("at least", self.at_least)):
             if target is not None and (self.value >= target) == self.higher_is_better:
                 return name
@@ -48,7 +48,7 @@ def figure(
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """Return how long the work takes."""
+    """Return the elapsed time of a call."""
     begin = time.perf_counter()
     work()
     return time.perf_counter() - begin
@@ -65,7 +65,7 @@ def heading() -> str:
 
 
 def row(figure: Figure) -> str:
-    """Return a figure's lines of the table."""
+    """Return the lines of a figure in the table."""
     sign = "≥ " if figure.higher_is_better else "≤ "
     spread = " to ".join(_number(value) for value in figure.spread) if figure.spread else ""
     targets = ("" if target is None else sign + _number(target) for target in (figure.at_least, figure.aim))

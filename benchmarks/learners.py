@@ -1,4 +1,4 @@
-"""The tutorial's cooperative learner and the blocks it fills, for the benchmarks of the kernels."""
+"""The tutorial's cooperative learner and blocks to fill, for benchmarks of the kernels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts
 
 BLOCK_STEPS = 16_384
-"""As in a run: `recording.chunk_steps` unless given."""
+"""The default of `recording.chunk_steps`."""
 BLOCK_EPISODES = 2_048
 NO_LIMIT = 2**62
 
@@ -27,7 +27,7 @@ def tutorial_learner(*overrides: str) -> Learner:
 
 
 def blocks(learner: Learner, phase: str, steps: int = BLOCK_STEPS) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return an empty block of step records and one of episode records, as the recorder hands them out."""
+    """Return an empty block of step records and one of episode records, as the recorder provides them."""
     topics = [topic for topic in schema.BLOCK_TOPICS if topic.phase == phase]
     learners, events = len(learner.agents), len(learner.mdp.event_names)
     step_block, episode_block = (
@@ -38,7 +38,7 @@ def blocks(learner: Learner, phase: str, steps: int = BLOCK_STEPS) -> tuple[NDAr
 
 
 def train(learner: Learner, until_episode: int) -> int:
-    """Train up to an episode, filling one block of records over and over; return the steps taken."""
+    """Train up to an episode, reusing one block of records; return the steps taken."""
     steps, episodes = blocks(learner, "train")
     while learner.episode < until_episode:
         learner.train(steps, episodes, until_episode, NO_LIMIT)

@@ -1,4 +1,4 @@
-"""What the figures were measured on."""
+"""The machine on which the figures are measured."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def machine() -> dict[str, str]:
 
 
 class OtherWork:
-    """Over a `with` block: how many cores were busy with anything but this program; it spoils figures."""
+    """Measures how many cores other processes used during a `with` block, because they disturb figures."""
 
     def __enter__(self) -> Self:
         self.cores = 0.0
@@ -41,7 +41,7 @@ class OtherWork:
 
 
 def _moment() -> tuple[float, float]:
-    """Return the clock, and the processor seconds that others have used up to now."""
+    """Return the clock, and the processor seconds used by other processes so far."""
     all_of_it, own = psutil.cpu_times(), os.times()
     busy = all_of_it.user + all_of_it.system + getattr(all_of_it, "nice", 0.0)
     return time.perf_counter(), busy - sum(own[:4])

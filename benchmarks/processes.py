@@ -1,7 +1,7 @@
-"""Commands run and measured as processes of their own.
+"""Run commands in separate processes and measure them.
 
-A small launcher stands between: on Linux a process inherits the peak memory of the one that starts it, so
-that one must be smaller than what is measured. The clock runs in the launcher, around the command alone.
+A small launcher starts each command: on Linux a process inherits the peak memory of its parent, which
+therefore must be smaller than the measured process. The launcher measures the time of the command alone.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ sys.exit(os.waitstatus_to_exitcode(status) and 1)
 
 @dataclass(frozen=True)
 class Process:
-    """What a finished process took."""
+    """Time and memory of a finished process."""
 
     seconds: float
-    """From its start to its end."""
+    """Elapsed time."""
     cpu_seconds: float
-    """Of all its threads, and the system for it."""
+    """User and system time of all threads."""
     peak_megabytes: float
-    """The most memory that was resident at once, in units of 10**6 bytes."""
+    """Peak resident memory in units of 10**6 bytes."""
 
 
 @dataclass(frozen=True)
 class JobRun:
-    """A job run by the command line, and what it left behind."""
+    """A job run by the command line, and its recording."""
 
     process: Process
     seconds: float
-    """From the making of its folder to its end, as the run itself says."""
+    """From the creation of its folder to its end, as stored in `run.json`."""
     steps: int
-    """Training and evaluation steps, all of them recorded."""
+    """Recorded training and evaluation steps."""
     file_bytes: int
     """Size of the recording."""
 
 
 def run(command: Sequence[str], environment: Mapping[str, str] | None = None) -> Process:
-    """Run a command to its end and return what it took.
+    """Run a command and return its time and memory.
 
     Raises:
-        RuntimeError: it failed; its output is told.
+        RuntimeError: it failed; the message has its output.
     """
     inherited = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
     done = subprocess.run(
@@ -82,7 +82,7 @@ def run_config(
     options: Sequence[str] = (),
     environment: Mapping[str, str] | None = None,
 ) -> JobRun:
-    """Run a shipped configuration as a user would, into a folder that is removed, and return what it took."""
+    """Run a shipped configuration in a temporary folder and return the measurements."""
     with tempfile.TemporaryDirectory() as recordings:
         process = run([*run_command(config, recordings, *overrides), *options], environment)
         (facts_file,) = Path(recordings).glob("*/run.json")

@@ -1,7 +1,7 @@
 """The figures of docs/reproduction.md: `python -m benchmarks.reproduction [--seeds N]`.
 
-Runs the tutorial's jobs, and ours, over several seeds (seconds a job; steps are not recorded, only
-measures) and prints the page's tables, the published figures beside the medians and ranges found.
+Runs the tutorial's jobs and ours with several seeds (seconds per job; only metrics are recorded) and prints
+the tables of the page: the published figures with our medians and ranges.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ REWARDS: Final[dict[str, tuple[int, dict[int, int]]]] = {
         | {90: 433, 99: 175},
     ),
 }
-"""Config -> the episode of a published report, and how many of the last 50,000 steps had which reward."""
+"""Config -> the episode of a published report, and the counts of rewards in the last 50,000 steps."""
 
 JOBS: Final[dict[str, list[str]]] = {
     "tutorial_cooperative": [],
@@ -77,20 +77,20 @@ SLIPS: Final[dict[str, list[dict[str, bool]]]] = {
     "cooperative": [{}],
     "competitive": [{}],
 }
-"""Config -> what is mended of it, one way a line."""
+"""Config -> the corrections to compare, with a label each."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run measured."""
+    """The metrics of one run."""
 
     evaluations: dict[int, dict[str, Any]]
-    """By training episodes before."""
+    """By number of training episodes."""
     reports: list[dict[str, Any]]
 
 
 def run(job: str, overrides: Sequence[str], seeds: int) -> list[Outcome]:
-    """Run a job with seeds 0, 1, ... and return what was measured."""
+    """Run a job with seeds 0, 1, ... and return their metrics."""
     changes = [f"seeds={{first: 0, count: {seeds}}}", "recording.steps=none", *overrides]
     config = CONFIGS / f"{job.partition(',')[0]}.yaml"
     outcomes = []
@@ -111,13 +111,13 @@ def spread(values: Iterable[float], digits: int) -> str:
 
 
 def cells(outcomes: list[Outcome], episode: int, measure: tuple[str, Callable[..., Any], int]) -> str:
-    """Return the spread of a measure at an evaluation; a dash where it is not defined yet."""
+    """Return median and range of a metric at an evaluation, or a dash if it is undefined."""
     values = [measure[1](outcome.evaluations[episode]) for outcome in outcomes]
     return "–" if None in values else spread(values, measure[2])
 
 
 def volatility(outcomes: list[Outcome]) -> str:
-    """Return by how many points finish percent changes between evaluations: mean over the last half."""
+    """Return the mean change of the success rate between evaluations in the second half, in points."""
     changes = []
     for outcome in outcomes:
         percent = [e["success_percent"] for _, e in sorted(outcome.evaluations.items())]
@@ -134,7 +134,7 @@ def table(title: str, heads: Sequence[str], rows: Iterable[Sequence[object]]) ->
 
 
 def print_moments(job: str, outcomes: list[Outcome]) -> None:
-    """Print the published evaluations beside ours."""
+    """Print the published evaluations and ours."""
     rows = [
         (f"{episode:,}", measure[0], "–" if value is None else value, cells(outcomes, episode, measure))
         for episode, values in PUBLISHED[job].items()
@@ -144,7 +144,7 @@ def print_moments(job: str, outcomes: list[Outcome]) -> None:
 
 
 def print_rewards(job: str, outcomes: list[Outcome]) -> None:
-    """Print a published reward distribution beside that of our nearest reports."""
+    """Print a published reward distribution and that of our nearest reports."""
     episode, published = REWARDS[job]
     near = [min(o.reports, key=lambda report: abs(report["episode"] - episode)) for o in outcomes]
     counts = [{c["reward"]: c["steps"] for c in report["reward_counts"]} for report in near]
@@ -157,7 +157,7 @@ def print_rewards(job: str, outcomes: list[Outcome]) -> None:
 
 
 def print_curves(found: dict[str, list[Outcome]]) -> None:
-    """Print how finish percent rises."""
+    """Print the success rate during training."""
     at = (0, 1000, 2000, 5000, 10_000, 20_000, 30_000, 40_000, 50_000)
     rows = []
     for job, outcomes in found.items():
@@ -173,7 +173,7 @@ def print_curves(found: dict[str, list[Outcome]]) -> None:
 
 
 def print_ends(found: dict[str, list[Outcome]]) -> None:
-    """Print what each job has come to at its end."""
+    """Print the final metrics of each job."""
     rows = []
     for job, outcomes in found.items():
         last = max(outcomes[0].evaluations)
@@ -182,7 +182,7 @@ def print_ends(found: dict[str, list[Outcome]]) -> None:
 
 
 def print_slips(seeds: int) -> None:
-    """Print what mending each slip does, measured from every start state."""
+    """Print the effect of correcting each error, evaluated from every start state."""
     rows = []
     for job, ways in SLIPS.items():
         for mended in ways:

@@ -1,4 +1,4 @@
-"""A service in a process of its own, clients that ask it at the same time, and the memory it takes."""
+"""A service in a separate process, concurrent clients, and its memory."""
 
 from __future__ import annotations
 
@@ -48,12 +48,12 @@ asyncio.run(main())
 
 @dataclass(frozen=True)
 class Service:
-    """A service that runs."""
+    """A running service."""
 
     host: str
     port: int
     process: int
-    """Its id."""
+    """Process id."""
 
     @property
     def url(self) -> str:
@@ -81,19 +81,19 @@ def serving(recordings: Path, *words: str, environment: Mapping[str, str] | None
         process.wait(60)
 
 
-def asked(
+def response_times(
     service: Service, paths: Sequence[str], clients: int = 20, seconds: float = 5, warm: float = 1
 ) -> list[float]:
-    """Return how long each answer took, in seconds, of clients that each ask again as soon as answered.
+    """Return the response times, in seconds, of concurrent clients that each send one request after another.
 
-    The clients are one process of their own; they go round the paths, each beginning at another.
+    The clients are in a separate process; each cycles through the paths, starting at a different one.
 
     Args:
-        service: is asked.
-        paths: what for.
-        clients: at the same time, each with a connection of its own.
-        seconds: so long.
-        warm: before that, so long without being counted.
+        service: the service.
+        paths: the paths to request.
+        clients: the number of clients, each with its own connection.
+        seconds: duration of the measurement.
+        warm: duration of the warm-up before it.
     """
     line = [service.host, str(service.port), str(seconds), json.dumps(list(paths)), str(warm), str(clients)]
     done = subprocess.run(
@@ -101,17 +101,17 @@ def asked(
     )
     if done.returncode:
         raise RuntimeError(done.stderr)
-    found: list[float] = json.loads(done.stdout)
-    return found
+    times: list[float] = json.loads(done.stdout)
+    return times
 
 
 def percentile(values: Sequence[float], percent: float) -> float:
-    """Return the value that so many percent of the values do not exceed."""
+    """Return a percentile of the values."""
     return sorted(values)[min(int(len(values) * percent / 100), len(values) - 1)]
 
 
 def memory_of(process: int) -> float:
-    """Return the megabytes that a process and all it began take; what they share is counted once."""
+    """Return the memory of a process and its children in MB, with shared pages counted once."""
     whole = psutil.Process(process)
     total = 0
     for part in (whole, *whole.children(recursive=True)):
