@@ -1,7 +1,7 @@
 """The cost of recording a user's loop: against the loop alone, and against Minari's DataCollector.
 
-The sides alternate in one run, with the same environment, seed and actions. Times are processor times of the whole
-process, from the first step to the end of the file; `added` is that of the calling thread.
+The sides alternate in one run, with the same environment, seed and actions. Times are processor times of the
+whole process, from the first step to the end of the file; `added` is that of the calling thread.
 Minari's figures need `pip install "minari[create]"`.
 """
 

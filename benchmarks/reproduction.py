@@ -55,7 +55,7 @@ JOBS: Final[dict[str, list[str]]] = {
     "tutorial_competitive": [],
     "tutorial_text_cooperative": [],
     "tutorial_text_competitive": [],
-    "tutorial_competitive, its second table mended": ["quirks.second_table_uses_first_action=false"],
+    "tutorial_competitive, its second table corrected": ["quirks.second_table_uses_first_action=false"],
     "cooperative": [],
     "competitive": [],
 }
@@ -169,7 +169,7 @@ def print_curves(found: dict[str, list[Outcome]]) -> None:
         ]
         rows.append((job, *medians, volatility(outcomes)))
     heads = ("episodes", *(f"{episode:,}" for episode in at), "changes by")
-    table("**Learning curves**, finish percent, median over seeds", heads, rows)
+    table("**Learning curves**, success rate, median over seeds", heads, rows)
 
 
 def print_ends(found: dict[str, list[Outcome]]) -> None:
@@ -181,18 +181,18 @@ def print_ends(found: dict[str, list[Outcome]]) -> None:
     table("**At the end of training**", ("job", "episodes", *(measure[0] for measure in MEASURES)), rows)
 
 
-def print_slips(seeds: int) -> None:
+def print_corrections(seeds: int) -> None:
     """Print the effect of correcting each error, evaluated from every start state."""
     rows = []
     for job, ways in SLIPS.items():
-        for mended in ways:
-            changes = [f"quirks.{name}={str(value).lower()}" for name, value in mended.items()]
+        for corrected in ways:
+            changes = [f"quirks.{name}={str(value).lower()}" for name, value in corrected.items()]
             outcomes = run(job, ["evaluation={every: 100000, trials: 2880, start: each}", *changes], seeds)
             last = [outcome.evaluations[max(outcome.evaluations)] for outcome in outcomes]
             percent = spread([evaluation["success_percent"] for evaluation in last], 1)
             length = spread([evaluation["mean_length"] for evaluation in last], 1)
-            rows.append((job, " and ".join(mended) or "nothing", percent, length))
-    heads = ("job", "mended", "finished, %", "mean length")
+            rows.append((job, " and ".join(corrected) or "nothing", percent, length))
+    heads = ("job", "corrected", "success, %", "mean length")
     table("**From each of the 2,880 start states**, after training", heads, rows)
 
 
@@ -207,7 +207,7 @@ def main() -> None:
         print_rewards(job, found[job])
     print_curves(found)
     print_ends(found)
-    print_slips(seeds)
+    print_corrections(seeds)
 
 
 if __name__ == "__main__":
