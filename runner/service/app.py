@@ -17,7 +17,7 @@ from runner.service import health, login, pages
 from runner.service.api import comparing, files, jobs, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.guard import Guard
-from runner.service.jobs.scheduler import Jobs
+from runner.service.jobs.pool import JobPool
 from runner.service.logs import LOG, AccessLog
 from runner.service.played import load_sweep_libraries
 from runner.service.problems import add_error_handlers, answers
@@ -109,10 +109,10 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
         app.state.catalogue.prepare()
         settings: Settings = app.state.settings
         app.state.jobs = stack.enter_context(
-            Jobs(
+            JobPool(
                 settings.recordings[0],
                 settings.workers,
-                most_waiting=settings.limits.jobs,
+                max_unfinished=settings.limits.jobs,
                 ray=settings.ray,
             )
         )
@@ -128,7 +128,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
             ProcessPool(PROCESSES, settings.limits.work_seconds, settings.limits.work_bytes)
         )
         app.state.sweep_processes = stack.enter_context(
-            ProcessPool(1, settings.limits.work_seconds, settings.limits.work_bytes, keep_seconds=None)
+            ProcessPool(1, settings.limits.work_seconds, settings.limits.work_bytes, is_reused=True)
         )
         if any(sweeps_in(folder) for folder in settings.recordings):
             app.state.sweep_processes.submit(load_sweep_libraries)

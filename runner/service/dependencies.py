@@ -11,7 +11,7 @@ from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.catalogue import Catalogue
-from runner.service.jobs.scheduler import Jobs
+from runner.service.jobs.pool import JobPool
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
 from runner.service.settings import Settings
@@ -35,9 +35,9 @@ def cache_of(request: Request) -> ResponseCache:
     return found
 
 
-def jobs_of(request: Request) -> Jobs:
+def jobs_of(request: Request) -> JobPool:
     """Return the jobs, done beside the service."""
-    found: Jobs = request.app.state.jobs
+    found: JobPool = request.app.state.jobs
     return found
 
 
@@ -58,7 +58,7 @@ CatalogueOf = Annotated[Catalogue, Depends(catalogue_of)]
 ProcessesOf = Annotated[ProcessPool, Depends(processes_of)]
 SweepProcesses = Annotated[ProcessPool, Depends(sweep_processes_of)]
 CacheOf = Annotated[ResponseCache, Depends(cache_of)]
-JobsOf = Annotated[Jobs, Depends(jobs_of)]
+JobsOf = Annotated[JobPool, Depends(jobs_of)]
 RunName = Annotated[
     str,
     Path(

@@ -25,7 +25,7 @@ from runner.errors import (
     StorageError,
 )
 from runner.service.errors import Refused
-from runner.service.jobs.queue import JobNotFound, JobStateConflict, QueueFull
+from runner.service.jobs.store import JobNotFound, JobStateConflict, QueueFull
 from runner.service.logs import LOG
 from runner.service.receiving.model import Conflict, TooLarge, TooMany
 from runner.service.settings import Settings

@@ -82,7 +82,7 @@ def command(
     require("fastapi", "uvicorn", "httptools", "httpx2", "jinja2", extra="service", purpose="the service")
     from runner.service import logs
     from runner.service.app import create_app
-    from runner.service.jobs.queue import require_free
+    from runner.service.jobs.store import LOCK_FILE, lock_folder
     from runner.service.server import bind, serve, url_of
     from runner.service.settings import Settings
 
@@ -105,7 +105,7 @@ def command(
         stream = log.open("a", encoding="utf-8") if log else sys.stderr
     except OSError as error:
         raise StorageError(f"{error.filename}: cannot be written ({error.strerror}).") from error
-    require_free(settings.recordings[0])  # refused before anybody can ask for anything
+    lock_folder(settings.recordings[0], LOCK_FILE).release()  # refused before anybody can ask for anything
     app = create_app(settings)
     listening = bind(settings)
     click.echo(url_of(listening))

@@ -1,4 +1,4 @@
-"""Jobs: submitted, listed, watched, cancelled, resumed."""
+"""JobPool: submitted, listed, watched, cancelled, resumed."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from pydantic import BaseModel, Field
 
 from runner.service.dependencies import JobsOf
 from runner.service.errors import Refused
-from runner.service.jobs.queue import Job, JobNotFound, Kind, State
-from runner.service.jobs.scheduler import SOURCE, Jobs, Standing
+from runner.service.jobs.checking import DEFAULT_SOURCE
+from runner.service.jobs.pool import JobPool, QueueStatus
+from runner.service.jobs.store import Job, JobNotFound, Kind, State
 from runner.service.problems import answers, content
 
 LOOK_SECONDS: Final = 0.25
@@ -130,10 +131,10 @@ Text = Annotated[str, Depends(text_of)]
     summary="Submit a configuration or a sweep.",
 )
 async def submit(
-    jobs: JobsOf, text: Text, response: Response, request: Request, source: Source = SOURCE
+    jobs: JobsOf, text: Text, response: Response, request: Request, source: Source = DEFAULT_SOURCE
 ) -> JobResponse:
     """Check the text, and queue it; a mistake is told with its line and key."""
-    checked = await jobs.check(text, source)  # may take long, so no thread of the server waits for it
+    checked = await jobs.checker.check(text, source)  # may take long, so no thread of the server waits for it
 
     def add() -> JobResponse:
         return told(jobs.add(text, checked), jobs)
@@ -149,9 +150,9 @@ async def submit(
     openapi_extra=_YAML,
     summary="Check a configuration or a sweep.",
 )
-async def check(jobs: JobsOf, text: Text, source: Source = SOURCE) -> CheckResponse:
+async def check(jobs: JobsOf, text: Text, source: Source = DEFAULT_SOURCE) -> CheckResponse:
     """Check the text as submitting it does, without queueing it."""
-    found = await jobs.check(text, source)
+    found = await jobs.checker.check(text, source)
     return CheckResponse(kind=found.kind, name=found.name, runs=found.runs, bytes=found.bytes)
 
 
@@ -163,13 +164,13 @@ def list_jobs(
     offset: Annotated[int, Query(ge=0, lt=2**31)] = 0,
 ) -> JobsPage:
     """List the jobs of the queue, and tell how it stands."""
-    found = [job for job in reversed(jobs.queue.jobs()) if not state or job.state in state]
+    found = [job for job in reversed(jobs.store.jobs()) if not state or job.state in state]
     return JobsPage(
         jobs=[told(job, jobs) for job in found[offset : offset + limit]],
         total=len(found),
         offset=offset,
         limit=limit,
-        queue=queue_response(jobs.standing()),
+        queue=queue_response(jobs.status()),
     )
 
 
@@ -178,7 +179,7 @@ def list_jobs(
 )
 def one(jobs: JobsOf, number: Number) -> JobResponse:
     """Tell of a job."""
-    return told(jobs.queue.job(number), jobs)
+    return told(jobs.store.job(number), jobs)
 
 
 @router.get(
@@ -189,7 +190,7 @@ def one(jobs: JobsOf, number: Number) -> JobResponse:
 )
 def submitted(jobs: JobsOf, number: Number) -> Response:
     """Return the YAML that was submitted."""
-    return Response(jobs.queue.submitted(number), media_type="text/plain")
+    return Response(jobs.store.submitted(number), media_type="text/plain")
 
 
 @router.post(
@@ -240,7 +241,7 @@ async def watch(
     `state`, `run` and `log` have ids; `progress` has none, as only the latest counts.
     """
     place = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 16 else after
-    if jobs.queue.job(number).is_over and place and not jobs.queue.events(number, place)[0]:
+    if jobs.store.job(number).is_over and place and not jobs.store.events(number, place)[0]:
         return Response(status_code=HTTPStatus.NO_CONTENT)  # which ends a browser's coming again
     if jobs.watchers >= MOST_WATCHERS:
         raise Refused(
@@ -253,15 +254,15 @@ async def watch(
     )
 
 
-async def _events(jobs: Jobs, number: int, place: int, stopping: asyncio.Event) -> AsyncIterator[str]:
+async def _events(jobs: JobPool, number: int, place: int, stopping: asyncio.Event) -> AsyncIterator[str]:
     jobs.watchers += 1
     try:
         yield f"retry: {RETRY_MILLISECONDS}\n\n"
         progress, spoken = None, time.monotonic()
         while not stopping.is_set():
-            job = jobs.queue.job(number)  # before its events, so that none of them is missed
+            job = jobs.store.job(number)  # before its events, so that none of them is missed
             before, progress = progress, jobs.progress(number)
-            found, place = await run_sync(jobs.queue.events, number, place)
+            found, place = await run_sync(jobs.store.events, number, place)
             has_moved = progress is not None and progress is not before
             if progress is not None and has_moved:
                 yield _event("progress", progress)
@@ -288,9 +289,9 @@ def _event(kind: str, data: Mapping[str, Any], place: int | None = None) -> str:
     return f"{head}event: {kind}\ndata: {json.dumps(data, ensure_ascii=False)}\n\n"
 
 
-def told(job: Job, jobs: Jobs) -> JobResponse:
+def told(job: Job, jobs: JobPool) -> JobResponse:
     """Return what is told of a job."""
-    begun = jobs.queue.runs_of(job.number)
+    begun = jobs.store.run_ids(job.number)
     return JobResponse(
         number=job.number,
         kind=job.kind,
@@ -306,7 +307,7 @@ def told(job: Job, jobs: Jobs) -> JobResponse:
     )
 
 
-def queue_response(standing: Standing) -> QueueResponse:
+def queue_response(standing: QueueStatus) -> QueueResponse:
     """Return what is told of the queue."""
     return QueueResponse(
         workers=standing.workers,

@@ -35,7 +35,7 @@ def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: J
         request,
         "disk.html",
         total=sums.by_kind(),
-        free=jobs.standing().free_bytes,
+        free=jobs.status().free_bytes,
         freeable=[(*FREED_BY[kind], size) for kind, size in freeable.items() if size],
         rows=[{"row": usage.row, "sizes": sizes([usage])} for usage in largest],
         left=sums.runs - len(largest),

@@ -16,8 +16,8 @@ from runner.service.dependencies import JobsOf
 from runner.service.pages.rendering import link, page
 
 if TYPE_CHECKING:
-    from runner.service.jobs.queue import Job
-    from runner.service.jobs.scheduler import Jobs
+    from runner.service.jobs.pool import JobPool
+    from runner.service.jobs.store import Job
 
 router = APIRouter(prefix="/queue", include_in_schema=False)
 
@@ -54,14 +54,14 @@ def queue_standing(
 def job(request: Request, jobs: JobsOf, number: Number) -> Response:
     """Show a job: how far it is, what it said, its runs."""
     log, place = _log(jobs, number)
-    found = jobs.queue.job(number)  # not older than its log: what comes behind that, the page's script hears
+    found = jobs.store.job(number)  # not older than its log: what comes behind that, the page's script hears
     return page(
         request,
         "job.html",
         job=shown_job(found, jobs),
         log=log,
         place=place,
-        submitted=jobs.queue.submitted(number),
+        submitted=jobs.store.submitted(number),
         runs=_runs(found, jobs),
         is_over=found.is_over,
         seconds=_seconds(found),
@@ -85,12 +85,12 @@ def resume(jobs: JobsOf, number: Number) -> Response:
 # --- inside -------------------------------------------------------------------------------------------
 
 
-def _queue(jobs: Jobs, number: int) -> dict[str, Any]:
-    found = list(reversed(jobs.queue.jobs()))
+def _queue(jobs: JobPool, number: int) -> dict[str, Any]:
+    found = list(reversed(jobs.store.jobs()))
     shown = found[(number - 1) * ROWS : number * ROWS]
     return {
         "jobs": [shown_job(job, jobs) for job in shown],
-        "standing": queue_response(jobs.standing()),
+        "standing": queue_response(jobs.status()),
         "active": any(job.state in ("queued", "running") for job in found),
         "page": number,
         "pages": max(1, math.ceil(len(found) / ROWS)),
@@ -98,7 +98,7 @@ def _queue(jobs: Jobs, number: int) -> dict[str, Any]:
     }
 
 
-def shown_job(job: Job, jobs: Jobs) -> dict[str, Any]:
+def shown_job(job: Job, jobs: JobPool) -> dict[str, Any]:
     """Return what is shown of a job."""
     facts = told(job, jobs).model_dump()
     progress = facts["progress"] or {}
@@ -125,9 +125,9 @@ def _said(job: Job, progress: dict[str, Any]) -> str:
     return f"{progress['episode']:,} of {progress['episodes']:,} episodes{run}"
 
 
-def _log(jobs: Jobs, number: int) -> tuple[list[dict[str, Any]], int]:
+def _log(jobs: JobPool, number: int) -> tuple[list[dict[str, Any]], int]:
     """Return the last events of a job, and the place behind them."""
-    found, place = jobs.queue.last_events(number, MOST_LINES)
+    found, place = jobs.store.last_events(number, MOST_LINES)
     return [{"kind": event.kind, **event.data} for event in found], place
 
 
@@ -138,5 +138,5 @@ def _seconds(job: Job) -> float | None:
     return (datetime.fromisoformat(job.ended) - datetime.fromisoformat(job.started)).total_seconds()
 
 
-def _runs(job: Job, jobs: Jobs) -> list[dict[str, Any]]:
-    return [{"seed": seed, "id": run_id} for seed, run_id in jobs.queue.runs_of(job.number).items()]
+def _runs(job: Job, jobs: JobPool) -> list[dict[str, Any]]:
+    return [{"seed": seed, "id": run_id} for seed, run_id in jobs.store.run_ids(job.number).items()]

@@ -43,7 +43,7 @@ from runner.service.pages.rendering import page
 from runner.util import humanize
 
 if TYPE_CHECKING:
-    from runner.service.jobs.scheduler import Jobs
+    from runner.service.jobs.pool import JobPool
     from runner.service.processes import ProcessPool
     from runner.service.response_cache import ResponseCache
     from runner.service.settings import Settings
@@ -175,7 +175,7 @@ async def _random_policy(run: Run, cache: ResponseCache, processes: ProcessPool)
 
 
 def _overview(
-    request: Request, run: Run, jobs: Jobs, settings: Settings, problem: str = "", random: str = ""
+    request: Request, run: Run, jobs: JobPool, settings: Settings, problem: str = "", random: str = ""
 ) -> Response:
     """Return the first page of a run, with what is wrong with labels that were sent."""
     status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
@@ -185,7 +185,7 @@ def _overview(
     )
 
 
-def _standing(run: Run, jobs: Jobs, settings: Settings) -> dict[str, Any]:
+def _standing(run: Run, jobs: JobPool, settings: Settings) -> dict[str, Any]:
     """Return how a run stands: what it did, how far it is, which job makes it, whether that will change."""
     number, progress = _job_of(run, jobs)
     summary = progress or run.summary
@@ -238,10 +238,10 @@ def _of_evaluation(values: Mapping[EvaluationMetric, float | None]) -> dict[str,
     }
 
 
-def _job_of(run: Run, jobs: Jobs) -> tuple[int | None, dict[str, Any]]:
+def _job_of(run: Run, jobs: JobPool) -> tuple[int | None, dict[str, Any]]:
     """Return the job that makes a run, or will go on with it, and how far the run is; None if none does."""
-    for job in jobs.queue.jobs():
-        if not job.is_over and run.run_id in jobs.queue.runs_of(job.number).values():
+    for job in jobs.store.jobs():
+        if not job.is_over and run.run_id in jobs.store.run_ids(job.number).values():
             progress = (jobs.progress(job.number) or {}) if job.state == "running" else {}
             return job.number, progress if progress.get("run_id") == run.run_id else {}
     return None, {}

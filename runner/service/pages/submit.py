@@ -17,7 +17,7 @@ from runner.config.schema import json_schema, without_references
 from runner.errors import RunnerError
 from runner.service.dependencies import CatalogueOf, JobsOf
 from runner.service.errors import Refused
-from runner.service.jobs.checking import SWEEP_KEYS, Checked
+from runner.service.jobs.checking import SWEEP_KEYS, CheckedJob
 from runner.service.pages.forms import Form
 from runner.service.pages.rendering import page, viewer_of
 from runner.service.problems import error_body
@@ -75,7 +75,7 @@ async def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
     """Queue what was sent, or say what is wrong with it."""
     text = sent.get("text", "")
     try:
-        checked = await jobs.check(text)
+        checked = await jobs.checker.check(text)
         if sent.get("action") == "check":
             return await run_in_threadpool(_form, request, text, fine=checked)
         job = await run_in_threadpool(jobs.add, text, checked)
@@ -99,7 +99,7 @@ def _form(
     request: Request,
     text: str,
     problems: list[dict[str, Any]] | None = None,
-    fine: Checked | None = None,
+    fine: CheckedJob | None = None,
     status: HTTPStatus = HTTPStatus.OK,
 ) -> Response:
     lines = text.splitlines()

@@ -77,7 +77,7 @@ async def sweep(
         parts[part] = await run_in_threadpool(render, body) if body else None
 
     def shown() -> Response:
-        made_by = [job for job in jobs.queue.jobs() if job.kind == "sweep" and job.name == name]
+        made_by = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
         return page(
             request,
             "sweep.html",

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from runner.errors import StorageError
-from runner.service.jobs.folder_lock import hold
+from runner.service.jobs.store import lock_folder
 from runner.service.receiving.appending import on_disk
 from runner.service.receiving.model import BODY_FILE, STATE_FILE, Upload, read_upload
 from runner.util.files import sync, write_object
@@ -40,7 +40,7 @@ class UploadFolder:
 
     def __init__(self, recordings: Path) -> None:
         self._path = recordings / FOLDER
-        self._lock = hold(recordings, f"{FOLDER}/{LOCK_FILE}")
+        self._lock = lock_folder(recordings, f"{FOLDER}/{LOCK_FILE}")
         self._guard = threading.Lock()
         self._flushing: dict[str, list[Future[None]]] = {}
         self._flusher = ThreadPoolExecutor(1, "flushing")

@@ -11,7 +11,7 @@ import pytest
 from runner.config import load
 from runner.errors import ConfigError
 from runner.service.jobs import checking
-from runner.service.jobs.checking import Checker, check
+from runner.service.jobs.checking import JobChecker, check
 from runner.sweep import state
 from runner.sweep.loading import from_values
 
@@ -91,7 +91,7 @@ def test_more_runs_than_a_job_may_make_are_refused(tmp_path):
 
 
 def test_the_process_answers_as_the_function_does(tmp_path):
-    with Checker(tmp_path) as checker:
+    with JobChecker(tmp_path) as checker:
         assert checker.check_now(TINY, "tiny.yaml") == check(TINY, "tiny.yaml", tmp_path)
         with pytest.raises(ConfigError) as caught:
             checker.check_now("episodes: many", "job.yaml")
@@ -101,25 +101,25 @@ def test_the_process_answers_as_the_function_does(tmp_path):
 
 
 def test_an_environment_that_hangs_or_kills_costs_only_its_own_process(tmp_path, environments, monkeypatch):
-    with Checker(tmp_path) as checker:
+    with JobChecker(tmp_path) as checker:
         with pytest.raises(ConfigError, match="ended the process that was checking it"):
             checker.check_now(environments["killing"], "job.yaml")
         assert checker.check_now(TINY, "tiny.yaml").runs == 2
     monkeypatch.setattr(checking, "CHECK_SECONDS", 1.0)
-    with Checker(tmp_path) as checker, pytest.raises(ConfigError, match="took longer than 1 s to check"):
+    with JobChecker(tmp_path) as checker, pytest.raises(ConfigError, match="took longer than 1 s to check"):
         checker.check_now(environments["hanging"], "job.yaml")
 
 
 def test_an_environment_that_takes_too_much_memory_is_refused(tmp_path, environments, monkeypatch):
     monkeypatch.setattr(checking, "MEMORY_BYTES", 256 << 20)
-    with Checker(tmp_path) as checker:
+    with JobChecker(tmp_path) as checker:
         with pytest.raises(ConfigError, match=r"needs more than 0\.25 GiB of memory"):
             checker.check_now(environments["greedy"], "job.yaml")
         assert checker.check_now(TINY, "tiny.yaml").runs == 2
 
 
 def test_an_idle_process_that_was_ended_is_not_blamed_on_the_next_text(tmp_path):
-    with Checker(tmp_path) as checker:
+    with JobChecker(tmp_path) as checker:
         for _ in range(3):
             assert checker.check_now(TINY, "tiny.yaml").runs == 2
             for process in psutil.Process().children(recursive=True):

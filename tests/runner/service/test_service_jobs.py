@@ -1,4 +1,4 @@
-"""Jobs over HTTP: submitted, watched, cancelled, resumed."""
+"""JobPool over HTTP: submitted, watched, cancelled, resumed."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from submitted import ENDLESS, ICY
 import runner
 from runner.config import from_mapping
 from runner.runs.run import list_runs
-from runner.service.jobs import scheduler
-from runner.service.jobs.scheduler import Jobs
+from runner.service.jobs import pool
+from runner.service.jobs.pool import JobPool
 from tests.waiting import until
 
 CONFIG = ICY | {"episodes": 200, "evaluation": {"every": 100, "trials": 5}}
@@ -216,11 +216,11 @@ def test_a_text_can_be_checked_without_being_queued(client):
 
 
 def test_what_the_disk_would_not_hold_is_refused_and_a_full_one_is_waited_for(client, submit, monkeypatch):
-    monkeypatch.setattr(scheduler, "free_bytes", lambda _: 1000)
+    monkeypatch.setattr(pool, "free_bytes", lambda _: 1000)
     refused = client.post("/api/v1/jobs", content=json.dumps(CONFIG))
     assert refused.status_code == 507
     assert "its recordings need about" in refused.json()["error"]["message"]
-    monkeypatch.setattr(scheduler, "free_bytes", lambda _: scheduler.RESERVE_BYTES - 1)
+    monkeypatch.setattr(pool, "free_bytes", lambda _: pool.RESERVE_BYTES - 1)
     number = submit(CONFIG | {"seeds": [0]})
     time.sleep(0.5)
     assert job(client, number)["state"] == "queued"
@@ -245,15 +245,15 @@ def test_what_was_submitted_is_given_back(client, submit):
 @pytest.mark.parametrize("folder", ["missing", "there"])
 def test_a_run_that_was_promised_but_never_made_is_made(tmp_path, folder):
     """The worker wrote the run's id down, or made its folder, and was killed."""
-    with Jobs(tmp_path, 1) as jobs:
-        queued = jobs.queue.add("config", "icy", 1, "", from_mapping(CONFIG | {"seeds": [3]}).to_mapping())
-        (jobs.queue.folder_of(queued.number) / "runs.json").write_text('{"3": "abcdefgh"}')
+    with JobPool(tmp_path, 1) as jobs:
+        queued = jobs.store.add("config", "icy", 1, "", from_mapping(CONFIG | {"seeds": [3]}).to_mapping())
+        (jobs.store.folder_of(queued.number) / "runs.json").write_text('{"3": "abcdefgh"}')
         if folder == "there":
             (jobs.recordings / "abcdefgh").mkdir()
-        over = until(lambda job: job.is_over, lambda: jobs.queue.job(queued.number))
+        over = until(lambda job: job.is_over, lambda: jobs.store.job(queued.number))
         assert over.state == "finished"
         runs = list_runs(jobs.recordings)
-        assert [run.run_id for run in runs] == [jobs.queue.runs_of(queued.number)[3]]
+        assert [run.run_id for run in runs] == [jobs.store.run_ids(queued.number)[3]]
 
 
 def test_a_worker_that_cannot_be_started_is_waited_for_and_readiness_says_so(
@@ -264,7 +264,7 @@ def test_a_worker_that_cannot_be_started_is_waited_for_and_readiness_says_so(
     def refused(_):
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(scheduler, "RETRY_SECONDS", 0.05)
+    monkeypatch.setattr(pool, "RETRY_SECONDS", 0.05)
     with monkeypatch.context() as full:
         full.setattr(SpawnProcess, "start", refused)
         number = jobs_of(client).queue.add("config", "icy", 1, "", one_seed()).number
@@ -281,7 +281,7 @@ def test_a_worker_that_cannot_be_started_is_waited_for_and_readiness_says_so(
 
 def test_what_goes_wrong_with_one_job_does_not_stop_the_others(client, submit, monkeypatch):
     jobs = jobs_of(client)
-    note = jobs.queue.note
+    note = jobs.store.note
 
     def failing(number, *facts):
         if number == 1:
@@ -308,7 +308,7 @@ def test_readiness_tells_when_the_thread_of_the_jobs_is_dead(client, monkeypatch
 
 def test_a_cancelled_job_is_not_forgotten_while_its_worker_closes(client, submit):
     jobs = jobs_of(client)
-    jobs.queue._most_kept = 0
+    jobs.store._most_kept = 0
     number = submit(ENDLESS)
     job_until(client, number, lambda job: job["progress"] is not None)
     with jobs._lock:  # the worker's end is not taken in before the next job is there

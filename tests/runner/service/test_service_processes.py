@@ -60,12 +60,12 @@ def test_closing_ends_calls_that_are_under_way():
 
 
 def test_a_process_is_used_again_when_it_is_kept():
-    with ProcessPool(1, 30, MEMORY, keep_seconds=60) as pool:
+    with ProcessPool(1, 30, MEMORY, is_reused=True) as pool:
         assert pool.submit(os.getpid).result() == pool.submit(os.getpid).result()
 
 
 def test_calls_of_a_kept_process_leave_no_threads_behind():
-    with ProcessPool(1, 30, MEMORY, keep_seconds=60) as pool:
+    with ProcessPool(1, 30, MEMORY, is_reused=True) as pool:
         pool.submit(os.getpid).result()
         before = threading.active_count()
         for _ in range(20):

@@ -8,7 +8,7 @@ import pytest
 
 from runner.errors import RunnerError, StorageError
 from runner.service.jobs import queue as queues
-from runner.service.jobs.queue import JobNotFound, Queue, QueueFull
+from runner.service.jobs.store import JobNotFound, Queue, QueueFull
 
 CONFIG = {"episodes": 3}
 

@@ -10,7 +10,7 @@ from submitted import ENDLESS, ICY
 import runner
 from runner.recording.reader import open_recording
 from runner.runs.run import list_runs
-from runner.service.jobs.scheduler import Jobs
+from runner.service.jobs.pool import JobPool
 from tests.waiting import until
 
 pytest.importorskip("ray")
@@ -29,21 +29,21 @@ def cluster():
 
 def test_a_job_is_done_by_ray_as_beside_the_server_and_can_be_cancelled(cluster, tmp_path):
     here = runner.run_all(ICY, recordings=tmp_path / "here")
-    with Jobs(tmp_path / "far", 1, ray=cluster) as jobs:
+    with JobPool(tmp_path / "far", 1, ray=cluster) as jobs:
         number = jobs.submit(json.dumps(ICY), "job.yaml").number
-        over = until(lambda job: job.is_over, lambda: jobs.queue.job(number))
+        over = until(lambda job: job.is_over, lambda: jobs.store.job(number))
         assert over.state == "finished", over.error
         far = sorted(list_runs(tmp_path / "far"), key=lambda run: run.seed)
         digests = [[run.summary["content_digest"] for run in runs] for runs in (far, here)]
         assert digests[0] == digests[1]
-        assert jobs.queue.runs_of(number) == {run.seed: run.run_id for run in far}
-        told = {event.kind for event in jobs.queue.events(number)[0]}
+        assert jobs.store.run_ids(number) == {run.seed: run.run_id for run in far}
+        told = {event.kind for event in jobs.store.events(number)[0]}
         assert told == {"state", "run", "log"}
         with open_recording(far[0].recording) as recording:
             assert "ray" in recording.provenance["command"]
         endless = jobs.submit(json.dumps(ENDLESS), "job.yaml").number
         until(lambda progress: progress and progress.get("episode", 0) > 0, lambda: jobs.progress(endless))
         jobs.cancel(endless)
-        until(lambda job: job.state == "cancelled", lambda: jobs.queue.job(endless))
+        until(lambda job: job.state == "cancelled", lambda: jobs.store.job(endless))
     (run,) = [run for run in list_runs(tmp_path / "far") if run.name == "endless"]
     assert run.status == "interrupted"

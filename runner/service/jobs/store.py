@@ -1,0 +1,396 @@
+"""The jobs of a recordings folder in SQLite, on disk before a request is answered.
+
+    recordings/.jobs/jobs.sqlite
+
+A job is a configuration with all its seeds, or a sweep. Its number is its place in the queue.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+from collections import Counter
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias
+
+from peewee import (
+    AutoField,
+    BooleanField,
+    CompositeKey,
+    IntegerField,
+    Model,
+    PeeweeException,
+    SchemaManager,
+    SqliteDatabase,
+    TextField,
+)
+
+from runner.client.jobs import OVER
+from runner.config.document import read_yaml, write_yaml
+from runner.errors import RunnerError, StorageError
+from runner.runs.locking import acquired
+
+if TYPE_CHECKING:
+    from filelock import FileLock
+
+Kind = Literal["config", "sweep"]
+State = Literal["queued", "running", "interrupted", "finished", "failed", "cancelled"]
+EventData: TypeAlias = Mapping[str, Any]
+
+FOLDER: Final = ".jobs"
+DATABASE_FILE: Final = "jobs.sqlite"
+LOCK_FILE: Final = f"{FOLDER}/queue.lock"
+MAX_EVENTS: Final = 50_000
+"""Stored events of a job; beyond them only its states are stored."""
+EVENTS_PER_READ: Final = 2000
+
+
+class QueueFull(RunnerError):
+    """The maximum number of unfinished jobs is reached."""
+
+
+class JobNotFound(RunnerError):
+    """No job has this number."""
+
+
+class JobStateConflict(RunnerError):
+    """The job's state does not allow the operation."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A submitted job and its state. Times are in UTC, as ISO 8601; empty if they have not come."""
+
+    number: int
+    kind: Kind
+    name: str
+    runs: int
+    """Number of runs: a configuration's seeds; a sweep's trials, times its seeds."""
+    created: str
+    state: State = "queued"
+    started: str = ""
+    ended: str = ""
+    error: str = ""
+    """Why it failed; empty if it did not."""
+    deaths: int = 0
+    """Number of its workers that died since it was submitted or resumed."""
+    accept_changes: bool = False
+    """Whether to resume runs that were started by other code."""
+    retry: bool = False
+    """Whether to repeat failed runs of a sweep."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more happens unless a user resumes it."""
+        return self.state in OVER
+
+
+@dataclass(frozen=True)
+class Event:
+    """An event of a job: `state`, `run` (one was started) or `log`."""
+
+    id: int
+    kind: str
+    data: dict[str, Any]
+
+
+class _JobRow(Model):
+    number = IntegerField(primary_key=True)
+    kind = TextField()
+    name = TextField()
+    runs = IntegerField()
+    created = TextField()
+    state = TextField()
+    started = TextField()
+    ended = TextField()
+    error = TextField()
+    deaths = IntegerField()
+    accept_changes = BooleanField()
+    retry = BooleanField()
+    submitted = TextField()
+    values = TextField()
+
+    class Meta:
+        table_name = "jobs"
+
+
+class _RunRow(Model):
+    job = IntegerField()
+    seed = TextField()
+    """Decimal: seeds exceed SQLite's integers."""
+    run_id = TextField()
+    started = BooleanField()
+
+    class Meta:
+        table_name = "runs"
+        primary_key = CompositeKey("job", "seed")
+
+
+class _EventRow(Model):
+    id = AutoField()
+    job = IntegerField(index=True)
+    kind = TextField()
+    data = TextField()
+
+    class Meta:
+        table_name = "events"
+
+
+_TABLES: Final = (_JobRow, _RunRow, _EventRow)
+
+
+class JobStore:
+    """The jobs of a recordings folder; thread-safe. One process at a time has it.
+
+    The jobs themselves are held in memory too: the scheduler reads them several times a second, and a full
+    disk does not stop it.
+
+    Args:
+        recordings: the recordings folder.
+        max_unfinished: the maximum number of unfinished jobs.
+        max_over: how many jobs that are over to remember.
+
+    Raises:
+        RunnerError: another process has it.
+        StorageError: the folder or the database cannot be used.
+    """
+
+    def __init__(self, recordings: Path, max_unfinished: int = 1000, max_over: int = 1000) -> None:
+        self.recordings, self.path = recordings, recordings / FOLDER / DATABASE_FILE
+        self._max_unfinished, self._max_over = max_unfinished, max_over
+        self._lock = threading.RLock()
+        self._file_lock = lock_folder(recordings, LOCK_FILE)
+        # With exclusive locking the write-ahead log needs no shared memory, so network disks will do.
+        pragmas = {"locking_mode": "exclusive", "journal_mode": "wal", "synchronous": "full"}
+        options = {"thread_safe": False, "check_same_thread": False}  # guarded by our own lock
+        self._database = SqliteDatabase(self.path, pragmas=pragmas, **options)
+        try:
+            with self._transaction("move it away to start with an empty queue"):
+                for table in _TABLES:
+                    SchemaManager(table, self._database).create_all()
+                columns = [getattr(_JobRow, field.name) for field in fields(Job)]
+                rows = self._tuples(_JobRow.select(*columns).order_by(_JobRow.number))
+                self._jobs = {row[0]: Job(*row) for row in rows}
+                self._event_counts = Counter(job for (job,) in self._tuples(_EventRow.select(_EventRow.job)))
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the database, and release the folder for other processes."""
+        with self._lock:
+            self._database.close()
+            self._file_lock.release()
+
+    def jobs(self) -> list[Job]:
+        """Return all jobs, in the order of submission."""
+        with self._lock:
+            return list(self._jobs.values())
+
+    def job(self, number: int) -> Job:
+        """Return a job.
+
+        Raises:
+            JobNotFound: there is none.
+        """
+        with self._lock:
+            if number not in self._jobs:
+                raise JobNotFound(f"no job {number}; `GET /jobs` lists those there are.")
+            return self._jobs[number]
+
+    def add(
+        self,
+        kind: Kind,
+        name: str,
+        runs: int,
+        submitted: str,
+        values: Mapping[str, Any],
+        keep: Container[int] = (),
+    ) -> Job:
+        """Append a job to the queue, on disk, and return it.
+
+        Args:
+            kind: a configuration or a sweep.
+            name: its name.
+            runs: the number of its runs.
+            submitted: the text as it was submitted.
+            values: the configuration or sweep, every value present.
+            keep: numbers of jobs not to forget although they are over: a worker is still closing them.
+
+        Raises:
+            QueueFull: there are too many unfinished jobs.
+            StorageError: it cannot be written; then it is not in the queue.
+        """
+        with self._lock:
+            unfinished = sum(not job.is_over for job in self._jobs.values())
+            if unfinished >= self._max_unfinished:
+                raise QueueFull(
+                    f"{unfinished:,} jobs are unfinished, the maximum; wait until one of them is over."
+                )
+            job = Job(max(self._jobs, default=0) + 1, kind, name, runs, now())
+            over = [old.number for old in self._jobs.values() if old.is_over and old.number not in keep]
+            forgotten = over[: max(0, len(over) - self._max_over)]
+            with self._transaction():
+                row = asdict(job) | {"submitted": submitted, "values": write_yaml(values)}
+                _JobRow.insert(row).execute(self._database)
+                self._insert_state(job)
+                for table, column in (
+                    (_JobRow, _JobRow.number),
+                    (_RunRow, _RunRow.job),
+                    (_EventRow, _EventRow.job),
+                ):
+                    table.delete().where(column.in_(forgotten)).execute(self._database)
+            for number in forgotten:
+                del self._jobs[number], self._event_counts[number]
+            self._jobs[job.number] = job
+            return job
+
+    def update(self, number: int, **changes: Any) -> Job:
+        """Change fields of a job, and return it; a new state or error is an event.
+
+        Raises:
+            StorageError: it cannot be written; it is changed until the next start all the same.
+        """
+        with self._lock:
+            before = self.job(number)
+            job = self._jobs[number] = replace(before, **changes)
+            with self._transaction("free some disk"):
+                row = _JobRow.update(asdict(job)).where(_JobRow.number == number)
+                row.execute(self._database)
+                if (job.state, job.error) != (before.state, before.error):
+                    self._insert_state(job)
+            return job
+
+    def add_events(self, number: int, kind: str, data: Sequence[EventData]) -> None:
+        """Add events to a job; those that the disk or the limit has no room for are dropped."""
+        with self._lock, contextlib.suppress(StorageError), self._transaction():
+            room = max(0, MAX_EVENTS - self._event_counts[number])
+            self._insert_events(number, kind, data[:room])
+
+    def events(self, number: int, after: int = 0) -> tuple[list[Event], int]:
+        """Return a job's next events, not all if there are many, and the id of the last one.
+
+        Args:
+            number: the job's number.
+            after: the id of the last event seen; 0, or what is no event of the job, for the first ones.
+
+        Raises:
+            JobNotFound: there is no such job.
+        """
+        with self._lock:
+            self.job(number)
+            columns = (_EventRow.id, _EventRow.kind, _EventRow.data)
+            own = _EventRow.select(*columns).where(_EventRow.job == number)
+            if after and not self._tuples(own.where(_EventRow.id == after)):
+                after = 0
+            query = own.where(_EventRow.id > after).order_by(_EventRow.id).limit(EVENTS_PER_READ)
+            found = [Event(id_, kind, json.loads(data)) for id_, kind, data in self._tuples(query)]
+            return found, found[-1].id if found else after
+
+    def last_events(self, number: int, limit: int) -> tuple[list[Event], int]:
+        """Return the last events of a job, and the id of the last one.
+
+        Raises:
+            JobNotFound: there is no such job.
+        """
+        with self._lock:
+            self.job(number)
+            query = _EventRow.select(_EventRow.id).where(_EventRow.job == number)
+            ids = self._tuples(query.order_by(_EventRow.id.desc()).limit(1).offset(limit))
+            return self.events(number, ids[0][0] if ids else 0)
+
+    def run_ids(self, number: int, started: bool = True) -> dict[int, str]:
+        """Return the run ids of a configuration's job by seed: of started runs, or all reserved ones."""
+        with self._lock:
+            query = _RunRow.select(_RunRow.seed, _RunRow.run_id).where(_RunRow.job == number)
+            query = query.where(_RunRow.started) if started else query
+            return dict(sorted((int(seed), run_id) for seed, run_id in self._tuples(query)))
+
+    def reserve_runs(self, number: int, run_ids: Mapping[int, str]) -> None:
+        """Store the ids of runs by seed before they are made, so that no run is started twice.
+
+        Raises:
+            StorageError: they cannot be written.
+        """
+        with self._lock, self._transaction("free some disk"):
+            for seed, run_id in run_ids.items():
+                self._insert_run(number, seed, run_id, started=False)
+
+    def start_run(self, number: int, seed: int, run_id: str) -> None:
+        """Store that a run was started, as an event too."""
+        with self._lock, contextlib.suppress(StorageError), self._transaction():
+            self._insert_run(number, seed, run_id, started=True)
+            self._insert_events(number, "run", [{"run_id": run_id, "seed": seed, "time": now()}])
+
+    def submitted(self, number: int) -> str:
+        """Return the text of a job as it was submitted.
+
+        Raises:
+            JobNotFound: there is no such job.
+        """
+        self.job(number)
+        return self._column(number, _JobRow.submitted)
+
+    def values(self, number: int) -> dict[str, Any]:
+        """Return the configuration or sweep of a job, every value present."""
+        return dict(read_yaml(self._column(number, _JobRow.values), f"job {number}").value)
+
+    def _column(self, number: int, column: TextField) -> str:
+        with self._lock:
+            ((text,),) = self._tuples(_JobRow.select(column).where(_JobRow.number == number))
+            return str(text)
+
+    def _tuples(self, query: Any) -> list[tuple[Any, ...]]:
+        return list(query.tuples().execute(self._database))
+
+    def _insert_state(self, job: Job) -> None:
+        error = {"error": job.error} if job.error else {}
+        self._insert_events(job.number, "state", [{"state": job.state, "time": now()} | error])
+
+    def _insert_run(self, number: int, seed: int, run_id: str, started: bool) -> None:
+        row = {"job": number, "seed": str(seed), "run_id": run_id, "started": started}
+        _RunRow.replace(row).execute(self._database)
+
+    def _insert_events(self, number: int, kind: str, data: Sequence[EventData]) -> None:
+        rows = [{"job": number, "kind": kind, "data": json.dumps(each)} for each in data]
+        if rows:
+            _EventRow.insert_many(rows).execute(self._database)
+            self._event_counts[number] += len(rows)
+
+    @contextlib.contextmanager
+    def _transaction(self, advice: str = "free some disk") -> Iterator[None]:
+        try:
+            with self._database.atomic():
+                yield
+        except PeeweeException as error:
+            raise StorageError(f"{self.path}: cannot be written ({error}); {advice}.") from error
+
+
+def lock_folder(recordings: Path, lock_file: str) -> FileLock:
+    """Lock a part of a recordings folder against other processes, until it is released or this one ends.
+
+    Args:
+        recordings: the recordings folder; created if it is missing.
+        lock_file: the lock file of the part, relative to the folder.
+
+    Raises:
+        RunnerError: another process has it.
+        StorageError: the folder cannot be written.
+    """
+    busy = f"{recordings} is served by another process already; stop it, or choose another --recordings."
+    return acquired(recordings / lock_file, RunnerError(busy))
+
+
+def now() -> str:
+    """Return the current time as jobs have it."""
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
