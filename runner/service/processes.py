@@ -3,7 +3,8 @@
     with ProcessPool(processes=2, seconds=600, memory_bytes=4 << 30) as pool:
         result = await pool(function, argument)
 
-A thread waits for each busy process, which works on every platform, unlike an event loop that waits for a pipe.
+A thread waits for each busy process: unlike an event loop that waits for a pipe, this works on every
+platform.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ class ProcessPool:
         self._children: set[ChildProcess] = set()
         self._thread = threading.local()
         """The reused process of each thread, as `child`."""
-        self._is_closed = False
+        self._closed = threading.Event()
 
     def __enter__(self) -> Self:
         """Start the process that all others are forked from, so that the first call need not wait for it."""
@@ -76,7 +77,7 @@ class ProcessPool:
     def close(self) -> None:
         """Kill all processes; calls that run or wait fail."""
         with self._lock:
-            self._is_closed = True
+            self._closed.set()
             for child in self._children:
                 child.kill()
         self._threads.shutdown(wait=True)
@@ -136,7 +137,7 @@ class ProcessPool:
                 self._end(child)
 
     def _start(self) -> ChildProcess:
-        if self._is_closed:
+        if self._closed.is_set():
             raise ProcessDied("the service is stopping.")
         try:
             child = ChildProcess(self._memory_bytes, self._context)
@@ -144,7 +145,7 @@ class ProcessPool:
             raise Busy(f"the system has no process for it ({error.strerror}); try again.") from error
         with self._lock:
             self._children.add(child)
-            if self._is_closed:  # after all others were killed
+            if self._closed.is_set():  # after all others were killed
                 child.kill()
         return child
 

@@ -267,7 +267,7 @@ async def _events(jobs: JobPool, number: int, place: int, stopping: asyncio.Even
             if progress is not None and has_moved:
                 yield _event("progress", progress)
             for event in found:
-                yield _event(event.kind, event.data, event.place)
+                yield _event(event.kind, event.data, event.id)
             if not found and job.is_over:
                 return
             if not (found or has_moved):

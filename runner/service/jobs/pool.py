@@ -22,7 +22,7 @@ from typing import Any, Final, Self
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.runs.run import new_run_id
-from runner.service.jobs.checking import CheckedJob, JobChecker
+from runner.service.jobs.checking import DEFAULT_SOURCE, CheckedJob, JobChecker
 from runner.service.jobs.store import Job, JobStateConflict, JobStore, now
 from runner.service.jobs.worker import JobSpec, Outcome, work
 from runner.service.logs import LOG
@@ -32,8 +32,6 @@ STOP_SECONDS: Final = 15.0
 RECEIVE_SECONDS: Final = 0.1
 MAX_DEATHS: Final = 2
 """A job fails when so many of its workers have died."""
-DEFAULT_SOURCE: Final = "job.yaml"
-"""The name of a text that was submitted without one."""
 RESERVE_BYTES: Final = 256 << 20
 """No job is started while the disk has less space."""
 RETRY_SECONDS: Final = 5.0

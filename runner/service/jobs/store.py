@@ -166,8 +166,10 @@ class JobStore:
         self._file_lock = lock_folder(recordings, LOCK_FILE)
         # With exclusive locking the write-ahead log needs no shared memory, so network disks will do.
         pragmas = {"locking_mode": "exclusive", "journal_mode": "wal", "synchronous": "full"}
-        options = {"thread_safe": False, "check_same_thread": False}  # guarded by our own lock
-        self._database = SqliteDatabase(self.path, pragmas=pragmas, **options)
+        # One connection, guarded by our own lock.
+        self._database = SqliteDatabase(
+            str(self.path), pragmas=pragmas, thread_safe=False, check_same_thread=False
+        )
         try:
             with self._transaction("move it away to start with an empty queue"):
                 for table in _TABLES:
@@ -359,7 +361,7 @@ class JobStore:
 
     def _insert_run(self, number: int, seed: int, run_id: str, started: bool) -> None:
         row = {"job": number, "seed": str(seed), "run_id": run_id, "started": started}
-        _RunRow.replace(row).execute(self._database)
+        _RunRow.insert(row).on_conflict_replace().execute(self._database)
 
     def _insert_events(self, number: int, kind: str, data: Sequence[EventData]) -> None:
         rows = [{"job": number, "kind": kind, "data": json.dumps(each)} for each in data]

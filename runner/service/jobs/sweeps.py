@@ -47,7 +47,7 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
         require_disk(plan, before, spec.recordings)
         reporter = _SweepReporter(channel)
         with _workers(spec, channel, plan.runs) as workers:
-            _, standing = run_sweep(
+            _, status = run_sweep(
                 sweep,
                 spec.recordings,
                 workers,
@@ -56,13 +56,13 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
                 room=room(sweep.file.limits, plan, spec.recordings, before),
                 accept_changes=spec.accept_changes,
             )
-        reporter.send(standing)
-    if standing.stopped == INTERRUPTED and channel.stop():
+        reporter.send(status)
+    if status.stopped == INTERRUPTED and channel.stop():
         return Outcome("interrupted")
-    if standing.stopped:
-        return Outcome("failed", f"stopped: {standing.stopped}")
-    if standing.failed:
-        return Outcome("failed", f"{standing.failed:,} of {standing.runs:,} runs failed; the sweep says why.")
+    if status.stopped:
+        return Outcome("failed", f"stopped: {status.stopped}")
+    if status.failed:
+        return Outcome("failed", f"{status.failed:,} of {status.runs:,} runs failed; the sweep says why.")
     return Outcome("finished")
 
 
@@ -153,21 +153,21 @@ class _SweepReporter:
         self._channel = channel
         self._sent, self._best = 0.0, -1
 
-    def report(self, standing: SweepStatus) -> None:
+    def report(self, status: SweepStatus) -> None:
         """Accept the sweep's progress."""
         if time.monotonic() - self._sent >= REPORT_SECONDS:
             self._sent = time.monotonic()
-            self.send(standing)
+            self.send(status)
 
-    def send(self, standing: SweepStatus) -> None:
+    def send(self, status: SweepStatus) -> None:
         """Send the sweep's progress."""
-        best = standing.best
+        best = status.best
         if best is not None and best.number != self._best:
             self._best = best.number
             text = f"trial {best.number} is the best so far: {best.value:g}"
             self._channel.send("log", [{"text": text}])
         keys = ("done", "runs", "running", "pruned", "failed", "bytes")
-        progress = {key: getattr(standing, key) for key in keys} | {"best": None}
+        progress = {key: getattr(status, key) for key in keys} | {"best": None}
         if best is not None:
             # A level that was never reached is infinite or None; JSON has no infinity.
             value = best.value if best.value is not None and math.isfinite(best.value) else None

@@ -244,16 +244,19 @@ def test_what_was_submitted_is_given_back(client, submit):
 
 @pytest.mark.parametrize("folder", ["missing", "there"])
 def test_a_run_that_was_promised_but_never_made_is_made(tmp_path, folder):
-    """The worker wrote the run's id down, or made its folder, and was killed."""
+    """The server reserved the run's id, or the worker made its folder as well, and was killed."""
     with JobPool(tmp_path, 1) as jobs:
-        queued = jobs.store.add("config", "icy", 1, "", from_mapping(CONFIG | {"seeds": [3]}).to_mapping())
-        (jobs.store.folder_of(queued.number) / "runs.json").write_text('{"3": "abcdefgh"}')
         if folder == "there":
             (jobs.recordings / "abcdefgh").mkdir()
+        with jobs._lock:
+            queued = jobs.store.add(
+                "config", "icy", 1, "", from_mapping(CONFIG | {"seeds": [3]}).to_mapping()
+            )
+            jobs.store.reserve_runs(queued.number, {3: "abcdefgh"})
         over = until(lambda job: job.is_over, lambda: jobs.store.job(queued.number))
         assert over.state == "finished"
         runs = list_runs(jobs.recordings)
-        assert [run.run_id for run in runs] == [jobs.store.run_ids(queued.number)[3]]
+        assert [run.run_id for run in runs] == [jobs.store.run_ids(queued.number)[3]] == ["abcdefgh"]
 
 
 def test_a_worker_that_cannot_be_started_is_waited_for_and_readiness_says_so(
@@ -267,7 +270,7 @@ def test_a_worker_that_cannot_be_started_is_waited_for_and_readiness_says_so(
     monkeypatch.setattr(pool, "RETRY_SECONDS", 0.05)
     with monkeypatch.context() as full:
         full.setattr(SpawnProcess, "start", refused)
-        number = jobs_of(client).queue.add("config", "icy", 1, "", one_seed()).number
+        number = jobs_of(client).store.add("config", "icy", 1, "", one_seed()).number
         waiting = "no worker process can be started (Resource temporarily unavailable)"
         until(
             lambda queue: queue["waiting_for"] == waiting, lambda: client.get("/api/v1/jobs").json()["queue"]
@@ -281,14 +284,14 @@ def test_a_worker_that_cannot_be_started_is_waited_for_and_readiness_says_so(
 
 def test_what_goes_wrong_with_one_job_does_not_stop_the_others(client, submit, monkeypatch):
     jobs = jobs_of(client)
-    note = jobs.store.note
+    add_events = jobs.store.add_events
 
     def failing(number, *facts):
         if number == 1:
             raise RuntimeError("a fault of our own")
-        note(number, *facts)
+        add_events(number, *facts)
 
-    monkeypatch.setattr(jobs.queue, "note", failing)
+    monkeypatch.setattr(jobs.store, "add_events", failing)
     numbers = [submit(CONFIG | {"seeds": [0]}) for _ in range(2)]
     for number in numbers:
         job_until(client, number, lambda job: job["state"] == "finished")
@@ -301,14 +304,14 @@ def test_readiness_tells_when_the_thread_of_the_jobs_is_dead(client, monkeypatch
         raise SystemExit
 
     jobs = jobs_of(client)
-    monkeypatch.setattr(jobs, "_hear", fatal)
+    monkeypatch.setattr(jobs, "_receive", fatal)
     until(lambda ready: ready.status_code == 503, lambda: client.get("/readyz"))
     assert client.get("/readyz").json()["checks"]["jobs_can_be_started"] is False
 
 
 def test_a_cancelled_job_is_not_forgotten_while_its_worker_closes(client, submit):
     jobs = jobs_of(client)
-    jobs.store._most_kept = 0
+    jobs.store._max_over = 0
     number = submit(ENDLESS)
     job_until(client, number, lambda job: job["progress"] is not None)
     with jobs._lock:  # the worker's end is not taken in before the next job is there

@@ -13,6 +13,7 @@ from served import Served
 
 import runner
 from runner.runs.run import list_runs
+from runner.service.jobs.store import JobStore
 from runner.sweep import state
 from runner.sweep.loading import from_values
 from runner.sweep.task import do
@@ -124,8 +125,8 @@ def test_a_server_that_is_told_to_stop_leaves_its_job_resumable_and_lets_watcher
         assert server.stop() in (0, -signal.SIGTERM)
         watcher.join(10)
         assert not watcher.is_alive()
-        job = json.loads((tmp_path / ".jobs" / "1" / "job.json").read_text())
-        assert job["state"] == "interrupted"
+        with JobStore(tmp_path) as store:
+            assert store.job(1).state == "interrupted"
         assert [run.status for run in list_runs(tmp_path)] == ["interrupted"]
 
         server.start()

@@ -269,7 +269,7 @@ def test_the_page_of_a_run_is_live_from_when_a_job_will_go_on_with_it(client, re
     assert "data-live" not in page_of(client, "/runs/first")
     assert client.get("/runs/first/standing?status=interrupted").status_code == 204
     assert client.post("/api/v1/jobs", content="env: {id: FrozenLake-v1}\nepisodes: 60").status_code == 201
-    (recordings / ".jobs" / "1" / "runs.json").write_text(json.dumps({"0": run.run_id}))
+    client.app.state.jobs.store.start_run(1, 0, run.run_id)
     page = page_of(client, "/runs/first")
     assert f'data-live="/runs/{run.run_id}/standing?status=interrupted"' in page
     assert "live.js" in page
