@@ -1,4 +1,4 @@
-"""The documentation is true: its examples and commands run as they stand, and it shows every picture."""
+"""The documentation is true: its examples and commands run, and it shows every image."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _EXAMPLE = re.compile(r"^```python[ \t]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
 _COMMANDS = re.compile(r"^```sh run[ \t]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-"""A block of commands that are run, one a line; a backslash at the end goes on with the next."""
+"""A block of commands that are run, one per line; a backslash continues a line."""
 
 
 def examples(page: Path) -> list[tuple[int, str]]:
@@ -40,7 +40,7 @@ WITH_EXAMPLES = [page for page in PAGES if examples(page)]
 
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recordings folder with a run of a shipped configuration, not to be changed."""
+    """A read-only recordings folder with a run of a shipped configuration."""
     made = tmp_path_factory.mktemp("documented") / "recordings"
     runner.run(ROOT / "configs" / "quick.yaml", recordings=made)
     return made
@@ -48,7 +48,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(tmp_path: Path, recordings: Path) -> Path:
-    """A folder as a page takes it to be: with the shipped configurations and a run of one of them."""
+    """A folder as the pages expect it: with the shipped configurations and a run of one of them."""
     (tmp_path / "configs").symlink_to(ROOT / "configs", target_is_directory=True)
     shutil.copytree(recordings, tmp_path / "recordings")
     return tmp_path
@@ -56,7 +56,7 @@ def folder(tmp_path: Path, recordings: Path) -> Path:
 
 @pytest.fixture
 def own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forget afterwards what an example registers; other tests have environments of the same names."""
+    """Restore the registry after an example; other tests register environments of the same names."""
     shipped = {name: spec for name, spec in gymnasium.registry.items() if isinstance(spec.entry_point, str)}
     monkeypatch.setattr(gymnasium.envs.registration, "registry", shipped)
 

@@ -137,8 +137,8 @@ def _is_legal(env, cell, action, state, taxi) -> bool:
         return row < 3 if action == 0 else row > 0
     if action < 4:
         walls = {((0, 1), (0, 2)), ((1, 1), (1, 2)), ((2, 0), (2, 1)), ((3, 1), (3, 2))}
-        beside = (row, column + (1 if action == 2 else -1))
-        return 0 <= beside[1] <= 3 and tuple(sorted((cell, beside))) not in walls
+        neighbour = (row, column + (1 if action == 2 else -1))
+        return 0 <= neighbour[1] <= 3 and tuple(sorted((cell, neighbour))) not in walls
     if action == 4:
         return passenger < 4 and landmarks[passenger] == cell
     return passenger == 4 + taxi and cell in landmarks

@@ -149,13 +149,13 @@ def test_events_account_for_the_rewards(competitive):
             "illegal_pickup": -10,
             "illegal_drop_off": -10,
         }
-        told = np.zeros(events.shape, dtype=bool)
+        named = np.zeros(events.shape, dtype=bool)
         for name, value in worth.items():
             has = (events & bit[f"{taxi}.{name}"]) != 0
             assert has.any()
             assert set(rewards[has]) == {value}
-            told |= has
+            named |= has
         collision = (events & bit["collision"]) != 0
         assert set(rewards[collision]) == {-15}
-        assert not (told & collision).any()
-        assert set(rewards[~told & ~collision]) == {-2, -1}
+        assert not (named & collision).any()
+        assert set(rewards[~named & ~collision]) == {-2, -1}

@@ -33,16 +33,16 @@ SECONDS = 10
 ROUND = 100_000
 SHARED = Path("/dev/shm")
 EVERY_REPAIR = 8
-"""One of so many inputs is repaired besides."""
+"""Every Nth input is also repaired."""
 
 
 def main() -> None:
-    """Fuzz, in rounds of a process each: the fuzzer's own memory grows, and is not to be taken for ours."""
+    """Fuzz in rounds, one process each, because the memory of the fuzzer itself grows."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--runs", type=int, default=1_000_000, help="inputs to try")
-    parser.add_argument("--seconds", type=int, default=0, help="stop after so long; 0 for never")
-    parser.add_argument("--seed", type=int, default=1, help="of libFuzzer; the same seed tries the same")
-    parser.add_argument("--findings", type=Path, default=Path("fuzz-findings"), help="where they are kept")
+    parser.add_argument("--runs", type=int, default=1_000_000, help="number of inputs")
+    parser.add_argument("--seconds", type=int, default=0, help="time limit; 0 for none")
+    parser.add_argument("--seed", type=int, default=1, help="seed of libFuzzer")
+    parser.add_argument("--findings", type=Path, default=Path("fuzz-findings"), help="folder for failing inputs")
     parser.add_argument("--corpus", type=Path, help=argparse.SUPPRESS)  # of a round
     options = parser.parse_args()
     options.findings.mkdir(parents=True, exist_ok=True)

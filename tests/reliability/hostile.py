@@ -81,7 +81,7 @@ def join(records: list[Record], finished: bool = True) -> bytes:
 
 
 def index_entry(records: list[Record], offsets: list[int], k: int, offset: int) -> bytes:
-    """Return what the summary says of a record; nothing if the record is too torn to tell."""
+    """Return the entry of a record in the summary; nothing if the record is too damaged."""
     opcode, body = records[k].opcode, records[k].body
     length = 9 + len(body)
     try:
@@ -161,7 +161,7 @@ def _changed_by_meaning(record: Record, rng: random.Random, change: Bytes) -> by
 
 
 def with_number(data: bytes, rng: random.Random) -> bytes:
-    """Return the bytes with a telling number of 1 to 8 bytes somewhere in them."""
+    """Return the bytes with a boundary value of 1 to 8 bytes somewhere in them."""
     if not data:
         return b"\0"
     width = rng.choice((1, 2, 4, 4, 8, 8))

@@ -68,7 +68,7 @@ def read_everything(path: Path) -> bool:
 
 
 def read_description(recording: Recording) -> None:
-    """Read what the recording says of its run."""
+    """Read the recording's description of its run."""
     recording.run_facts()
     assert isinstance(recording.provenance, dict)
     assert isinstance(recording.lost, dict)
@@ -76,7 +76,7 @@ def read_description(recording: Recording) -> None:
 
 
 def read_environment(recording: Recording) -> None:
-    """Read the environment, and say it in words."""
+    """Read the environment and describe its states and actions."""
     mdp = recording.mdp
     states_in_words(mdp)
     action_names(mdp)

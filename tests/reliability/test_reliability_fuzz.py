@@ -99,7 +99,7 @@ def with_chunks(data: bytes, bodies: list[bytes], finished: bool) -> bytes:
 
 
 def steps_of_zeros(size: int) -> bytes:
-    """Return messages of training steps, all alike, of about so many bytes."""
+    """Return equal messages of training steps with about this size."""
     one = blank_records(schema.TRAIN_STEP, (2,), 1).tobytes()
     return one * (size // len(one))
 
@@ -127,7 +127,7 @@ BOMBS = {
 @linux
 @pytest.mark.parametrize("finished", [True, False])
 @pytest.mark.parametrize("bomb", BOMBS)
-def test_what_is_made_to_exhaust_memory_does_not(bomb, finished, recordings, path):
+def test_recordings_made_to_exhaust_memory_do_not(bomb, finished, recordings, path):
     path.write_bytes(with_chunks(recordings["tiny-0"], BOMBS[bomb], finished))
     assert _peak(path) < MOST_MEMORY
 
@@ -135,12 +135,12 @@ def test_what_is_made_to_exhaust_memory_does_not(bomb, finished, recordings, pat
 def replaced(data: bytes, opcode: int, name: str, body: bytes) -> bytes:
     """Return the recording with another body for the metadata or attachment of a name."""
     at = 0 if opcode == METADATA else 16
-    told = struct.pack("<I", len(name)) + name.encode()
+    head = struct.pack("<I", len(name)) + name.encode()
     records = split(data)
     (place,) = [
         k
         for k, record in enumerate(records)
-        if record.opcode == opcode and record.body[at : at + len(told)] == told
+        if record.opcode == opcode and record.body[at : at + len(head)] == head
     ]
     records[place].body = body
     return join(records)
