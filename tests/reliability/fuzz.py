@@ -42,7 +42,9 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=1_000_000, help="number of inputs")
     parser.add_argument("--seconds", type=int, default=0, help="time limit; 0 for none")
     parser.add_argument("--seed", type=int, default=1, help="seed of libFuzzer")
-    parser.add_argument("--findings", type=Path, default=Path("fuzz-findings"), help="folder for failing inputs")
+    parser.add_argument(
+        "--findings", type=Path, default=Path("fuzz-findings"), help="folder for failing inputs"
+    )
     parser.add_argument("--corpus", type=Path, help=argparse.SUPPRESS)  # of a round
     options = parser.parse_args()
     options.findings.mkdir(parents=True, exist_ok=True)
