@@ -30,7 +30,7 @@ from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import look
 from runner.runs.catalogue.usage import usage_of
 place = Path(sys.argv[2])
-_, sums = usage_of(lambda work: look([place], work, as_known=True), Filter(None), 50)
+_, sums = usage_of(lambda work: look([place], work, cached=True), Filter(None), 50)
 sums.freeable([place])
 """
 """The work of the page `/disk` in a separate process, with an index that is up to date."""

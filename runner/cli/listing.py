@@ -9,8 +9,7 @@ from typing import Any, Final
 import click
 
 from runner.cli.output import console, draw, table
-from runner.runs.catalogue.columns import HEADINGS, as_json, in_words
-from runner.runs.catalogue.fields import FIELDS, Kind
+from runner.runs.catalogue.columns import FIELDS, HEADINGS, Kind, as_json, as_text
 
 USUAL: Final = (
     *("id", "name", "config", "seed", "status", "tag", "episodes", "success_percent", "mean_return"),
@@ -83,7 +82,7 @@ def print_table(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> None:
     """Print rows as a table; fitted to the terminal, if there is one, but ids are never cut."""
     headings = [HEADINGS.get(column, column) for column in columns]
     left = [column not in FIELDS or FIELDS[column].kind in _LEFT for column in columns]
-    cells = [[printable(in_words(row, column)) for column in columns] for row in rows]
+    cells = [[printable(as_text(row, column)) for column in columns] for row in rows]
     if not console().is_terminal:
         click.echo("\n".join(aligned([headings, *cells], left)))
         return
@@ -99,7 +98,7 @@ def fitting(rows: Sequence[dict[str, Any]], columns: Sequence[str]) -> list[str]
     kept, drawn = list(columns), console()
     widths = {
         column: max(
-            len(HEADINGS.get(column, column)), *(len(printable(in_words(row, column))) for row in rows)
+            len(HEADINGS.get(column, column)), *(len(printable(as_text(row, column))) for row in rows)
         )
         + 2
         for column in columns

@@ -68,7 +68,7 @@ class FilterWord(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # ge
         incomplete: str,
     ) -> list[CompletionItem]:
         """Return the fields that begin so, each with its colon; after `status:` the statuses."""
-        from runner.runs.catalogue.fields import FIELDS, SETTING, STATUSES
+        from runner.runs.catalogue.columns import FIELDS, SETTING, STATUSES
 
         words = {f"{name}:": field.meaning for name, field in FIELDS.items()}
         words[SETTING] = "a value of the configuration, such as config.discount"

@@ -86,7 +86,7 @@ def find_run(
     if name != LATEST and not (len(candidates) == 1 and candidates[0].name != name):
         candidates = matches(Depth.FOLDERS) or matches(Depth.FILES)
     if not candidates:
-        raise look([folder], lambda index: not_found(name, index, folder), report, as_known=True)
+        raise look([folder], lambda index: not_found(name, index, folder), report, cached=True)
     return choose(name, candidates).run()
 
 

@@ -80,7 +80,7 @@ class Catalogue:
         """
         if self.version() is None:
             self._begin_look().result()
-        return look(self.roots, work, self._tell, as_known=self.version() is not None)
+        return look(self.roots, work, self._tell, cached=self.version() is not None)
 
     def can_list(self) -> bool:
         """Return whether runs can be listed, by what the last look found; waits for none but the first."""

@@ -56,7 +56,7 @@ def rebuild(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
     from runner.runs.catalogue.index import look
 
     began = time.monotonic()
-    found = look(recordings, _found, say, anew=True)
+    found = look(recordings, _found, say, rebuild=True)
     took = time.monotonic() - began
     if as_json:
         told = {"runs": found.runs, "same_content": found.copies, "statuses": found.statuses}

@@ -79,7 +79,7 @@ def command(
       dualtaxi ls --quiet name:quick
     """  # noqa: D301 - Click wants the backspace itself
     from runner.cli import listing
-    from runner.runs.catalogue.columns import PROGRAMS, columns_of
+    from runner.runs.catalogue.columns import DEFAULT_JSON, columns_of
     from runner.runs.catalogue.filters import parse
 
     if sum((quiet, as_csv, as_json)) > 1:
@@ -90,7 +90,7 @@ def command(
         limit = ON_A_TERMINAL
     wanted = _Wanted(chosen, sort, limit or None, offset)
     if quiet or as_csv or as_json:
-        columns_shown = ["id"] if quiet else shown or list(PROGRAMS)
+        columns_shown = ["id"] if quiet else shown or list(DEFAULT_JSON)
         render: Render = listing.csv_lines if as_csv else _ids if quiet else _objects
         listed, total, problems = _stream(recordings, wanted, columns_shown, render)
     else:
@@ -179,7 +179,7 @@ def _found(
     recordings: tuple[Path, ...], wanted: _Wanted, columns: Sequence[str]
 ) -> tuple[list[dict[str, Any]], int]:
     """Return the rows to show, and how many fit the filter."""
-    from runner.runs.catalogue.columns import needed_for, with_originals
+    from runner.runs.catalogue.columns import needed_for
     from runner.runs.catalogue.index import look, order_of
 
     order, needed = order_of(wanted.sort), needed_for([*columns, "same_as"])
@@ -188,7 +188,7 @@ def _found(
         rows, total = index.page(
             wanted.filter, *order, limit=wanted.limit, offset=wanted.offset, columns=needed
         )
-        return with_originals(rows, index), total
+        return index.with_same_as(rows), total
 
     return look(recordings, work, say)
 

@@ -13,10 +13,10 @@ from runner.cli.options import filter_argument, folders_option, json_option
 from runner.cli.output import say
 from runner.cli.removing import carry_out, dry_run_option, force_option, yes_option
 from runner.errors import RunnerError
-from runner.runs.catalogue.fields import STATUSES
+from runner.runs.catalogue.columns import STATUSES
 
 if TYPE_CHECKING:
-    from runner.runs.catalogue.removal import Removal, Wish
+    from runner.runs.catalogue.removal import Criteria, Removal
 
 
 @click.command("prune")
@@ -63,12 +63,12 @@ def command(
       dualtaxi prune 'config:quick success_percent:<50' --yes
     """  # noqa: D301 - Click wants the backspace itself
     from runner.runs.catalogue.filters import parse
-    from runner.runs.catalogue.removal import Wish
+    from runner.runs.catalogue.removal import Criteria
 
-    wish = Wish(parse(" ".join(words)), _seconds(older_than), keep_last, statuses)
-    if wish.filter.condition is None and older_than is None and keep_last is None and not statuses:
+    criteria = Criteria(parse(" ".join(words)), _seconds(older_than), keep_last, statuses)
+    if criteria.filter.condition is None and older_than is None and keep_last is None and not statuses:
         raise click.UsageError("expected a FILTER, --older-than, --keep-last or --status: which runs?")
-    removals, protected = _chosen(recordings, wish, force, dry_run)
+    removals, protected = _chosen(recordings, criteria, force, dry_run)
     kept = {each.run_id: each.refusal for each in removals if each.refusal}
     for run_id, why in kept.items():
         say(f"Run {run_id} stays: {why}.")
@@ -87,23 +87,23 @@ def _seconds(text: str | None) -> float | None:
     Raises:
         RunnerError: there is none.
     """
-    from runner.runs.catalogue.values import span_seconds
+    from runner.runs.catalogue.filters import seconds_of
 
     try:
-        return None if text is None else span_seconds(text)
+        return None if text is None else seconds_of(text)
     except ValueError:
         raise RunnerError(f"--older-than: found {text!r}, expected an age such as 30d, 12h or 2w.") from None
 
 
 def _chosen(
-    recordings: tuple[Path, ...], wish: Wish, force: bool, dry_run: bool
+    recordings: tuple[Path, ...], criteria: Criteria, force: bool, dry_run: bool
 ) -> tuple[list[Removal], Counter[str]]:
     """Return what may go, and how many runs are protected, by reason."""
     from runner.runs.catalogue.index import look
     from runner.runs.catalogue.removal import plan, plan_row, unwanted
     from runner.runs.run import runs_in
 
-    rows, protected = look(recordings, lambda index: unwanted(index, wish, time.time()), say)
+    rows, protected = look(recordings, lambda index: unwanted(index, criteria, time.time()), say)
     if dry_run:
         return [plan_row(row, force) for row in rows], protected
     places = [(Path(row["root"]), row["entry"]) for row in rows]

@@ -1,47 +1,195 @@
-"""Rows of the index as programs are told of them: columns by name, as plain values."""
+"""The columns of a run, in one table: index, filters, JSON, `ls` and pages derive theirs from it."""
 
 from __future__ import annotations
 
+import enum
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from runner.errors import RunnerError
+from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRICS
-from runner.runs.catalogue.fields import FIELDS, SETTING, field_of
 from runner.runs.run import RECORDING_FILE
 from runner.util.humanize import UNKNOWN, age, duration, number, size
 
-if TYPE_CHECKING:
-    from runner.runs.catalogue.index import Index
+RowValues = Mapping[str, Any]
+"""A run as the index has it, by the names of the stored columns."""
 
-MADE: Final = ("same_as", "path")
-"""Columns that are no fields: the run that recorded the same content first, and the recording's path."""
-PROGRAMS: Final = (
-    *("run_id", "name", "config", "seed", "status", "tags", "note", "created"),
-    *("episodes", "episodes_to_do", "train_steps", "eval_steps", "seconds"),
-    *(metric.name for metric in METRICS),
-    "logged",
-    *("bytes", "content_digest", "same_as"),
-    *("mode", "environment", "host", "git", "archive", "path"),
-)
-"""What programs are told of a run, unless they ask for other columns."""
-HEADINGS: Final = {
-    "success_percent": "success %",
-    "mean_return": "return",
-    "bytes": "size",
-    "tag": "tags",
-    "same_as": "same as",
+SETTING: Final = "config."
+"""The prefix of a column that holds a value of the configuration, such as `config.discount`."""
+STATUSES: Final = ("running", "finished", "interrupted", "failed", "archived", "damaged")
+
+
+class Kind(enum.Enum):
+    """How a filter compares the values of a column; the text says what it expects."""
+
+    START = "the beginning of it"
+    TEXT = "the whole of it; * and ? stand for any"
+    STATUS = "one of " + ", ".join(STATUSES)
+    PROSE = "a part of it"
+    TAGS = "one of them"
+    WHOLE = "a whole number"
+    NUMBER = "a number"
+    SIZE = "a number of bytes, or 10MB, 1.5GB"
+    DATE = "a date such as 2026-01-31, or 2026-01-31T10:00 (UTC)"
+    AGE = "a time span such as 90s, 12h, 30d or 2w, with < or >"
+
+
+TEXT_KINDS: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a run."""
+
+    name: str
+    kind: Kind | None
+    """None if it cannot be filtered or sorted by."""
+    meaning: str
+    type: type | None = str
+    """What the index stores; None if it derives the value from `needs`."""
+    key: str = ""
+    """Its key in JSON, if that is not the name."""
+    heading: str = ""
+    """What a table calls it, if not by its name."""
+    aliases: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
+    """The stored columns that it is read from; itself by default. Filters compare the first."""
+    in_json: bool = True
+    """Whether JSON has it by default."""
+    read: Callable[[RowValues], Any] | None = None
+    show: Callable[[Any], str] = lambda value: f"{value:,}" if isinstance(value, int) else str(value)
+    if_empty: str = UNKNOWN
+
+    @property
+    def stored(self) -> tuple[str, ...]:
+        """The stored columns that it is read from."""
+        return self.needs or (self.name,)
+
+
+def moment(row: RowValues) -> datetime:
+    """Return when a run began, in UTC."""
+    return datetime.fromtimestamp(row["created"] / 1000, UTC)
+
+
+def _logged_text(values: Mapping[str, float | None]) -> str:
+    """Return logged values on one line: `loss 0.0123, entropy 1.5`."""
+    return ", ".join(
+        f"{name} {'not finite' if value is None else f'{value:,.4g}'}" for name, value in values.items()
+    )
+
+
+_METRIC_HEADINGS: Final = {"success_percent": "success %", "mean_return": "return"}
+
+COLUMNS: Final = {
+    column.name: column
+    for column in (
+        Column("id", Kind.START, "the run's id", key="run_id"),
+        Column("name", Kind.TEXT, "the run's name"),
+        Column("config", Kind.TEXT, "the name of its configuration"),
+        Column("seed", Kind.WHOLE, "its seed", int, show=str),
+        Column("status", Kind.STATUS, "its status"),
+        Column(
+            *("tag", Kind.TAGS, "one of its tags", None),
+            key="tags",
+            heading="tags",
+            needs=("tags",),
+            read=lambda row: row["tags"].split(),
+            show=" ".join,
+            if_empty="",
+        ),
+        Column("note", Kind.PROSE, "its note", if_empty=""),
+        Column(
+            *("created", Kind.DATE, "when it began", int),
+            read=lambda row: moment(row).isoformat(timespec="milliseconds"),
+            show=lambda text: text[:16].replace("T", " "),
+        ),
+        Column(
+            *("age", Kind.AGE, "how long ago it began", None),
+            needs=("created",),
+            in_json=False,
+            read=lambda row: round((datetime.now(UTC) - moment(row)).total_seconds()),
+            show=age,
+        ),
+        Column("episodes", Kind.NUMBER, "training episodes done", int),
+        Column("episodes_to_do", Kind.NUMBER, "training episodes in its configuration", int),
+        Column("steps", Kind.NUMBER, "steps of training and evaluation", int, in_json=False),
+        Column("train_steps", Kind.NUMBER, "steps of training", int),
+        Column("eval_steps", Kind.NUMBER, "steps of evaluation", int),
+        Column("seconds", Kind.NUMBER, "how long it took", float, show=duration),
+        *(
+            Column(
+                metric.name,
+                Kind.NUMBER,
+                f"{metric.heading} of the last evaluation"
+                + (" of a loop; of its last 100 training episodes without one" if metric.per_agent else ""),
+                float,
+                heading=_METRIC_HEADINGS.get(metric.name, ""),
+                show=number,
+            )
+            for metric in METRICS
+        ),
+        Column(
+            *("logged", Kind.PROSE, "the last values that a loop logged, by name"),
+            read=lambda row: json.loads(row["logged"]),
+            show=_logged_text,
+            if_empty="",
+        ),
+        Column(
+            "bytes", Kind.SIZE, "the size of its recording", int, heading="size", aliases=("size",), show=size
+        ),
+        Column("digest", Kind.START, "its content digest: equal content, equal digest", key="content_digest"),
+        Column(
+            *("same_as", None, "the run that recorded the same content first", None),
+            heading="same as",
+            needs=("digest",),
+            read=lambda row: row["same_as"],
+            if_empty="",
+        ),
+        Column("mode", Kind.TEXT, "cooperative or competitive"),
+        Column("environment", Kind.TEXT, "the environment's id", aliases=("env",)),
+        Column("host", Kind.TEXT, "the machine it ran on"),
+        Column("git", Kind.START, "the commit of the code it ran with"),
+        Column("archive", Kind.TEXT, "where its recording is archived", if_empty=""),
+        Column("folder", Kind.TEXT, "its recordings folder", None, needs=("root",), in_json=False),
+        Column(
+            *("path", None, "the path of its recording", None),
+            needs=("root", "entry"),
+            read=lambda row: str(Path(row["root"], row["entry"], RECORDING_FILE)),
+        ),
+    )
 }
-"""What stands above a column, if that is not its name."""
-_OFTEN_EMPTY: Final = ("tag", "same_as", "note", "archive", "logged")
-_FIELD_OF: Final = {"run_id": "id", "tags": "tag", "content_digest": "digest"}
+FIELDS: Final = {name: column for name, column in COLUMNS.items() if column.kind}
+"""The columns that filters and sorting know."""
+DEFAULT_JSON: Final = tuple(column.key or name for name, column in COLUMNS.items() if column.in_json)
+"""The columns of a run in JSON, unless others are chosen."""
+HEADINGS: Final = {name: column.heading for name, column in COLUMNS.items() if column.heading}
+_ALIASES: Final = {
+    alias: name for name, column in COLUMNS.items() for alias in (column.key, *column.aliases) if alias
+}
+
+
+def field_of(name: str) -> Column:
+    """Return the column of a name that a filter can use.
+
+    Raises:
+        RunnerError: there is none.
+    """
+    column = FIELDS.get(_ALIASES.get(name, name))
+    if column is None:
+        hint = nearest(name, [*FIELDS, *_ALIASES])
+        raise RunnerError(
+            f"there is no field {name!r}.{hint} There are {', '.join(FIELDS)}, "
+            f"and {SETTING}PATH for a value of the configuration such as {SETTING}discount."
+        )
+    return column
 
 
 def columns_of(text: str) -> list[str]:
-    """Return the columns that a list of names, separated by commas, asks for.
+    """Return the columns in a list of names, separated by commas.
 
     Raises:
         RunnerError: there is no such column.
@@ -49,98 +197,57 @@ def columns_of(text: str) -> list[str]:
     names = [name.strip() for name in text.split(",") if name.strip()]
     if not names:
         raise RunnerError("columns: found nothing, expected names such as id,name,success_percent.")
-    return [name if name in MADE or name.startswith(SETTING) else field_of(name).name for name in names]
+    return [name if name in COLUMNS or name.startswith(SETTING) else field_of(name).name for name in names]
 
 
 def needed_for(columns: Iterable[str]) -> list[str]:
-    """Return the columns of the index that `value` and `with_originals` need for these columns."""
+    """Return the stored columns that `value` and `with_same_as` need for these columns."""
     needed = ["root", "entry", "id", "problem"]
-    for column in columns:
-        name = _FIELD_OF.get(column, column)
-        if name.startswith(SETTING):
-            needed.append("settings")
-        elif name == "same_as":
-            needed.append("digest")
-        elif name != "path":
-            needed.append(FIELDS[name].column or name)
+    for name in columns:
+        needed += ["settings"] if name.startswith(SETTING) else _column(name).stored
     if "episodes" in needed:
         needed.append("episodes_to_do")  # shown with it where some are missing
     return list(dict.fromkeys(needed))
 
 
-def with_originals(rows: list[dict[str, Any]], index: Index) -> list[dict[str, Any]]:
-    """Return rows with `same_as`: the id of another run that recorded the same content first, or None."""
-    originals = index.originals([row["digest"] for row in rows if row["digest"]])
-    return list(with_same_as(rows, originals))
-
-
 def with_same_as(
     rows: Iterable[dict[str, Any]], originals: Mapping[str, tuple[str, str, str]]
 ) -> Iterator[dict[str, Any]]:
-    """Yield rows with `same_as`, by what `Index.originals` returns."""
+    """Yield rows with `same_as`: the id of another run that recorded the same content first, or None.
+
+    Args:
+        rows: rows with their digest.
+        originals: as `Index.originals` returns them.
+    """
     for row in rows:
         first = originals.get(row["digest"])
-        elsewhere = first is not None and first[:2] != (row["root"], row["entry"])
-        row["same_as"] = first[2] if first and elsewhere else None
+        row["same_as"] = first[2] if first and first[:2] != (row["root"], row["entry"]) else None
         yield row
 
 
-def value(row: dict[str, Any], column: str) -> Any:
-    """Return what programs are told of a run in a column."""
-    name = _FIELD_OF.get(column, column)
+def value(row: RowValues, name: str) -> Any:
+    """Return the value of a column, as JSON has it."""
     if name.startswith(SETTING):
         return json.loads(row["settings"]).get(name.removeprefix(SETTING))
-    match name:
-        case "tag":
-            return row["tags"].split()
-        case "created":
-            return moment(row).isoformat(timespec="milliseconds")
-        case "age":
-            return round((datetime.now(UTC) - moment(row)).total_seconds())
-        case "path":
-            return str(Path(row["root"], row["entry"], RECORDING_FILE))
-    found = row[FIELDS[name].column or name] if name in FIELDS else row[name]
-    return json.loads(found) if name == "logged" else found
+    column = _column(name)
+    return column.read(row) if column.read else row[column.stored[0]]
 
 
-def as_json(row: dict[str, Any], columns: Sequence[str] = PROGRAMS) -> dict[str, Any]:
-    """Return what programs are told of a run, by column."""
-    return {column: value(row, column) for column in columns}
+def as_json(row: RowValues, columns: Sequence[str] = DEFAULT_JSON) -> dict[str, Any]:
+    """Return the values of a run by column."""
+    return {name: value(row, name) for name in columns}
 
 
-def moment(row: dict[str, Any]) -> datetime:
-    """Return when a run began, in UTC."""
-    return datetime.fromtimestamp(row["created"] / 1000, UTC)
-
-
-def in_words(row: dict[str, Any], column: str) -> str:
-    """Return what people are shown of a run in a column."""
-    found = value(row, column)
-    if column == "episodes" and row["episodes_to_do"] not in (None, found):
+def as_text(row: RowValues, name: str) -> str:
+    """Return the value of a column as a table shows it."""
+    found = value(row, name)
+    if name == "episodes" and row["episodes_to_do"] not in (None, found):
         return f"{UNKNOWN if found is None else f'{found:,}'} of {row['episodes_to_do']:,}"
-    if found is None or found in ([], {}):
-        return "" if column in _OFTEN_EMPTY else UNKNOWN
-    if column == "created":
-        return f"{moment(row):%Y-%m-%d %H:%M}"
-    if column in _IN_WORDS:
-        return _IN_WORDS[column](found)
-    plain = column in FIELDS and isinstance(found, int)
-    return f"{found:,}" if plain else str(found)
+    if name.startswith(SETTING):
+        return UNKNOWN if found is None else str(found)
+    column = _column(name)
+    return column.if_empty if found is None or found in ([], {}) else column.show(found)
 
 
-def _logged_in_words(values: dict[str, float | None]) -> str:
-    """Return logged values on one line: `loss 0.0123, entropy 1.5`."""
-    return ", ".join(
-        f"{name} {'not finite' if value is None else f'{value:,.4g}'}" for name, value in values.items()
-    )
-
-
-_IN_WORDS: Final[dict[str, Callable[[Any], str]]] = {
-    **dict.fromkeys((metric.name for metric in METRICS), number),
-    "logged": _logged_in_words,
-    "age": age,
-    "bytes": size,
-    "seconds": duration,
-    "seed": str,
-    "tag": " ".join,
-}
+def _column(name: str) -> Column:
+    return COLUMNS[_ALIASES.get(name, name)]

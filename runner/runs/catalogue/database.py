@@ -1,7 +1,7 @@
 """The file of the index: one SQLite database in the user's cache.
 
-It is made at one stroke, and thrown away when it is damaged or of another version. It keeps a journal, not a
-write-ahead log: users' caches stand on network disks too, and transactions are short.
+It is created atomically, and replaced when it is damaged or of another version. It has a rollback journal,
+not a write-ahead log: the cache may be on a network disk, and transactions are short.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from peewee import SchemaManager, SqliteDatabase
 from runner.runs.catalogue.rows import Row
 from runner.util.files import cache_folder, replacing
 
-Tell = Callable[[str], None]
+Report = Callable[[str], None]
 
 INDEX_FILE: Final = "catalogue.sqlite"
 _APPLICATION: Final = 0x44546178  # "DTax"
-_VERSION: Final = zlib.crc32(",".join(["7", *Row._meta.sorted_field_names]).encode()) >> 1
-"""Of the columns, and of indexes and contents (the number before them); another one is thrown away."""
+_VERSION: Final = zlib.crc32(",".join(["8", *Row._meta.sorted_field_names]).encode()) >> 1
+"""Identifies the columns, and by the number indexes and contents; an index of another version is replaced."""
 _HEAD_BYTES: Final = 100
-"""Of an SQLite file; at 24 stands how often it was changed."""
+"""The header of an SQLite file; at 24 it has the number of changes."""
 _BUSY_SECONDS: Final = 60
 
 
@@ -35,14 +35,14 @@ def index_path() -> Path:
 
 
 class Version(NamedTuple):
-    """What tells one state of the index from another."""
+    """Identifies a state of the index."""
 
     file: int
     changes: int
 
 
 def version() -> Version | None:
-    """Return what changes with every change of the index; None if there is none that can be read."""
+    """Return the version of the index's contents; None if there is no index that can be read."""
     try:
         with index_path().open("rb", buffering=0) as stream:
             head = stream.read(_HEAD_BYTES)
@@ -51,8 +51,8 @@ def version() -> Version | None:
         return None
 
 
-def opened(tell: Tell) -> SqliteDatabase:
-    """Return the index, opened; made first if it is missing, foreign or of another version."""
+def open_index(report: Report) -> SqliteDatabase:
+    """Open the index; create it first if it is missing, foreign or of another version."""
     path = index_path()
     if not path.exists():
         renew()
@@ -61,13 +61,13 @@ def opened(tell: Tell) -> SqliteDatabase:
         if (database.application_id, database.user_version) == (_APPLICATION, _VERSION):
             return database
         database.close()
-        tell(f"The index {path} is of another version; it is made anew.")
+        report(f"The index {path} is of another version; it is rebuilt.")
         renew()
-    raise OSError("it changes under our hands")
+    raise OSError("another process keeps replacing it")
 
 
 def renew() -> None:
-    """Put an empty index in place of what is there, unless another process just did."""
+    """Replace the index by an empty one, unless another process just did."""
     from filelock import FileLock
 
     path = index_path()
@@ -77,7 +77,7 @@ def renew() -> None:
         if _identity(path) != before:
             return
         with replacing(path) as fresh:
-            made(os.fspath(fresh)).close()
+            create(os.fspath(fresh)).close()
             path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
 
 
@@ -89,14 +89,14 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def _connected(path: str) -> SqliteDatabase:
-    """Return the database of a path, its writers taking turns."""
+    """Return the database at a path; its writers wait for one another."""
     pragmas = {"busy_timeout": _BUSY_SECONDS * 1000, "synchronous": "normal"}
     database = SqliteDatabase(path, pragmas=pragmas, lock_type="IMMEDIATE", timeout=_BUSY_SECONDS)
     database.connect()
     return database
 
 
-def made(path: str) -> SqliteDatabase:
+def create(path: str) -> SqliteDatabase:
     """Return a new, empty index."""
     database = _connected(path)
     SchemaManager(Row, database).create_all()
@@ -105,13 +105,13 @@ def made(path: str) -> SqliteDatabase:
 
 
 def tuples_of(database: SqliteDatabase, query: Any) -> Iterator[tuple[Any, ...]]:
-    """Return what a query finds as SQLite has it: many rows, quickly."""
+    """Return the rows of a query as tuples of SQLite's values, without peewee's conversions."""
     found: Iterator[tuple[Any, ...]] = database.execute(query)  # type: ignore[no-untyped-call]
     return found
 
 
 def write_rows(database: SqliteDatabase, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Put whole rows in the index, in place of those of the same folders; within a transaction."""
+    """Write whole rows, replacing those of the same folders; within a transaction."""
     fields = Row._meta.sorted_fields
     columns = ", ".join(f'"{field.column_name}"' for field in fields)
     places = ", ".join("?" * len(fields))
@@ -120,12 +120,12 @@ def write_rows(database: SqliteDatabase, rows: Sequence[Mapping[str, Any]]) -> N
     database.connection().executemany(statement, values)  # type: ignore[no-untyped-call]
 
 
-def keep_usage(database: SqliteDatabase, values: Sequence[tuple[Any, ...]]) -> None:
-    """Keep what folders use of the disk, with those that are as they were.
+def store_usage(database: SqliteDatabase, values: Sequence[tuple[Any, ...]]) -> None:
+    """Store the disk usage of folders, unless they changed in the meantime.
 
     Args:
         database: the index.
-        values: bytes of recording, all else, what is left over, what would be freed; then root, entry, mark
+        values: bytes of the recording, of all else, left over, and freed by removal; then root, entry, mark
             and fingerprint of the folder.
     """
     statement = (

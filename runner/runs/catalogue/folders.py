@@ -1,7 +1,7 @@
-"""Recordings folders as they are now, and how they differ from what the index has of them.
+"""Find and apply the differences between recordings folders and the index.
 
-A look is as close as it needs to be: listing the names in a recordings folder costs 0.5 us a run, a stat of
-each run's folder 3 us, and a stat of each run's files 10 us. Files are read where something changed.
+A check is as thorough as it needs to be: listing the names in a recordings folder takes 0.5 us a run, a stat
+of each run's folder 3 us, and a stat of each run's files 10 us. Files are read where something changed.
 """
 
 from __future__ import annotations
@@ -22,65 +22,65 @@ from runner.runs.catalogue.rows import Row, row_of
 from runner.runs.run import RECORDING_FILE, RUN_FILE, run_entries, runs_in
 
 _SETTLED_NS: Final = 2 * 10**9
-"""Files that changed so recently may change again without a trace: they are read again next time."""
+"""Files that changed this recently may change again with the same time: they are read again next time."""
 _RUN_FILES: Final = (RUN_FILE, LABELS_FILE, RECORDING_FILE)
 _BATCH: Final = 2000
-"""Rows that are in memory at once, and are written in one transaction."""
+"""Rows in memory at once, written in one transaction."""
 _FEW: Final = 500
-"""Values that one statement names."""
+"""Values in one statement."""
 
 
 class Depth(enum.IntEnum):
-    """Which changes of a recordings folder a look finds."""
+    """Which changes of a recordings folder are detected."""
 
     NAMES = 0
-    """Runs that are new or gone."""
+    """New and removed runs."""
     FOLDERS = 1
-    """Also runs of which a file was made, replaced or removed, as all commands do, and running ones."""
+    """Also runs with a file created, replaced or removed, as all commands do, and running ones."""
     FILES = 2
-    """Also files that were changed in place."""
+    """Also files changed in place."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How a recordings folder differs from the index, by names of folders."""
+    """How a recordings folder differs from the index; runs are given by the names of their folders."""
 
     root: str
     changed: list[str]
-    """Folders that are new, or not as they were."""
+    """New and changed runs."""
     died: list[str]
-    """Runs whose process is no more, and could not say so."""
+    """Runs whose process was killed."""
     gone: list[str]
-    """Folders that are no more."""
+    """Runs that were removed."""
 
 
 class Folders:
-    """Some recordings folders, and the index that is to agree with them."""
+    """Some recordings folders, compared with the index."""
 
     def __init__(
         self,
         database: SqliteDatabase,
         roots: Sequence[str],
         depth: Depth = Depth.FILES,
-        anew: bool = False,
+        rebuild: bool = False,
     ) -> None:
-        """Begin a look.
+        """Begin a comparison.
 
         Args:
             database: the index.
             roots: absolute paths of recordings folders.
-            depth: which changes are looked for.
-            anew: whether every run is read, changed or not.
+            depth: which changes are detected.
+            rebuild: read every run, changed or not.
         """
         self._database = database
         self._roots = roots
         self._depth = depth
-        self._anew = anew
+        self._rebuild = rebuild
         self._tokens: dict[str, dict[str, str]] = {}
         self._read: dict[str, set[str]] = {root: set() for root in roots}
 
     def differences(self) -> list[Difference]:
-        """Return how the folders, as they were when first looked at, differ from what is in the index now.
+        """Return how the folders, as they were at the first call, differ from the index as it is now.
 
         Raises:
             StorageError: a recordings folder cannot be read.
@@ -88,8 +88,8 @@ class Folders:
         found = [self._difference(root) for root in self._roots]
         return [each for each in found if each.changed or each.died or each.gone]
 
-    def take_in(self, found: Sequence[Difference]) -> None:
-        """Read what changed and write it to the index, a batch and a transaction at a time."""
+    def apply(self, found: Sequence[Difference]) -> None:
+        """Read what changed and write it to the index, a transaction for each batch."""
         for difference in found:
             root, here = difference.root, Row.root == difference.root
             for entries in chunked(difference.changed, _BATCH):
@@ -103,37 +103,37 @@ class Folders:
                 Row.delete().where(here & Row.entry.in_(entries)).execute(self._database)
 
     def forget_missing(self) -> None:
-        """Forget recordings folders that are no more."""
+        """Delete the rows of recordings folders that no longer exist."""
         known = [root for (root,) in tuples_of(self._database, Row.select(Row.root).distinct())]
         stale = [root for root in known if not os.path.isdir(root)]  # noqa: PTH112
         Row.delete().where(Row.root.in_(stale)).execute(self._database)
 
     def _difference(self, root: str) -> Difference:
         known, tokens = self._known(root), self._tokens_of(root)
-        if self._depth is Depth.NAMES and not self._anew:
+        if self._depth is Depth.NAMES and not self._rebuild:
             changed = [entry for entry in tokens if entry not in known]
-            return self._sorted_out(root, known, changed, [])
+            return self._difference_of(root, known, changed, [])
         changed = [entry for entry, token in tokens.items() if known.get(entry) != token]
-        running, unsettled = self._unsteady(root)
-        again = [*tokens] if self._anew else unsettled
+        running, unsettled = self._unstable(root)
+        again = [*tokens] if self._rebuild else unsettled
         if self._depth is Depth.FOLDERS:
             again = [*again, *running]  # their recordings grow in place
         changed += [e for e in again if known.get(e) == tokens.get(e) and e not in self._read[root]]
         alike = set(running) - set(changed)
-        died = [entry for entry in alike if entry in tokens and not _runs(root, entry)]
-        return self._sorted_out(root, known, changed, died)
+        died = [entry for entry in alike if entry in tokens and not _is_running(root, entry)]
+        return self._difference_of(root, known, changed, died)
 
-    def _sorted_out(
+    def _difference_of(
         self, root: str, known: dict[str, str], changed: Sequence[str], died: list[str]
     ) -> Difference:
-        """Return the difference, with the folders that have no files of a run left out or gone."""
-        there = [entry for entry in dict.fromkeys(changed) if _seen(root, entry) is not None]
+        """Return the difference; folders without files of a run are left out, or gone."""
+        there = [entry for entry in dict.fromkeys(changed) if _state_of(root, entry) is not None]
         missing = {*known} - {*self._tokens[root]} | {*changed} - {*there}
-        gone = [entry for entry in missing if entry in known and _seen(root, entry) is None]
+        gone = [entry for entry in missing if entry in known and _state_of(root, entry) is None]
         return Difference(root, there, died, gone)
 
     def _tokens_of(self, root: str) -> dict[str, str]:
-        """Return what each folder looked like when it was first looked at, or when it was read."""
+        """Return the token of each run's folder at the first check, or when it was read."""
         if root not in self._tokens:
             entries = [entry for entry in run_entries(Path(root)) if entry.isprintable()]
             self._tokens[root] = {entry: self._token(root, entry) for entry in entries}
@@ -145,16 +145,16 @@ class Folders:
                 return ""
             case Depth.FOLDERS:
                 return _mark(root, entry)[0]
-        seen = _seen(root, entry)
+        seen = _state_of(root, entry)
         return "" if seen is None else seen.fingerprint
 
     def _known(self, root: str) -> dict[str, str]:
-        """Return what each folder looked like when the index read it."""
+        """Return the token of each run's folder in the index."""
         token = Row.mark if self._depth is Depth.FOLDERS else Row.fingerprint
         return dict(tuples_of(self._database, Row.select(Row.entry, token).where(Row.root == root)))
 
-    def _unsteady(self, root: str) -> tuple[list[str], list[str]]:
-        """Return the runs that were running when they were read, and those that had just changed."""
+    def _unstable(self, root: str) -> tuple[list[str], list[str]]:
+        """Return the runs that were running when they were read, and those just changed then."""
         unsteady = (Row.status == "running") | (Row.settled == False)  # noqa: E712 - an expression of SQL
         rows = Row.select(Row.entry, Row.status, Row.settled).where((Row.root == root) & unsteady)
         found = list(tuples_of(self._database, rows))
@@ -162,21 +162,21 @@ class Folders:
         return running, [entry for entry, _, settled in found if not settled]
 
     def _row(self, root: str, entry: str) -> dict[str, Any]:
-        """Return the row of a folder, read now."""
-        mark, changed = _mark(root, entry)  # before the files: what changes from here on is seen next time
-        seen = _seen(root, entry) or Seen("", 0, None)
+        """Read a run's folder into a row."""
+        mark, changed = _mark(root, entry)  # before the files: later changes are found next time
+        seen = _state_of(root, entry) or State("", 0, None)
         settled = max(changed, seen.changed) + _SETTLED_NS < time.time_ns()
         self._tokens[root][entry] = mark if self._depth is Depth.FOLDERS else seen.fingerprint
         self._read[root].add(entry)
         place = {"root": root, "entry": entry, "fingerprint": seen.fingerprint, "mark": mark}
         for run in runs_in(Path(root, entry)):
             return _EMPTY | place | {"settled": settled} | row_of(run, seen.size)
-        problem = f"{Path(root, entry)}: neither {RUN_FILE} nor {RECORDING_FILE} can be read as a run's."
+        problem = f"{Path(root, entry)}: neither {RUN_FILE} nor {RECORDING_FILE} can be read as a run."
         return _EMPTY | place | {"settled": settled, "problem": problem}
 
 
-class Seen(NamedTuple):
-    """A run's files as they look from outside."""
+class State(NamedTuple):
+    """The state of a run's files, without reading them."""
 
     fingerprint: str
     changed: int
@@ -185,23 +185,23 @@ class Seen(NamedTuple):
     """Bytes of its recording."""
 
 
-def _seen(root: str, entry: str) -> Seen | None:
-    """Return how a run's files look from outside; None if there are none."""
+def _state_of(root: str, entry: str) -> State | None:
+    """Return the state of a run's files; None if there are none."""
     marks, changed, size = [], 0, None
     for name in _RUN_FILES:
         try:
-            facts = os.stat(f"{root}{os.sep}{entry}{os.sep}{name}")  # noqa: PTH116 - Path takes thrice as long
+            facts = os.stat(f"{root}{os.sep}{entry}{os.sep}{name}")  # noqa: PTH116 - Path takes three times as long
         except OSError:
             marks.append("")
             continue
         marks.append(f"{facts.st_mtime_ns}.{facts.st_size}.{facts.st_ino}")
         changed = max(changed, facts.st_mtime_ns)
         size = facts.st_size if name == RECORDING_FILE else None
-    return Seen(" ".join(marks), changed, size) if marks[0] or marks[2] else None
+    return State(" ".join(marks), changed, size) if marks[0] or marks[2] else None
 
 
 def _mark(root: str, entry: str) -> tuple[str, int]:
-    """Return what changes when a file in a folder is made, replaced or removed, and when that was."""
+    """Return a token that changes when a file in a folder is created, replaced or removed, and that time."""
     try:
         facts = os.stat(f"{root}{os.sep}{entry}")  # noqa: PTH116
     except OSError:
@@ -209,7 +209,7 @@ def _mark(root: str, entry: str) -> tuple[str, int]:
     return f"{facts.st_mtime_ns}.{facts.st_ino}", facts.st_mtime_ns
 
 
-def _runs(root: str, entry: str) -> bool:
+def _is_running(root: str, entry: str) -> bool:
     return any(run.status == "running" for run in runs_in(Path(root, entry)))
 
 

@@ -1,4 +1,4 @@
-"""What the index knows of a run: one row, the columns of a table in SQLite."""
+"""A run in the index: the columns of one row in SQLite, and how they are read from the run."""
 
 from __future__ import annotations
 
@@ -13,94 +13,74 @@ from peewee import BigIntegerField, BooleanField, CompositeKey, Field, FloatFiel
 
 from runner.errors import RecordingError
 from runner.recording.metrics import METRICS
-from runner.recording.run_file import EvaluationMetrics, Summary
+from runner.recording.run_file import EvaluationMetrics
+from runner.runs.catalogue.columns import COLUMNS, Kind
 from runner.runs.run import Run
 
 SEEDS: Final = 2**64
 _LARGEST: Final = 2**63 - 1
-_MODES: Final = {("joint", "team"): "cooperative", ("per_agent", "individual"): "competitive"}
+_MODES: Final = {"joint team": "cooperative", "per_agent individual": "competitive"}
 _DEPTH: Final = 20
 _LOGGED: Final = 64
 _NAME: Final = 200
-"""Logged names that are kept, and the letters of one."""
+"""The most characters of a logged name."""
 _TEXT: Final = 4000
-"""The most characters kept of a text, and the most settings of a configuration."""
-
-
+"""The most characters of a text, and the most values of a configuration."""
 _SUMMED: Final = (
     *("root", "used_recording", "used_other", "used_left_over", "used_freed"),
     *("status", "tags", "digest", "created", "id"),
 )
-"""What sums over the use of the disk need: an index of these spares a look at all rows."""
+"""The columns for sums of disk usage: an SQLite index over them saves reading all rows."""
 
 
 class SeedField(Field):
-    """A seed, from 0 to 2^64 - 1, kept in order as SQLite's signed integers."""
+    """A seed, from 0 to 2^64 - 1, shifted to SQLite's signed integers so that their order stays."""
 
     field_type = "BIGINT"
 
     def db_value(self, value: int | None) -> int | None:
-        """Return what is stored of a seed."""
+        """Return the stored value of a seed."""
         return None if value is None else value - 2**63
 
     def python_value(self, value: int | None) -> int | None:
-        """Return the seed that is stored."""
+        """Return the seed of a stored value."""
         return None if value is None else value + 2**63
 
 
 class Row(Model):
-    """A run's folder as it was last read; a damaged run has a `problem`; what is no run has no `id`."""
+    """A run's folder as it was last read; a damaged run has a `problem`, other folders have no `id`."""
 
     root = TextField()
     """The recordings folder, absolute."""
     entry = TextField()
     """The run's folder in it."""
     fingerprint = TextField()
-    """What tells whether its files changed."""
+    """Changes with every change of its files."""
     mark = TextField()
-    """What tells whether files in it were made, replaced or removed."""
+    """Changes when a file in it is created, replaced or removed."""
     settled = BooleanField()
-    """Whether they had not changed just before; if they had, they may do so again without a trace."""
+    """Whether they had not just changed; if they had, they may change again with the same time."""
     problem = TextField(null=True)
 
-    id = TextField(null=True)
-    name = TextField(null=True)
-    config = TextField(null=True)
-    seed = SeedField(null=True)
-    status = TextField(null=True)
     tags = TextField(null=True)
     """A tag a line."""
-    note = TextField(null=True)
-    words = TextField(null=True)
-    """Id, name, configuration's name, tags and note, each on lines of its own."""
-    created = BigIntegerField(null=True)
-    """Milliseconds since 1970, UTC."""
-    episodes = BigIntegerField(null=True)
-    episodes_to_do = BigIntegerField(null=True)
-    steps = BigIntegerField(null=True)
-    train_steps = BigIntegerField(null=True)
-    eval_steps = BigIntegerField(null=True)
-    logged = TextField(null=True)
-    """The last value logged under each name, as a JSON object; null for a value that is not finite."""
-    seconds = FloatField(null=True)
-    bytes = BigIntegerField(null=True)
-    digest = TextField(null=True)
-    mode = TextField(null=True)
-    environment = TextField(null=True)
-    host = TextField(null=True)
-    git = TextField(null=True)
-    archive = TextField(null=True)
-    settings = TextField(null=True)
-    """The configuration as a JSON object of paths and plain values."""
-
+    # From COLUMNS, as are all others; these are used by name.
+    id: TextField
+    name: TextField
+    seed: SeedField
+    status: TextField
+    created: BigIntegerField
+    digest: TextField
+    words: TextField
+    settings: TextField
     used_recording = BigIntegerField(null=True)
-    """Bytes that its folder uses of the disk, by what they are; null until somebody asks."""
+    """Disk usage of its folder, in bytes; null until it is measured."""
     used_other = BigIntegerField(null=True)
     used_left_over = BigIntegerField(null=True)
     used_freed = BigIntegerField(null=True)
 
     class Meta:
-        """How the table is made."""
+        """The options of the table."""
 
         table_name = "runs"
         primary_key = CompositeKey("root", "entry")
@@ -113,32 +93,38 @@ class Row(Model):
         )
 
 
-for _metric in METRICS:
-    Row._meta.add_field(_metric.name, FloatField(null=True))
+_FIELDS: Final = {str: TextField, int: BigIntegerField, float: FloatField}
+for _column in COLUMNS.values():
+    if _column.type:
+        _field = SeedField if _column.kind is Kind.WHOLE else _FIELDS[_column.type]
+        Row._meta.add_field(_column.name, _field(null=True))
+# The long texts come last, so that SQLite reads the other columns without them.
+Row._meta.add_field("words", TextField(null=True))  # id, name, configuration's name, tags, note: a line each
+Row._meta.add_field("settings", TextField(null=True))  # the configuration: a JSON object of dotted paths
 
 
 def row_of(run: Run, size: int | None) -> dict[str, Any]:
-    """Return what is kept of a run, by column; the place and the fingerprint are not in it.
+    """Return the row of a run, by column, without place and fingerprint.
 
     Args:
-        run: as its folder says now.
+        run: the run as it is now.
         size: bytes of its recording; None if there is none.
     """
     config, summary = run.file.config, run.summary
     last, recent = summary.last_evaluation or EvaluationMetrics(), summary.recent_training
     done = summary if summary.episodes is not None else {**_recorded(run), **summary}
     episodes, train, evaluation = (done.get(key) for key in ("episodes", "train_steps", "eval_steps"))
-    called = text(config.get("name"))
+    config_name, environment = text(config.get("name")), config.get("env")
     return {
         "id": run.run_id,
         "name": text(run.name),
-        "config": called,
+        "config": config_name,
         "problem": text(run.problem) or None,
         "seed": run.file.seed if run.has_seed else None,
         "status": text(run.status),
         "tags": "\n".join(run.tags),
         "note": text(run.note),
-        "words": text("\n".join([run.run_id, run.name, called or "", *run.tags, run.note]), 3 * _TEXT),
+        "words": text("\n".join([run.run_id, run.name, config_name or "", *run.tags, run.note]), 3 * _TEXT),
         "created": math.floor(run.created.timestamp() * 1000),
         "episodes": episodes,
         "episodes_to_do": run.episodes_to_do,
@@ -147,12 +133,18 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
         "eval_steps": evaluation,
         **{metric.name: last.values.get(metric.name) for metric in METRICS},
         **({} if summary.last_evaluation or not recent else {"mean_return": recent.mean_return}),
-        "logged": json.dumps(_logged(summary)),
+        "logged": json.dumps(
+            {
+                name: value
+                for name, value in islice(summary.logged.items(), _LOGGED)
+                if text(name, _NAME) == name
+            }
+        ),
         "seconds": summary.seconds,
         "bytes": size,
         "digest": summary.content_digest,
-        "mode": _mode(config),
-        "environment": text(_mapping(config.get("env")).get("id")),
+        "mode": _MODES.get(f"{config.get('tables')} {config.get('rewards')}"),
+        "environment": text(environment.get("id") if isinstance(environment, Mapping) else None),
         "host": text(run.file.provenance.get("host") or run.file.owner.get("host")),
         "git": text(run.file.provenance.get("git")),
         "archive": text(run.archive.target or None),
@@ -161,7 +153,7 @@ def row_of(run: Run, size: int | None) -> dict[str, Any]:
 
 
 def _recorded(run: Run) -> Mapping[str, Any]:
-    """Return how far a run came that was ended before it could say so; nothing if nobody can tell, or yet."""
+    """Return the progress of a run that was killed, from its recording; empty if unknown or still running."""
     from runner.recording.reader import open_recording
 
     if run.status == "archived":
@@ -172,22 +164,15 @@ def _recorded(run: Run) -> Mapping[str, Any]:
     return {}
 
 
-def _logged(summary: Summary) -> dict[str, float | None]:
-    """Return the last logged values of a loop by name."""
-    return {
-        name: value for name, value in islice(summary.logged.items(), _LOGGED) if text(name, _NAME) == name
-    }
-
-
-def text(value: Any, most: int = _TEXT) -> str | None:
-    """Return a text that SQLite can hold, cut off where it is too long; None if it is none."""
+def text(value: Any, max_length: int = _TEXT) -> str | None:
+    """Return a text for SQLite, truncated; None if the value is not a text."""
     if not isinstance(value, str):
         return None
-    return value[:most].encode(errors="replace").decode()
+    return value[:max_length].encode(errors="replace").decode()
 
 
 def number(value: Any) -> float | None:
-    """Return a finite number; None if it is none."""
+    """Return a finite number; None for any other value."""
     if type(value) not in (int, float):
         return None
     try:
@@ -196,17 +181,8 @@ def number(value: Any) -> float | None:
         return None
 
 
-def _mapping(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}
-
-
-def _mode(config: Mapping[str, Any]) -> str | None:
-    tables, rewards = config.get("tables"), config.get("rewards")
-    return _MODES.get((tables, rewards)) if isinstance(tables, str) and isinstance(rewards, str) else None
-
-
 def _flat(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
-    """Yield the plain values in a configuration by path: `evaluation.every`; lists by position."""
+    """Yield the plain values in a configuration by dotted path; items of lists by their position."""
     if isinstance(value, Mapping | list):
         parts = enumerate(value) if isinstance(value, list) else value.items()
         for (key, part), _ in zip(parts, range(_TEXT), strict=False):

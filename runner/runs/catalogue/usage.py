@@ -1,4 +1,4 @@
-"""What uses the disk: the files in runs' folders, and what is cached for them."""
+"""Disk usage of runs: the files in their folders, and what is cached for them."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ import os
 import re
 import stat
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol
 
 from peewee import Case, DatabaseError, Value, chunked, fn
 
 from runner.recording.labels import KEEP, LABELS_FILE, LOCK_FILE
-from runner.runs.catalogue.columns import with_originals
-from runner.runs.catalogue.database import keep_usage, opened
+from runner.runs.catalogue.database import open_index, store_usage
 from runner.runs.catalogue.filters import Filter
-from runner.runs.catalogue.index import Index
+from runner.runs.catalogue.index import Index, Rows
 from runner.runs.catalogue.rows import Row
 from runner.runs.locking import RUN_LOCK
 from runner.runs.run import RECORDING_FILE, RUN_FILE
 from runner.util.files import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
 
 REMOVED: Final = ".removed-"
-"""What the folder of a run is called from the moment it is removed until its files are."""
+"""The prefix of a run's folder from the moment it is removed until its files are deleted."""
+KINDS: Final = ("recording", "exports", "restored", "other")
+"""The kinds of bytes, attributes of `Usage` and `Sums`."""
 
 _OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, RUN_LOCK))
 _LEFT_OVER: Final = re.compile(
@@ -33,22 +34,22 @@ _LEFT_OVER: Final = re.compile(
     r"|\.[0-9a-f]{8}\.(run|labels)\.json|(run|labels)\.[0-9a-f]{8}\.tmp"
 )
 _KEY: Final = re.compile(r"-[0-9a-f]+(\.\w+)+$")
-"""What follows the ids in the name of a cached file."""
+"""The end of a cached file's name, after the ids."""
 
 
 @dataclass(slots=True)
 class Contents:
-    """What is in a run's folder, in bytes; links to elsewhere and files with other names count as nothing."""
+    """The bytes in a run's folder."""
 
     recording: int = 0
     other: int = 0
-    """All else, what is strange too."""
+    """All other files, including strange ones."""
     left_over: int = 0
-    """Of that: what a repair or an interrupted command left behind."""
+    """Of these: files left by a repair or an interrupted command."""
     freed: int = 0
-    """What removing the run's own files would free."""
+    """Freed by removing the run's own files; those with other links free nothing."""
     strange: list[str] = field(default_factory=list)
-    """Names that are no run's: files of the user's own, folders, links."""
+    """Names that no run has: the user's own files, folders, links."""
 
 
 def contents_of(folder: Path) -> Contents:
@@ -91,36 +92,58 @@ def cached(part: str) -> Counter[str]:
         part: the folder in the cache: `EXPORTS`, `TABLES` or `RESTORED`.
     """
     found: Counter[str] = Counter()
-    for name, size in _sizes(cache_folder() / part):
-        found[_KEY.sub("", name).partition(RUN_SEPARATOR)[0]] += size
+    with contextlib.suppress(OSError), os.scandir(cache_folder() / part) as entries:
+        for entry in entries:
+            is_folder = entry.is_dir(follow_symlinks=False)
+            size = _size_within(entry.path) if is_folder else entry.stat(follow_symlinks=False).st_size
+            found[_KEY.sub("", entry.name).partition(RUN_SEPARATOR)[0]] += size
     return found
+
+
+class _Sized(Protocol):
+    @property
+    def recording(self) -> int: ...
+    @property
+    def exports(self) -> int: ...
+    @property
+    def restored(self) -> int: ...
+    @property
+    def other(self) -> int: ...
+
+
+def sizes(usages: Sequence[_Sized]) -> dict[str, int]:
+    """Return the bytes that runs use together, by kind, and their total."""
+    found = {kind: sum(getattr(usage, kind) for usage in usages) for kind in KINDS}
+    return found | {"total": sum(found.values())}
 
 
 @dataclass(frozen=True)
 class Usage:
-    """What a run uses of the disk, in bytes."""
+    """The disk usage of a run, in bytes."""
 
     row: dict[str, Any]
-    """The run, as the index has it."""
+    """The run's row in the index."""
     contents: Contents
     exports: int
     restored: int
 
     @property
+    def recording(self) -> int:
+        """Bytes of its recording."""
+        return self.contents.recording
+
+    @property
+    def other(self) -> int:
+        """Bytes of the other files in its folder."""
+        return self.contents.other
+
+    @property
     def total(self) -> int:
-        """All of it."""
-        return self.contents.recording + self.contents.other + self.exports + self.restored
-
-    @classmethod
-    def of(cls, row: dict[str, Any], exports: Mapping[str, int], restored: Mapping[str, int]) -> Usage:
-        """Return the usage of a run that the index keeps, given the bytes cached by id."""
-        contents = Contents(
-            row["used_recording"], row["used_other"], row["used_left_over"], row["used_freed"]
-        )
-        return cls(row, contents, exports.get(row["id"], 0), restored.get(row["id"], 0))
+        """All bytes."""
+        return self.recording + self.other + self.exports + self.restored
 
 
-USED_BY: Final = (
+COLUMNS_OF_USAGE: Final = (
     *("root", "entry", "id", "name", "status", "tags", "digest", "fingerprint", "mark", "settled"),
     *("used_recording", "used_other", "used_left_over", "used_freed"),
 )
@@ -129,48 +152,41 @@ USED_BY: Final = (
 
 @dataclass
 class Sums:
-    """Bytes that several runs use together."""
+    """The disk usage of several runs together, in bytes."""
 
     runs: int = 0
-    """How many runs these are."""
     recording: int = 0
-    exports: int = 0
-    restored: int = 0
     other: int = 0
     same_content: int = 0
-    """What removing runs whose content another run recorded first would free; without protected runs."""
+    """Freed by removing runs whose content another run recorded first; not counting protected runs."""
     unfinished: int = 0
-    """What removing interrupted and failed runs would free; without protected runs."""
+    """Freed by removing interrupted and failed runs; not counting protected runs."""
     left_over: int = 0
-    """What repairs and interrupted commands left behind; without protected runs."""
+    """Left by repairs and interrupted commands; not counting protected runs."""
+    exports: int = 0
+    restored: int = 0
 
     def by_kind(self) -> dict[str, int]:
-        """Return the bytes by what they are, and their total."""
-        kinds = {
-            "recording": self.recording,
-            "exports": self.exports,
-            "restored": self.restored,
-            "other": self.other,
-        }
-        return {**kinds, "total": sum(kinds.values())}
+        """Return the bytes by kind, and their total."""
+        return sizes([self])
 
     def freeable(self, recordings: Sequence[Path]) -> dict[str, int]:
-        """Return the bytes that could be freed, by what they are.
+        """Return the bytes that could be freed, by reason.
 
         Args:
-            recordings: the folders searched for runs whose removal was cut off.
+            recordings: the folders searched for runs whose removal was interrupted.
         """
-        cut_off = [contents_of(stray) for root in recordings for stray in strays(root)]
+        interrupted = [contents_of(stray) for root in recordings for stray in strays(root)]
         return {
             "same_content": self.same_content,
             "unfinished": self.unfinished,
             "left_over": self.left_over,
             "cached": self.exports + self.restored,
-            "half_removed": sum(contents.recording + contents.other for contents in cut_off),
+            "half_removed": sum(contents.recording + contents.other for contents in interrupted),
         }
 
     def add(self, usage: Usage) -> None:
-        """Add a run whose folder was measured just now."""
+        """Add a run whose folder was measured just now, without its cached files."""
         row, contents = usage.row, usage.contents
         self.runs += 1
         self.recording += contents.recording
@@ -182,78 +198,73 @@ class Sums:
         self.unfinished += contents.freed if row["status"] in ("interrupted", "failed") else 0
 
 
-def sizes(usages: Iterable[Usage]) -> dict[str, int]:
-    """Return the bytes that a few runs use, by what they are, and their total."""
-    sums = Sums()
-    for usage in usages:
-        sums.recording += usage.contents.recording
-        sums.exports += usage.exports
-        sums.restored += usage.restored
-        sums.other += usage.contents.other
-    return sums.by_kind()
-
-
 def usage_of(
-    read: Callable[[Callable[[Index], _Parts]], _Parts], chosen: Filter, limit: int | None
+    read: Callable[[Callable[[Index], _Stored]], _Stored], chosen: Filter, limit: int | None
 ) -> tuple[list[Usage], Sums]:
     """Return the runs that use most of the disk, the largest first, and the sums over all runs.
 
-    SQLite adds up and sorts what the index keeps. Folders that it knows nothing of, or that changed, are
-    measured here, after the index was read: that may take long, and must not keep others from writing to it.
+    SQLite adds up and sorts what the index has. Folders that are new or changed are measured here, after the
+    index was read: that may take long, and must not keep others from writing to it.
 
     Args:
-        read: does some work on the index and returns what came of it, as `look` does.
+        read: calls some work with the index and returns its result, as `look` does.
         chosen: which runs.
-        limit: how many of the largest runs to return at most; all if None.
+        limit: the maximum number of runs to return; None for all.
     """
     exports, restored = cached(EXPORTS) + cached(TABLES), cached(RESTORED)
-    with_cache = {*exports, *restored}
-    parts = read(lambda index: _parts(index, chosen, with_cache, limit))
-    fresh, sums = [], parts.sums
-    found = {(row["root"], row["entry"]): Usage.of(row, exports, restored) for row in parts.kept}
-    measured = []
-    for row in parts.unknown:
-        contents = _contents(row)
+    stored = read(lambda index: _stored(index, chosen, {*exports, *restored}, limit))
+
+    def usage(row: dict[str, Any], contents: Contents) -> Usage:
+        return Usage(row, contents, exports[row["id"]], restored[row["id"]])
+
+    found = {
+        (row["root"], row["entry"]): usage(row, Contents(*(row[name] for name in COLUMNS_OF_USAGE[-4:])))
+        for row in stored.measured
+    }
+    every, sums, measured = list(found.values()), stored.sums, []
+    for row in stored.unmeasured:
+        try:
+            contents = contents_of(Path(row["root"], row["entry"]))
+        except OSError:
+            contents = Contents()  # removed just now
         if row["settled"] and row["status"] != "running" and not contents.strange:
-            fresh.append((row, contents))
-        usage = Usage(row, contents, exports[row["id"]], restored[row["id"]])
-        sums.add(usage)
-        measured.append(usage)
-    if fresh:
-        _keep(fresh)
-    every = [*found.values(), *measured]
-    sums.exports = sum(usage.exports for usage in every)
-    sums.restored = sum(usage.restored for usage in every)
+            measured.append((row, contents))
+        every.append(usage(row, contents))
+        sums.add(every[-1])
+    if measured:
+        _store(measured)
+    sums.exports = sum(each.exports for each in every)
+    sums.restored = sum(each.restored for each in every)
     every.sort(key=lambda usage: (-usage.total, usage.row["id"]))
     return every[:limit], sums
 
 
-class _Parts(NamedTuple):
-    """What the index knows of the runs' usage."""
+class _Stored(NamedTuple):
+    """What the index has of the runs' usage."""
 
     sums: Sums
-    """Over the runs whose usage it keeps; without cached files."""
-    kept: list[dict[str, Any]]
-    """Of these runs: the largest, and all that have cached files."""
-    unknown: list[dict[str, Any]]
+    """Over the measured runs; without cached files."""
+    measured: Rows
+    """Of the measured runs: the largest, and all that have cached files."""
+    unmeasured: Rows
     """The runs whose folders have to be measured."""
 
 
-def _parts(index: Index, chosen: Filter, with_cache: set[str], limit: int | None) -> _Parts:
-    is_kept = Row.used_recording.is_null(False)
-    sums = Sums(*index.sums(chosen.also(is_kept), _columns(index)))
+def _stored(index: Index, chosen: Filter, with_cache: set[str], limit: int | None) -> _Stored:
+    is_measured = Row.used_recording.is_null(False)
+    sums = Sums(*index.sums(chosen.also(is_measured), _summed(index)))
     own = Row.used_recording + Row.used_other
-    kept = index.largest(chosen.also(is_kept), own, limit, USED_BY)
+    measured = index.largest(chosen.also(is_measured), own, limit, COLUMNS_OF_USAGE)
     if limit is not None:  # a run that is small by itself may have large files in the cache
         for ids in chunked(sorted(with_cache), 500):
-            kept += index.select(chosen.also(is_kept & Row.id.in_(ids)), columns=USED_BY)
-    unknown = index.select(chosen.also(Row.used_recording.is_null()), columns=USED_BY)
-    with_originals([*kept, *unknown], index)
-    return _Parts(sums, kept, unknown)
+            measured += index.select(chosen.also(is_measured & Row.id.in_(ids)), columns=COLUMNS_OF_USAGE)
+    unmeasured = index.select(chosen.also(Row.used_recording.is_null()), columns=COLUMNS_OF_USAGE)
+    index.with_same_as([*measured, *unmeasured])
+    return _Stored(sums, measured, unmeasured)
 
 
-def _columns(index: Index) -> list[Any]:
-    """Return the sums that make the fields of `Sums`, in their order."""
+def _summed(index: Index) -> list[Any]:
+    """Return the sums for the fields of `Sums`, in their order, without the last two."""
     line = "\n"
     protected = fn.INSTR(Value(line).concat(Row.tags).concat(line), f"{line}{KEEP}{line}") > 0
     free = ~protected & (Row.status != "running")
@@ -264,8 +275,6 @@ def _columns(index: Index) -> list[Any]:
     return [
         fn.COUNT(Row.entry),
         fn.SUM(Row.used_recording),
-        Value(0),
-        Value(0),
         fn.SUM(Row.used_other),
         total(free & index.is_copy(), Row.used_freed),
         total(free & Row.status.in_(("interrupted", "failed")), Row.used_freed),
@@ -273,59 +282,37 @@ def _columns(index: Index) -> list[Any]:
     ]
 
 
-def _keep(fresh: Sequence[tuple[dict[str, Any], Contents]]) -> None:
-    """Keep in the index what was found in folders, where it still has them as they were; if it can be."""
+def _store(measured: Sequence[tuple[Mapping[str, Any], Contents]]) -> None:
+    """Store what was measured in the index, if it can be written."""
     values = [
         (
-            *(each.recording, each.other, each.left_over, each.freed),
+            *(contents.recording, contents.other, contents.left_over, contents.freed),
             *(row["root"], row["entry"], row["mark"], row["fingerprint"]),
         )
-        for row, each in fresh
+        for row, contents in measured
     ]
-    with contextlib.suppress(DatabaseError, OSError), contextlib.closing(opened(lambda _: None)) as database:
-        keep_usage(database, values)
+    with (
+        contextlib.suppress(DatabaseError, OSError),
+        contextlib.closing(open_index(lambda _: None)) as database,
+    ):
+        store_usage(database, values)
 
 
 def strays(root: Path) -> list[Path]:
-    """Return the folders of runs that were being removed when the command doing so was ended."""
-    try:
-        with os.scandir(root) as entries:
-            return sorted(
-                Path(entry.path)
-                for entry in entries
-                if entry.name.startswith(REMOVED) and entry.is_dir(follow_symlinks=False)
-            )
-    except OSError:
-        return []
-
-
-def _contents(row: dict[str, Any]) -> Contents:
-    try:
-        return contents_of(Path(row["root"], row["entry"]))
-    except OSError:
-        return Contents()  # removed just now
-
-
-def _sizes(folder: Path) -> Iterator[tuple[str, int]]:
-    """Yield name and bytes of what is in a folder; nothing if it is not there."""
-    try:
-        with os.scandir(folder) as entries:
-            for entry in entries:
-                is_folder = entry.is_dir(follow_symlinks=False)
-                yield (
-                    entry.name,
-                    _size_within(entry.path) if is_folder else entry.stat(follow_symlinks=False).st_size,
-                )
-    except OSError:
-        return
+    """Return the folders of runs whose removal was interrupted."""
+    with contextlib.suppress(OSError), os.scandir(root) as entries:
+        return sorted(
+            Path(entry.path)
+            for entry in entries
+            if entry.name.startswith(REMOVED) and entry.is_dir(follow_symlinks=False)
+        )
+    return []
 
 
 def _size_within(folder: str) -> int:
     total = 0
     for place, _, names in os.walk(folder):
         for name in names:
-            try:
+            with contextlib.suppress(OSError):
                 total += os.lstat(os.path.join(place, name)).st_size  # noqa: PTH118
-            except OSError:
-                continue
     return total

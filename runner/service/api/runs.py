@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 
 from runner.analysis.summary import described
 from runner.recording.labels import MAX_NOTE, MAX_TAGS
-from runner.runs.catalogue.columns import PROGRAMS, columns_of, with_originals
+from runner.runs.catalogue.columns import DEFAULT_JSON, columns_of
 from runner.runs.catalogue.columns import as_json as row_as_json
 from runner.runs.catalogue.filters import parse
 from runner.runs.catalogue.index import order_of
@@ -66,11 +66,11 @@ async def list_runs(
 
     def make() -> bytes:
         chosen, order = parse(filter), order_of(sort)
-        shown = columns_of(columns) if columns else PROGRAMS
+        shown = columns_of(columns) if columns else DEFAULT_JSON
 
         def work(index: Index) -> dict[str, Any]:
             rows, total = index.page(chosen, *order, limit=limit, offset=offset)
-            runs = [row_as_json(row, shown) for row in with_originals(rows, index)]
+            runs = [row_as_json(row, shown) for row in index.with_same_as(rows)]
             return {"runs": runs, "total": total, "offset": offset, "limit": limit}
 
         return json.dumps(catalogue.read(work), ensure_ascii=False).encode()

@@ -11,8 +11,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
-from runner.runs.catalogue.columns import HEADINGS, columns_of, in_words, with_originals
-from runner.runs.catalogue.fields import FIELDS, SETTING, Kind, field_of
+from runner.runs.catalogue.columns import FIELDS, HEADINGS, SETTING, Kind, as_text, columns_of, field_of
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.index import order_of
 from runner.service.dependencies import CacheOf, CatalogueOf
@@ -84,7 +83,7 @@ def _page(catalogue: Catalogue, text: str, sort: str, columns: str, number: int,
 
     def work(index: Index) -> tuple[list[dict[str, Any]], int, int]:
         found, total = index.page(chosen, *order, limit=ROWS, offset=(number - 1) * ROWS)
-        return with_originals(found, index), total, index.count(Filter(None)) if text else total
+        return index.with_same_as(found), total, index.count(Filter(None)) if text else total
 
     rows, total, everything = catalogue.read(work)
     asked = {"filter": text, "sort": sort, "columns": _asked(shown)}
@@ -155,7 +154,7 @@ def _cell(row: dict[str, Any], column: str, folded: bool) -> dict[str, Any]:
     href = f"/runs/{row['id']}" if column in ("id", "name") else ""
     if column == "same_as" and row["same_as"]:
         href = f"/runs/{row['same_as']}"
-    text = in_words(row, column)
+    text = as_text(row, column)
     if column == "digest":
         text = text[:16]
     return {"text": text, "kind": kind, "href": href, "status": column == "status"}

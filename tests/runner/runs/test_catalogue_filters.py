@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runner.errors import RunnerError
-from runner.runs.catalogue.filters import MAX_DEPTH, MAX_LENGTH, parse
+from runner.runs.catalogue.filters import MAX_DEPTH, MAX_LENGTH, parse, size_of
 from runner.runs.catalogue.index import look
-from runner.runs.catalogue.values import size_of
 
 NOW = datetime(2026, 6, 15, 12, tzinfo=UTC)
 RUNS = [
@@ -239,7 +238,7 @@ def test_any_text_is_a_filter_or_refused_with_its_place(folder, text):
         ("bytes:>3XB", "10MB"),
         ("name:>b", "text has no order"),
         ("name:b~2", "expected a word"),
-        ("name:(seed:3)", "behind name:, expected a value"),
+        ("name:(seed:3)", "after name:, expected a value"),
         ("config.x:>-1", "negative number is put in quotes"),
         (">3", "expected a field before it"),
         ("(" * (MAX_DEPTH + 1) + "a" + ")" * (MAX_DEPTH + 1), "nested"),

@@ -21,7 +21,7 @@ from runner.errors import RunNotFound
 from runner.recording.labels import LABELS_FILE, Labels, change_labels, read_labels
 from runner.runs.catalogue import folders
 from runner.runs.catalogue import usage as usages
-from runner.runs.catalogue.database import index_path, opened
+from runner.runs.catalogue.database import index_path, open_index
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.folders import Depth, Folders
 from runner.runs.catalogue.index import look
@@ -105,7 +105,7 @@ def test_only_what_changed_is_read(folder):
         create_run(folder, CONFIG, seed).update(status="finished")
     aged(folder)
     changed = list_runs(folder)[2].update(status="failed")
-    with contextlib.closing(opened(pytest.fail)) as database:
+    with contextlib.closing(open_index(pytest.fail)) as database:
         (difference,) = Folders(database, [str(folder)]).differences()
     assert difference.changed == [changed.run_id]
     assert ids(folder, "status:failed") == [changed.run_id]
@@ -192,7 +192,7 @@ def test_the_index_is_never_needed(folder):
     before = rows(folder)[0]
     index_path().unlink()
     assert rows(folder)[0] == before
-    assert look([folder], lambda index: index.select(ALL), anew=True) == before
+    assert look([folder], lambda index: index.select(ALL), rebuild=True) == before
 
 
 def test_several_folders_and_the_same_content_in_them(folder, recorded, tmp_path):
@@ -406,7 +406,7 @@ def test_making_the_index_anew_never_empties_it(folder, monkeypatch):
         return row_of(run, size)
 
     monkeypatch.setattr(folders, "row_of", looking_on)
-    assert len(look([folder], lambda index: index.select(ALL), anew=True)) == 4
+    assert len(look([folder], lambda index: index.select(ALL), rebuild=True)) == 4
     assert seen == [len(runs)] * 4
 
 
