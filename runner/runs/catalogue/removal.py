@@ -237,9 +237,7 @@ def _protected(run: Run) -> str:
 
 def _unreadable(folder: Path) -> str:
     if not are_readable(folder):
-        return (
-            f"{folder / LABELS_FILE} cannot be read, and may say {KEEP}; repair it, or remove that file"
-        )
+        return f"{folder / LABELS_FILE} cannot be read, and may say {KEEP}; repair it, or remove that file"
     return ""
 
 
