@@ -15,7 +15,7 @@ from runner.sweep.cluster import RayWorkers
 from runner.sweep.loading import from_values
 from runner.sweep.local import LocalWorkers
 from runner.sweep.model import Sweep
-from runner.sweep.trials import run_sweep
+from runner.sweep.running import run_sweep
 
 STUDY = 1000
 

@@ -28,7 +28,7 @@ from runner.service.response_cache import ResponseCache
 from runner.service.security import Tokens
 from runner.service.sessions import Sessions
 from runner.service.settings import Settings
-from runner.sweep.names import sweeps_in
+from runner.sweep import sweeps_in
 from runner.util.version import __version__
 
 API: Final = "/api/v1"

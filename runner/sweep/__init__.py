@@ -1,16 +1,47 @@
-"""Sweeps: many runs of one experiment with other values, chosen on a grid, at random or by a search.
+"""Sweeps: many runs of one experiment with different values, from a grid, at random or by a search.
 
-model      what a sweep file may say
-loading    the file to a `Sweep`, with located errors
-search     which values are tried next: Optuna
-readings   what a run is measured by
-task       one run, as a worker does it
-local      worker processes of this machine
-cluster    the same on Ray
-state      a sweep on disk: the file as resolved; its runs are the truth
-trials     batches of trials, from what is recorded or by running them
-results    ranking, importance, the best configuration
-plots      what is drawn of a sweep
-figure     the drawing
-page       a sweep as one page
+model       the contents of a sweep file
+loading     a file to a `Sweep`, with located errors
+search      the values to try next, by Optuna
+objective   readings of a metric during a run, and what a run is worth
+task        one run, as a worker does it
+local       worker processes on this machine
+cluster     the same on Ray
+state       a sweep on disk: its resolved file, and locks; progress follows from its runs
+trials      trials, and what is recorded of them
+running     the loop that gives batches of runs to workers
+plan        disk and runs that a sweep will take
+results     ranking, importance, the best configuration
+plots, figure, charts, page   drawings of a sweep, and the page with all of them
+
+This module loads nothing heavy, so that commands can look for sweeps first.
 """
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+FOLDER: Final = ".sweeps"
+FILE: Final = "sweep.yaml"
+
+
+def tag_of(name: str) -> str:
+    """Return the tag of a sweep's runs."""
+    return f"sweep={name}"
+
+
+def folder_of(name: str, recordings: Path) -> Path:
+    """Return the folder of a sweep; it need not exist."""
+    return recordings / FOLDER / name
+
+
+def sweeps_in(recordings: Path) -> list[str]:
+    """Return the names of the sweeps in a recordings folder."""
+    return sorted(file.parent.name for file in (recordings / FOLDER).glob(f"*/{FILE}"))
+
+
+def is_sweep(names: Sequence[str], recordings: Path) -> bool:
+    """Return whether these names are that of one sweep, rather than names of runs."""
+    return len(names) == 1 and names[0] in sweeps_in(recordings)

@@ -1,7 +1,7 @@
-"""Workers on Ray: the same tasks, on as many machines as a cluster has.
+"""Workers on Ray: the same tasks, on the machines of a cluster.
 
-The machines of a cluster must have the project installed, and see the recordings folder under one path: a run
-is recorded on its worker's own disk, and moved there when it is whole.
+The machines of a cluster must have the project installed, and see the recordings folder under the same path:
+a run is recorded on its worker's own disk, and moved there when it is complete.
 """
 
 from __future__ import annotations
@@ -9,15 +9,18 @@ from __future__ import annotations
 import os
 import socket
 import threading
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Final, Self
+from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
+from runner.sweep.local import CLOSE_SECONDS
 from runner.sweep.task import Result, Task, do
 from runner.util.extras import require
 
-_GOODBYE_SECONDS: Final = 30.0
-_KNOCK_SECONDS: Final = 5.0
+_CONNECT_SECONDS: Final = 5.0
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def require_ray() -> Any:
@@ -33,8 +36,8 @@ def connect(address: str | None, processors: int | None = None) -> Any:
     """Return the module `ray`, connected to a cluster.
 
     Args:
-        address: of the cluster, or `auto`; None starts Ray on this machine.
-        processors: how many Ray is to use of this machine; None for all.
+        address: the cluster, or `auto`; None starts Ray on this machine.
+        processors: the processors of this machine that Ray may use; None for all.
 
     Raises:
         MissingExtra: Ray is not installed.
@@ -44,86 +47,111 @@ def connect(address: str | None, processors: int | None = None) -> Any:
     options = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         options |= {"num_cpus": processors or os.cpu_count(), "include_dashboard": False}
+    host, _, port = (address or "").rpartition("//")[2].rpartition(":")
     try:
-        _knock(address or "")
+        if host and port.isdecimal():  # Ray itself would wait for minutes if nothing listens there
+            socket.create_connection((host, int(port)), _CONNECT_SECONDS).close()
         ray.init(address=address or "local", **options)
     except (ConnectionError, OSError, RuntimeError, ValueError) as error:
         raise RunnerError(
             f"--ray: no cluster at {address or 'this machine'} can be reached "
-            f"({str(error).strip().splitlines()[0]}); `ray status` says whether one runs, and --ray "
-            "without an address starts one here. One that asks for a token wants it in RAY_AUTH_TOKEN."
+            f"({str(error).strip().splitlines()[0]}); `ray status` shows whether one runs, and --ray "
+            "without an address starts one here. If it requires a token, set RAY_AUTH_TOKEN."
         ) from error
     return ray
 
 
-class Doer:
-    """Does tasks, one at a time, and can be told to stop meanwhile; an actor of Ray."""
+class RayActor:
+    """Runs one function at a time in a process of Ray, and is its channel: it keeps messages until fetched."""
 
     def __init__(self) -> None:
         self._stopping = threading.Event()
+        self._messages: list[tuple[str, Any]] = []
+        self._lock = threading.Lock()
 
-    def do(self, task: Task) -> Result:
-        """Do a task."""
-        return do(task, self._stopping.is_set)
+    def run(self, function: Callable[Concatenate[RayActor, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """Call a function with this actor and these arguments."""
+        return function(self, *args, **kwargs)
 
-    def stop(self) -> None:
-        """Close the recording that is under way, and every one after it at once."""
+    def request_stop(self) -> None:
+        """Ask the running function, and every later one, to stop."""
         self._stopping.set()
+
+    def stop(self) -> bool:
+        """Return whether the function must stop."""
+        return self._stopping.is_set()
+
+    def send(self, kind: str, data: Any) -> None:
+        """Keep a message of the function until it is fetched."""
+        with self._lock:
+            self._messages.append((kind, data))
+
+    def take_messages(self) -> list[tuple[str, Any]]:
+        """Return the messages since the last call."""
+        with self._lock:
+            messages, self._messages = self._messages, []
+        return messages
+
+
+def start_actor(ray: Any) -> Any:
+    """Return the handle of a new `RayActor`; its function and two other calls run at the same time."""
+    return ray.remote(RayActor).options(num_cpus=1, max_concurrency=3, max_restarts=0).remote()
+
+
+def _do(actor: RayActor, task: Task) -> Result:
+    return do(task, actor.stop)
 
 
 class RayWorkers:
     """Actors of Ray, started when they are needed; each keeps what it has loaded.
 
     Args:
-        count: how many at most; None for one a processor of the cluster.
-        address: of the cluster, or `auto`; None starts Ray on this machine.
-        most: there are never more.
+        count: the most workers; None for one per processor of the cluster.
+        address: the cluster, or `auto`; None starts Ray on this machine.
+        limit: never start more workers than this.
 
     Raises:
         MissingExtra: Ray is not installed.
         RunnerError: the cluster cannot be reached.
     """
 
-    def __init__(self, count: int | None, address: str | None, most: int) -> None:
+    def __init__(self, count: int | None, address: str | None, limit: int) -> None:
         self._ray = connect(address, count)
         processors = int(self._ray.cluster_resources().get("CPU", 1))
-        self._count = max(1, min(count or processors, most))
-        # Two calls at a time: `stop` must get through while a task is being done.
-        self._actor = self._ray.remote(Doer).options(num_cpus=1, max_concurrency=2, max_restarts=0)
+        self._count = max(1, min(count or processors, limit))
         self._elsewhere = address is not None
         self._idle: list[Any] = []
         self._busy: dict[Any, tuple[Any, Task]] = {}
 
     @property
     def idle(self) -> int:
-        """How many more tasks can be given."""
+        """The number of tasks that can be started now."""
         return self._count - len(self._busy)
 
     def give(self, task: Task) -> None:
         """Have an idle worker do a task."""
-        actor = self._idle.pop() if self._idle else self._actor.remote()
+        actor = self._idle.pop() if self._idle else start_actor(self._ray)
         there = replace(task, elsewhere=self._elsewhere, threads=False)
-        self._busy[actor.do.remote(there)] = actor, task
+        self._busy[actor.run.remote(_do, there)] = actor, task
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
-        """Return what is done, waiting so long for it; None for a worker that died, and was replaced."""
+        """Wait up to this time for tasks to end; return them with their results, None if the worker died."""
         done: list[tuple[Task, Result | None]] = []
         ready = self._ray.wait(list(self._busy), timeout=seconds)[0] if self._busy else []
         for reference in ready:
             actor, task = self._busy.pop(reference)
             try:
-                result: Result = self._ray.get(reference)
+                done.append((task, self._ray.get(reference)))
             except self._ray.exceptions.RayError:
                 done.append((task, None))
             else:
-                done.append((task, result))
                 self._idle.append(actor)
         return done
 
     def stop(self) -> None:
-        """Have every worker close its recording and return its task as interrupted."""
+        """Make every worker close its recording and return its task as interrupted."""
         for actor, _ in self._busy.values():
-            actor.stop.remote()
+            actor.request_stop.remote()
 
     def __enter__(self) -> Self:
         return self
@@ -131,16 +159,5 @@ class RayWorkers:
     def __exit__(self, *_: object) -> None:
         self.stop()
         if self._busy:
-            self._ray.wait(list(self._busy), num_returns=len(self._busy), timeout=_GOODBYE_SECONDS)
+            self._ray.wait(list(self._busy), num_returns=len(self._busy), timeout=CLOSE_SECONDS)
         self._ray.shutdown()
-
-
-def _knock(address: str) -> None:
-    """See if anybody answers at HOST:PORT; Ray itself would wait for minutes.
-
-    Raises:
-        OSError: nobody does.
-    """
-    host, _, port = address.rpartition("//")[2].rpartition(":")
-    if host and port.isdecimal():
-        socket.create_connection((host, int(port)), _KNOCK_SECONDS).close()

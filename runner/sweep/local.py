@@ -1,4 +1,4 @@
-"""Worker processes of this machine: each does one task after the other, and keeps what it has loaded."""
+"""Worker processes on this machine: each does one task after the other, and keeps what it has loaded."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from typing import Any, Final, Protocol, Self
 
 from runner.sweep.task import Result, Task, do
 
-_GOODBYE_SECONDS: Final = 30.0
-"""How long a worker may take to close a recording before it is ended."""
+CLOSE_SECONDS: Final = 30.0
+"""The time that a worker has to close its recording before it is killed."""
 
 
 class Workers(Protocol):
-    """Those who do tasks, here or elsewhere."""
+    """Workers that do tasks, on this machine or on others."""
 
     @property
     def idle(self) -> int:
-        """How many more tasks can be given."""
+        """The number of tasks that can be started now."""
 
     def give(self, task: Task) -> None:
         """Have an idle worker do a task."""
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
-        """Return what is done, waiting so long for it; None for a worker that died, and was replaced."""
+        """Wait up to this time for tasks to end; return them with their results, None if the worker died."""
 
     def stop(self) -> None:
-        """Have every worker close its recording and return its task as interrupted."""
+        """Make every worker close its recording and return its task as interrupted."""
 
 
 class LocalWorkers:
     """Processes, started when they are needed.
 
     Args:
-        count: how many at most.
+        count: the most processes.
     """
 
     def __init__(self, count: int) -> None:
         self._count = count
-        # Fresh interpreters: a fork would take the locks of this one's threads along.
+        # Fresh interpreters: a fork would copy locks that threads of this one hold.
         self._context = multiprocessing.get_context("spawn")
         self._stopping = self._context.Event()
         self._idle: list[_Worker] = []
@@ -50,7 +50,7 @@ class LocalWorkers:
 
     @property
     def idle(self) -> int:
-        """How many more tasks can be given."""
+        """The number of tasks that can be started now."""
         return self._count - len(self._busy)
 
     def give(self, task: Task) -> None:
@@ -63,11 +63,11 @@ class LocalWorkers:
             worker.end()
         else:
             worker = _Worker(self._context, self._stopping)
-            worker.ask(here)  # `collect` finds out if it is gone already
+            worker.ask(here)  # `collect` notices if it is dead already
         self._busy[worker.pipe] = worker, task
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
-        """Return what is done, waiting so long for it; None for a worker that died, and was replaced."""
+        """Wait up to this time for tasks to end; return them with their results, None if the worker died."""
         done: list[tuple[Task, Result | None]] = []
         for pipe in connection.wait(list(self._busy), seconds) if self._busy else ():
             worker, task = self._busy.pop(pipe)
@@ -78,7 +78,7 @@ class LocalWorkers:
         return done
 
     def stop(self) -> None:
-        """Have every worker close its recording and return its task as interrupted."""
+        """Make every worker close its recording and return its task as interrupted."""
         self._stopping.set()
 
     def __enter__(self) -> Self:
@@ -91,7 +91,7 @@ class LocalWorkers:
 
 
 class _Worker:
-    """One process, and the pipe to it."""
+    """A process and the pipe to it."""
 
     def __init__(self, context: Any, stopping: Any) -> None:
         self.pipe, theirs = context.Pipe()
@@ -102,7 +102,7 @@ class _Worker:
         theirs.close()
 
     def ask(self, task: Task) -> bool:
-        """Send a task; return False if the process is gone."""
+        """Send a task; return False if the process is dead."""
         try:
             self.pipe.send(task)
         except OSError:
@@ -110,7 +110,7 @@ class _Worker:
         return True
 
     def answer(self) -> Result | None:
-        """Return what came of the task; None if the process died over it."""
+        """Return the result of the task; None if the process died."""
         try:
             result: Result = self.pipe.recv()
         except (EOFError, OSError):
@@ -119,16 +119,16 @@ class _Worker:
         return result
 
     def end(self) -> None:
-        """Let the process go, or end it if it does not."""
+        """End the process, by force if it does not end by itself."""
         self.pipe.close()
-        self._process.join(_GOODBYE_SECONDS)
+        self._process.join(CLOSE_SECONDS)
         if self._process.is_alive():
             self._process.kill()
             self._process.join()
 
 
 def serve(pipe: Any, stopping: Any) -> None:
-    """Do the tasks that come through a pipe, until it is closed; a worker's main function."""
+    """Do the tasks that come through a pipe until it is closed; the main function of a worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal
     parent = os.getppid()
     with contextlib.suppress(EOFError, OSError):

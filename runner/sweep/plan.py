@@ -1,4 +1,4 @@
-"""What a sweep is going to take, found out by a run of one episode; and where it must stop."""
+"""The runs and the disk that a sweep will take, measured by a run of one episode; and its limits."""
 
 from __future__ import annotations
 
@@ -17,64 +17,65 @@ from runner.execution.session import run_job
 from runner.recording.reader import open_recording
 from runner.runs.run import create_run
 from runner.sweep.model import Limits, Sweep
-from runner.sweep.readings import curve_of
+from runner.sweep.objective import curve_of
+from runner.sweep.running import Limit, SweepStatus
 from runner.sweep.search import Search
 from runner.sweep.task import Task
-from runner.sweep.trials import Room, SweepStatus
 from runner.util.humanize import size
 
-BYTES_AN_EPISODE: Final = 40
-BYTES_AN_EVALUATION: Final = 1500
-TABLE_SHARE: Final = 0.75
-"""What a learned table keeps of its bytes when it is compressed."""
+BYTES_PER_EPISODE: Final = 40
+BYTES_PER_EVALUATION: Final = 1500
+COMPRESSED_SHARE: Final = 0.75
+"""Size of a compressed table as a share of its bytes."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done."""
+    """What a sweep will take."""
 
     trials: int
     runs: int
     bytes_a_run: int
-    """About; recordings grow with what is learned."""
+    """An estimate: recordings grow with what is learned."""
     excluded: int = 0
-    """Points of a grid that are left out: their values do not go together."""
+    """Points of a grid without runs, because their values contradict each other."""
 
     @property
     def bytes(self) -> int:
-        """Of all runs together, about."""
+        """The estimate for all runs together."""
         return self.runs * self.bytes_a_run
 
 
 def plan_of(sweep: Sweep) -> Plan:
-    """Return what a sweep is going to take, tried out by its first trial with one episode.
+    """Return what a sweep will take, measured by its first trial with one episode.
 
     Raises:
         RunnerError: the environment cannot be used, or the objective is not recorded.
     """
     search = Search(sweep.file)
-    suggested = search.ask(search.trials if sweep.file.strategy == "grid" else sweep.file.batch)
+    is_grid = sweep.file.strategy == "grid"
     configs: list[ExperimentConfig] = []
-    problems: list[ConfigError] = []
-    for values in suggested:
+    errors: list[ConfigError] = []
+    for values in search.ask(search.trials if is_grid else sweep.file.batch):
         try:
             configs.append(sweep.config(values))
         except ConfigError as error:
-            problems.append(error)
+            errors.append(error)
     if not configs:
-        raise problems[0]
-    mdp = load_mdp(configs[0].env.id, configs[0].env.kwargs, configs[0].rewards)
-    bytes_a_run = _try_out(configs[0], mdp, sweep.objective.metric) + _growth(configs[0], mdp)
-    excluded = len(problems) if sweep.file.strategy == "grid" else 0
+        raise errors[0]
+    config = configs[0]
+    mdp = load_mdp(config.env.id, config.env.kwargs, config.rewards)
+    bytes_a_run = _measured_bytes(config, mdp, sweep.objective.metric) + _estimated_bytes(config, mdp)
+    excluded = len(errors) if is_grid else 0
     trials = search.trials - excluded
     return Plan(trials, trials * len(sweep.seeds), bytes_a_run, excluded)
 
 
-def _try_out(config: ExperimentConfig, mdp: Mdp, metric: str) -> int:
-    """Return the bytes of a run of one episode, after its readings were looked at."""
+def _measured_bytes(config: ExperimentConfig, mdp: Mdp, metric: str) -> int:
+    """Return the bytes of a run of one episode, which must have readings of the metric."""
     values = config.to_mapping()
     if config.evaluation is not None:
-        values["evaluation"] = values["evaluation"] | {"every": 1, "trials": 1}
+        values["evaluation"] |= {"every": 1, "trials": 1}
     short = from_mapping(values, ["episodes=1"])
     with tempfile.TemporaryDirectory() as folder:
         run = create_run(Path(folder), short, short.seeds[0])
@@ -84,30 +85,30 @@ def _try_out(config: ExperimentConfig, mdp: Mdp, metric: str) -> int:
             return recording.size
 
 
-def _growth(config: ExperimentConfig, mdp: Mdp) -> int:
-    """Return about how many bytes all that one episode does not show will take."""
+def _estimated_bytes(config: ExperimentConfig, mdp: Mdp) -> int:
+    """Return an estimate of the bytes that one episode does not show."""
     counts = (mdp.joint_actions,) if config.tables == "joint" else mdp.action_counts
     table = mdp.states * sum(counts) * 8
     one = estimate(config, mdp.step_limit)
     trials = one.evaluations * (config.evaluation.trials if config.evaluation else 0)
     return round(
-        one.snapshots * table * TABLE_SHARE
-        + (config.episodes + trials) * BYTES_AN_EPISODE
-        + one.evaluations * BYTES_AN_EVALUATION
+        one.snapshots * table * COMPRESSED_SHARE
+        + (config.episodes + trials) * BYTES_PER_EPISODE
+        + one.evaluations * BYTES_PER_EVALUATION
         + (one.typical_bytes if config.recording.steps == "all" else 0)
     )
 
 
 def require_disk(plan: Plan, done: int, recordings: Path) -> None:
-    """Refuse a sweep that the disk would not hold.
+    """Refuse a sweep that does not fit on the disk.
 
     Args:
-        plan: what it takes.
-        done: runs that are there already.
-        recordings: the folder they go to.
+        plan: what it will take.
+        done: the number of its runs that exist already.
+        recordings: the folder of its runs.
 
     Raises:
-        StorageError: there is too little.
+        StorageError: there is too little space.
     """
     needed, free = max(0, plan.runs - done) * plan.bytes_a_run, free_bytes(recordings)
     if needed > free:
@@ -117,29 +118,29 @@ def require_disk(plan: Plan, done: int, recordings: Path) -> None:
         )
 
 
-def room(limits: Limits, plan: Plan, recordings: Path, before: int) -> Room:
-    """Return what says why a task may not be begun.
+def limit_of(limits: Limits, plan: Plan, recordings: Path, before: int) -> Limit:
+    """Return the function that says why a task may not be started.
 
     Args:
-        limits: the sweep's.
-        plan: what a run takes.
-        recordings: where to.
-        before: the sweep's runs that there were.
+        limits: the limits of the sweep.
+        plan: what a run will take.
+        recordings: the folder of the runs.
+        before: the number of runs of the sweep that existed before.
     """
 
     def reason(status: SweepStatus, task: Task) -> str:
         runs = before + status.begun - status.resumed
-        under_way = (status.running + 1) * plan.bytes_a_run
+        in_progress = (status.running + 1) * plan.bytes_a_run
         if limits.runs is not None and not task.run_id and runs >= limits.runs:
-            return f"limits.runs: {limits.runs:,} runs were begun"
+            return f"limits.runs: {limits.runs:,} runs were started"
         if limits.seconds is not None and status.seconds >= limits.seconds:
             return f"limits.seconds: {limits.seconds:g} s are over"
-        if limits.disk is not None and status.bytes + under_way > limits.disk:
+        if limits.disk is not None and status.bytes + in_progress > limits.disk:
             return (
                 f"limits.disk: {size(status.bytes)} of {size(limits.disk)} are used, and a run needs about "
                 f"{size(plan.bytes_a_run)}"
             )
-        if free_bytes(recordings) < under_way:
+        if free_bytes(recordings) < in_progress:
             return f"the disk of {recordings} is full: a run needs about {size(plan.bytes_a_run)}"
         return ""
 

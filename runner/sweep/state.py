@@ -1,7 +1,7 @@
-"""A sweep on disk: the file as it was resolved, beside the runs. What has been done, the runs themselves say.
+"""A sweep on disk: its resolved file next to the runs; what has been done follows from the runs themselves.
 
-recordings/.sweeps/NAME/sweep.yaml   the sweep, its base spelled out
-recordings/k3v9m2xq/labels.json      a run of it: the tag sweep=NAME
+recordings/.sweeps/NAME/sweep.yaml   the sweep, with the whole base
+recordings/k3v9m2xq/labels.json      one of its runs: it has the tag sweep=NAME
 """
 
 from __future__ import annotations
@@ -15,121 +15,111 @@ from runner.config.document import read_yaml, write_yaml
 from runner.config.job import identity_of
 from runner.config.loading import read_text
 from runner.errors import ConfigError, RunnerError, nearest
+from runner.execution.resume import require_same_makers
 from runner.runs.locking import acquired
 from runner.runs.run import Run, list_runs
+from runner.sweep import FILE, folder_of, sweeps_in, tag_of
 from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep
-from runner.sweep.names import FILE, folder_of, sweeps_in, tag_of
 from runner.util.files import read_object, replacing, storage_errors, write_object
 from runner.util.values import flatten
 
 FAILED: Final = "failed.json"
 MAX_FAILED_BYTES: Final = 8 << 20
 LOCK: Final = "owner.lock"
-FREE: Final = ("limits",)
-"""What may change when a sweep is gone on with: what is done follows from the rest."""
-TOLD_ANYWAY: Final = ("base.name", "base.seeds")
-"""What the base has from the sweep, where it is told."""
-
+_IGNORED: Final = ("limits", "base.name", "base.seeds")
+"""Ignored differences: limits may change, and the base has its name and seeds from the sweep."""
 PRUNED: Final = "pruned"
-"""The tag of a run that was given up."""
+"""The tag of a pruned run."""
 
 
 class SweepBusy(RunnerError):
-    """Another process is doing the sweep."""
+    """Another process is running the sweep."""
 
 
 def read_sweep(name: str, recordings: Path) -> Sweep:
-    """Return a sweep as it was begun.
+    """Return a sweep as it was started.
 
     Raises:
-        RunnerError: there is none of this name, or its file was damaged.
+        RunnerError: there is none of this name, or its file is damaged.
     """
-    known = sweeps_in(recordings)
-    if name not in known:
-        listed = f" There are {', '.join(known)}." if known else " `dualtaxi sweep run FILE` starts one."
-        raise RunnerError(f"no sweep {name!r} in {recordings}.{nearest(name, known) or listed}")
+    names = sweeps_in(recordings)
+    if name not in names:
+        listed = f" There are {', '.join(names)}." if names else " `dualtaxi sweep run FILE` starts one."
+        raise RunnerError(f"no sweep {name!r} in {recordings}.{nearest(name, names) or listed}")
     path = folder_of(name, recordings) / FILE
     try:
-        # What a sweep suggests follows from its file; one that was begun before `repeats` existed has none.
+        # Suggestions depend on the file; one from before `repeats` existed does not have it.
         return from_values({"repeats": True} | read_yaml(read_text(path), str(path)).value)
     except (ConfigError, TypeError, ValueError) as error:
-        raise RunnerError(f"{path}: is no sweep any more: {error}") from error
+        raise RunnerError(f"{path}: no longer describes a sweep: {error}") from error
 
 
 def begin(sweep: Sweep, recordings: Path, resume: bool, accept_changes: bool) -> None:
-    """Write a sweep down, or find it as it was begun.
+    """Write a sweep to disk, or check that it is the one on disk.
 
     Args:
-        sweep: what is to be done.
+        sweep: the sweep to run.
         recordings: the folder of its runs.
-        resume: whether it may be there already.
-        accept_changes: whether it may have been another then, or begun by other code.
+        resume: whether it may exist already.
+        accept_changes: whether the existing one may differ, or have been started by other code.
 
     Raises:
-        RunnerError: there is one of this name already, it was another, or other code began a run of it
-            that is not over.
+        RunnerError: a sweep of this name exists or differs, or other code started one of its unfinished runs.
         StorageError: the folder cannot be written.
     """
     require_startable(sweep, recordings, resume, accept_changes)
-    _write(folder_of(sweep.name, recordings), write_yaml(sweep.to_mapping()))
+    folder = folder_of(sweep.name, recordings)
+    with storage_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(folder / FILE) as fresh:
+            fresh.write_text(write_yaml(sweep.to_mapping()), encoding="utf-8")
 
 
 def require_startable(sweep: Sweep, recordings: Path, resume: bool, accept_changes: bool) -> None:
-    """Refuse what `begin` would refuse, and write nothing.
-
-    Raises:
-        RunnerError: there is one of this name already, it was another, or other code began a run of it
-            that is not over.
-    """
-    there = sweep.name in sweeps_in(recordings)
-    if there and not resume:
+    """Raise the `RunnerError` that `begin` would raise, and write nothing."""
+    exists = sweep.name in sweeps_in(recordings)
+    if exists and not resume:
         raise RunnerError(
-            f"a sweep {sweep.name!r} is in {recordings} already: --resume goes on with it, --name calls this "
-            "one otherwise."
+            f"a sweep {sweep.name!r} exists in {recordings}: --resume continues it, --name gives this one "
+            "another name."
         )
-    if there and not accept_changes:
+    if exists and not accept_changes:
         changed = differences(read_sweep(sweep.name, recordings).to_mapping(), sweep.to_mapping())
         if changed:
             raise RunnerError(
-                f"the sweep {sweep.name!r} was begun with something else:\n"
+                f"the sweep {sweep.name!r} was started with other settings:\n"
                 + "\n".join(f"  {key}: {before}, now {now}" for key, before, now in changed)
-                + "\n--accept-changes goes on all the same, and runs that still belong to it count; "
-                "--name begins another."
+                + "\n--accept-changes continues it nevertheless and keeps the runs that still belong to it; "
+                "--name starts another."
             )
-        _require_same_makers(sweep.name, recordings)
-
-
-def _require_same_makers(name: str, recordings: Path) -> None:
-    """Refuse runs that cannot be gone on with as they are: without them a search would go elsewhere."""
-    from runner.execution.resume import require_same_makers
-
-    failed = failures_of(name, recordings)
-    for identity, run in runs_of(name, recordings).items():
-        if not is_over(run) and identity not in failed:
-            require_same_makers(run)
+        # Runs that cannot be resumed as they are would send the search another way.
+        failed = failures_of(sweep.name, recordings)
+        for identity, run in runs_of(sweep.name, recordings).items():
+            if not is_over(run) and identity not in failed:
+                require_same_makers(run)
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Return what differs between two sweeps: path, value before, value now."""
-    ours, theirs = (flatten({k: v for k, v in each.items() if k not in FREE}) for each in (before, now))
-    missing = "nothing"
+    ours, theirs = flatten(before), flatten(now)
     return [
-        (key, str(ours.get(key, missing)), str(theirs.get(key, missing)))
+        (key, str(ours.get(key, "nothing")), str(theirs.get(key, "nothing")))
         for key in dict.fromkeys([*ours, *theirs])
-        if ours.get(key, missing) != theirs.get(key, missing) and key not in TOLD_ANYWAY
+        if ours.get(key, "nothing") != theirs.get(key, "nothing")
+        and not f"{key}.".startswith(tuple(f"{ignored}." for ignored in _IGNORED))
     ]
 
 
 @contextlib.contextmanager
-def held(name: str, recordings: Path) -> Iterator[None]:
-    """Keep every other process from doing this sweep meanwhile.
+def locked(name: str, recordings: Path) -> Iterator[None]:
+    """Keep every other process from running this sweep.
 
     Raises:
-        SweepBusy: one does.
+        SweepBusy: another one is running it.
         StorageError: the folder cannot be written.
     """
-    busy = SweepBusy(f"the sweep {name!r} is being done by another process; let it.")
+    busy = SweepBusy(f"the sweep {name!r} is being run by another process; try again when that has finished.")
     lock = acquired(folder_of(name, recordings) / LOCK, busy)
     try:
         yield
@@ -138,32 +128,32 @@ def held(name: str, recordings: Path) -> Iterator[None]:
 
 
 def is_over(run: Run) -> bool:
-    """Return whether there is nothing left to do for a run of a sweep; it may be archived."""
+    """Return whether a run of a sweep is finished or pruned; it may be archived."""
     return run.file.status == "finished" or PRUNED in run.tags
 
 
 def runs_of(name: str, recordings: Path) -> dict[str, Run]:
-    """Return the runs of a sweep by the identity of their job: where there are two, the one that is over."""
-    found: dict[str, Run] = {}
+    """Return the runs of a sweep by the identity of their job; of two, the one that is over."""
+    runs: dict[str, Run] = {}
     for run in list_runs(recordings):
         if tag_of(name) in run.tags:
             identity = identity_of(run.file.config, run.seed)
-            if identity not in found or (is_over(run) and not is_over(found[identity])):
-                found[identity] = run
-    return found
+            if identity not in runs or (is_over(run) and not is_over(runs[identity])):
+                runs[identity] = run
+    return runs
 
 
 def failures_of(name: str, recordings: Path) -> dict[str, str]:
-    """Return why jobs of a sweep failed, by identity; what cannot be understood counts as not failed."""
+    """Return the errors of a sweep's failed jobs by identity; a damaged list counts as empty."""
     try:
-        found = read_object(folder_of(name, recordings) / FAILED, MAX_FAILED_BYTES)
+        errors = read_object(folder_of(name, recordings) / FAILED, MAX_FAILED_BYTES)
     except (OSError, ValueError):
         return {}
-    return {identity: error for identity, error in found.items() if isinstance(error, str)}
+    return {identity: error for identity, error in errors.items() if isinstance(error, str)}
 
 
-def note_failures(name: str, recordings: Path, failures: dict[str, str]) -> None:
-    """Write down why jobs of a sweep failed.
+def write_failures(name: str, recordings: Path, failures: Mapping[str, str]) -> None:
+    """Store the errors of a sweep's failed jobs.
 
     Raises:
         StorageError: the folder cannot be written.
@@ -174,12 +164,5 @@ def note_failures(name: str, recordings: Path, failures: dict[str, str]) -> None
 
 
 def forget_failures(name: str, recordings: Path) -> None:
-    """Have the jobs of a sweep that failed tried again."""
+    """Let the failed jobs of a sweep be tried again."""
     (folder_of(name, recordings) / FAILED).unlink(missing_ok=True)
-
-
-def _write(folder: Path, text: str) -> None:
-    with storage_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing(folder / FILE) as fresh:
-            fresh.write_text(text, encoding="utf-8")

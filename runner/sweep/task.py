@@ -1,4 +1,4 @@
-"""One run of a sweep, as a worker does it: begun, gone on with, or only read when it is finished."""
+"""One run of a sweep, as a worker does it: started, resumed, or only read if it is over."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.runs.run import Run, create_run, list_runs, unless_empty
 from runner.sweep.model import Objective
-from runner.sweep.readings import Curve, curve_of, readings, should_prune
+from runner.sweep.objective import Curve, curve_of, readings, should_prune
 from runner.sweep.state import PRUNED, is_over
+from runner.util.files import storage_errors
 
 
 @dataclass(frozen=True)
 class Task:
-    """A run that is wanted: a trial's configuration with a seed."""
+    """A run to do: a trial's configuration with a seed."""
 
     identity: str
-    """Of its job."""
+    """The identity of its job."""
     seed: int
     config: dict[str, Any]
     name: str
@@ -42,20 +43,20 @@ class Task:
     recordings: str
     objective: Objective
     bounds: Mapping[int, float] = field(default_factory=dict)
-    """By episode what a run must reach, or be given up."""
+    """By episode, the bound that a run must reach or be pruned."""
     run_id: str = ""
-    """The run that there is already; empty if it is to be begun."""
+    """The existing run to resume; empty to start a new one."""
     accept_changes: bool = False
-    """Whether to go on with a run that other code began."""
+    """Whether to resume a run that other code started."""
     elsewhere: bool = False
-    """Whether to record on the worker's own disk, and to move the run when it is whole."""
+    """Whether to record on the worker's own disk, and to move the run when it is complete."""
     threads: bool = True
-    """Whether the worker has more than one processor, so that recording may go on beside learning."""
+    """Whether the worker has more than one processor, so that recording can run in parallel to learning."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What came of a task."""
+    """The result of a task."""
 
     status: Literal["finished", "pruned", "interrupted", "failed"]
     run_id: str = ""
@@ -63,20 +64,20 @@ class Result:
     digest: str = ""
     bytes: int = 0
     seconds: float = 0.0
-    """What learning and recording took; of a run that was only read, when it was made."""
+    """The time that learning and recording took, also of a run that was only read."""
     error: str = ""
 
 
 def do(task: Task, stop: Callable[[], bool]) -> Result:
-    """Do a task; what a user can mend comes back as a failed result.
+    """Do a task; errors that a user can fix become a failed result.
 
     Args:
-        task: what to do.
-        stop: asked every few milliseconds whether to stop; the run is then interrupted, its recording kept.
+        task: the run to do.
+        stop: called every few milliseconds; once it returns True, the run is interrupted.
     """
-    if task.elsewhere:
-        return _do_elsewhere(task, stop)
     try:
+        if task.elsewhere:
+            return _do_elsewhere(task, stop)
         run = _run(task, stop)
         return result_of(run, task.objective) if is_over(run) else Result("interrupted", run.run_id)
     except RunnerError as error:
@@ -84,28 +85,23 @@ def do(task: Task, stop: Callable[[], bool]) -> Result:
 
 
 def _do_elsewhere(task: Task, stop: Callable[[], bool]) -> Result:
-    """Do a task in a folder of this machine's own; then move what was recorded where it belongs."""
+    """Do a task in a temporary folder of this machine; then move its run into the recordings."""
     recordings = Path(task.recordings)
-    try:
-        with tempfile.TemporaryDirectory(prefix="dualtaxi-sweep-") as folder:
-            own = Path(folder)
-            if task.run_id:
-                shutil.copytree(recordings / task.run_id, own / task.run_id)
-            result = do(replace(task, recordings=folder, elsewhere=False), stop)
-            for run in list_runs(own):
-                move_whole(run.folder, recordings)
-    except OSError as error:
-        return Result(
-            "failed", task.run_id, error=f"{recordings}: cannot be written ({error.strerror or error})."
-        )
+    with storage_errors(recordings), tempfile.TemporaryDirectory(prefix="dualtaxi-sweep-") as folder:
+        own = Path(folder)
+        if task.run_id:
+            shutil.copytree(recordings / task.run_id, own / task.run_id)
+        result = do(replace(task, recordings=folder, elsewhere=False), stop)
+        for run in list_runs(own):
+            move_whole(run.folder, recordings)
     return result
 
 
 def move_whole(run: Path, recordings: Path) -> None:
-    """Put a run's folder among the recordings, in the place of the same one if it is there.
+    """Copy a run's folder into the recordings, where it replaces an older copy at once.
 
     Raises:
-        OSError: that cannot be; the one that was there stays.
+        OSError: it cannot be copied; the older copy stays.
     """
     place, mark = recordings / run.name, secrets.token_hex(4)
     fresh, old = (recordings / f".{run.name}.{mark}.{kind}" for kind in ("fresh", "old"))
@@ -125,7 +121,7 @@ def move_whole(run: Path, recordings: Path) -> None:
 
 
 def result_of(run: Run, objective: Objective) -> Result:
-    """Return what came of a run that is finished, or was given up.
+    """Return the result of a finished or pruned run.
 
     Raises:
         RunnerError: its recording cannot be read, or the objective was never recorded.
@@ -135,11 +131,10 @@ def result_of(run: Run, objective: Objective) -> Result:
         facts = path.stat()
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
-    curve = dict(_curve_of(path, facts.st_size, facts.st_mtime_ns, objective.metric))
     return Result(
         "pruned" if PRUNED in run.tags else "finished",
         run.run_id,
-        curve,
+        dict(_curve_of(path, facts.st_size, facts.st_mtime_ns, objective.metric)),
         run.summary.content_digest or "",
         facts.st_size,
         run.summary.seconds or 0.0,
@@ -148,70 +143,64 @@ def result_of(run: Run, objective: Objective) -> Result:
 
 @lru_cache(maxsize=4096)
 def _curve_of(path: Path, size: int, modified: int, metric: str) -> Curve:  # noqa: ARG001
-    """Return the readings of a recording; size and time tell its states apart."""
+    """Return the readings of a recording; its size and time are in the key of the cache."""
     with open_recording(path) as recording:
         return curve_of(recording, metric)
 
 
 def _run(task: Task, stop: Callable[[], bool]) -> Run:
-    if task.run_id:
-        run = find_run(task.run_id, Path(task.recordings))
-        if is_over(run):
-            return run
-        watch = _Pruning(task, _mdp_of(task), stop)
-        return watch.labelled(resume(run, task.accept_changes, watch.report, watch.stop))
-    job = Job(from_mapping(task.config), task.seed)
-    mdp = _mdp_of(task)
-    watch = _Pruning(task, mdp, stop)
-    run = create_run(Path(task.recordings), job.config, task.seed, task.name)
-    with unless_empty(run):
-        change_labels(run.folder, lambda _: Labels(tags=tuple(sorted(task.tags))))
-        return watch.labelled(run_job(job, run, watch.report, watch.stop, mdp=mdp, threads=task.threads))
+    recordings = Path(task.recordings)
+    run = find_run(task.run_id, recordings) if task.run_id else None
+    if run is not None and is_over(run):
+        return run
+    env = task.config["env"]
+    mdp = _load_mdp(env["id"], json.dumps(env["kwargs"], sort_keys=True), task.config["rewards"])
+    pruner = _Pruner(task, mdp, stop)
+    if run is not None:
+        run = resume(run, task.accept_changes, pruner.report, pruner.stop)
+    else:
+        job = Job(from_mapping(task.config), task.seed)
+        run = create_run(recordings, job.config, task.seed, task.name)
+        with unless_empty(run):
+            change_labels(run.folder, lambda _: Labels(tags=tuple(sorted(task.tags))))
+            run = run_job(job, run, pruner.report, pruner.stop, mdp=mdp, threads=task.threads)
+    if pruner.is_pruned and run.status != "finished":
+        change_labels(run.folder, lambda now: Labels(now.name, (*now.tags, PRUNED), now.note))
+        return Run(run.folder, run.facts)
+    return run
 
 
-class _Pruning:
-    """Gives a run up when it is hopeless."""
+@lru_cache(maxsize=4)
+def _load_mdp(env_id: str, kwargs: str, rewards: str) -> Mdp:
+    """Return an environment, which a worker loads once."""
+    return load_mdp(env_id, json.loads(kwargs), rewards)
+
+
+class _Pruner:
+    """Stops a run once it falls behind the bounds of its task."""
 
     def __init__(self, task: Task, mdp: Mdp, stop: Callable[[], bool]) -> None:
-        self._task = task
-        self._stop = stop
+        self._task, self._stop = task, stop
         joint = task.config["tables"] == "joint" and len(mdp.agents) > 1
         self._agents = ("agency",) if joint else mdp.agents
         self._events = mdp.event_names
         self._curve: Curve = {}
         self._seen = 0
-        self._is_pruned = False
+        self.is_pruned = False
 
     def report(self, progress: Progress) -> None:
-        """Look at the evaluations that are new."""
+        """Look at the new evaluations."""
         if not self._task.bounds:
             return
+        objective = self._task.objective
         for metrics in progress.evaluations[self._seen :]:
             read = readings(metrics, metrics.get("optimality"), self._agents, self._events)
-            if self._task.objective.metric in read:
-                self._curve[metrics["episode"]] = read[self._task.objective.metric]
+            if objective.metric in read:
+                self._curve[metrics["episode"]] = read[objective.metric]
         self._seen = len(progress.evaluations)
-        done = progress.episode >= progress.episodes
-        self._is_pruned = not done and should_prune(self._task.objective, self._curve, self._task.bounds)
+        is_done = progress.episode >= progress.episodes
+        self.is_pruned = not is_done and should_prune(objective, self._curve, self._task.bounds)
 
     def stop(self) -> bool:
-        """Return whether the run is to stop."""
-        return self._is_pruned or self._stop()
-
-    def labelled(self, run: Run) -> Run:
-        """Return a run, tagged if it was given up."""
-        if not self._is_pruned or run.status == "finished":
-            return run
-        change_labels(run.folder, lambda said: Labels(said.name, (*said.tags, PRUNED), said.note))
-        return Run(run.folder, run.facts)
-
-
-def _mdp_of(task: Task) -> Mdp:
-    env = task.config["env"]
-    return _mdp(env["id"], json.dumps(env["kwargs"], sort_keys=True), task.config["rewards"])
-
-
-@lru_cache(maxsize=4)
-def _mdp(env_id: str, kwargs: str, rewards: str) -> Mdp:
-    """Return an environment; a worker loads it once."""
-    return load_mdp(env_id, json.loads(kwargs), rewards)
+        """Return whether the run must stop."""
+        return self.is_pruned or self._stop()

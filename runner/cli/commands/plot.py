@@ -51,7 +51,7 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
     from runner.export.plots.metrics import panels_of
     from runner.recording.reader import open_recording
     from runner.runs.run import recordings_folder
-    from runner.sweep.names import is_sweep
+    from runner.sweep import is_sweep
 
     check_suffix(output)
     folder = recordings_folder(recordings)

@@ -69,7 +69,7 @@ def command(
     from runner.export.places import write_new
     from runner.export.reports.report import require_packages, write_report
     from runner.runs.run import recordings_folder
-    from runner.sweep.names import is_sweep
+    from runner.sweep import is_sweep
 
     require_packages()
     folder = recordings_folder(recordings)

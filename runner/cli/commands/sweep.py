@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from runner.sweep.local import Workers
     from runner.sweep.model import Sweep
     from runner.sweep.plan import Plan
-    from runner.sweep.trials import SweepStatus, Trials
+    from runner.sweep.running import SweepStatus
+    from runner.sweep.trials import Trials
 
 
 @click.group("sweep", cls=Group)
@@ -91,9 +92,9 @@ def run(
     from runner.runs.run import recordings_folder
     from runner.sweep import state
     from runner.sweep.loading import load_sweep
-    from runner.sweep.plan import plan_of, require_disk, room
+    from runner.sweep.plan import limit_of, plan_of, require_disk
+    from runner.sweep.running import run_sweep
     from runner.sweep.search import require_optuna
-    from runner.sweep.trials import run_sweep
     from runner.util.values import checked_name
 
     require_optuna()
@@ -103,7 +104,7 @@ def run(
     if dry_run:
         _tell_plan(sweep, plan, as_json)
         return
-    with state.held(sweep.name, folder):
+    with state.locked(sweep.name, folder):
         state.require_startable(sweep, folder, resuming, accept_changes)
         before = len(state.runs_of(sweep.name, folder))
         require_disk(plan, before, folder)
@@ -122,7 +123,7 @@ def run(
                 those,
                 stop=interrupt,
                 report=report,
-                room=room(sweep.file.limits, plan, folder, before),
+                limit=limit_of(sweep.file.limits, plan, folder, before),
                 accept_changes=accept_changes,
             )
     _tell(sweep, trials, status, as_json)
@@ -212,7 +213,7 @@ def ls(recordings: Path | None, as_json: bool) -> None:
       dualtaxi sweep ls
     """  # noqa: D301 - Click wants the backspace itself
     from runner.runs.run import recordings_folder
-    from runner.sweep.names import sweeps_in
+    from runner.sweep import sweeps_in
 
     names = sweeps_in(recordings_folder(recordings))
     if as_json:
@@ -334,7 +335,7 @@ def _tell(sweep: Sweep, trials: Trials, status: SweepStatus, as_json: bool) -> N
         if best is not None:
             told["best"] = f"{reading(best.value)} in trial {best.number}: {words(best.values)}"
         draw(facts(told | {"next": f"dualtaxi sweep show {sweep.name}"}))
-    for trial in trials.told:
+    for trial in trials.done:
         for error in trial.errors if trial.state == "failed" else ():
             say(f"Failed: trial {trial.number}, {error}")
     if status.stopped:

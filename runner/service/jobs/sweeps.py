@@ -20,7 +20,7 @@ from runner.service.jobs.worker import (
 if TYPE_CHECKING:
     from runner.sweep.local import Workers
     from runner.sweep.task import Result, Task
-    from runner.sweep.trials import SweepStatus
+    from runner.sweep.running import SweepStatus
 
 
 def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
@@ -31,9 +31,9 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
     """
     from runner.sweep import state
     from runner.sweep.loading import from_values
-    from runner.sweep.names import sweeps_in
-    from runner.sweep.plan import plan_of, require_disk, room
-    from runner.sweep.trials import INTERRUPTED, run_sweep
+    from runner.sweep import sweeps_in
+    from runner.sweep.plan import limit_of, plan_of, require_disk
+    from runner.sweep.running import INTERRUPTED, run_sweep
 
     sweep = from_values(spec.values)
     with _locked_sweep(spec, channel.stop):
@@ -53,7 +53,7 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
                 workers,
                 stop=channel.stop,
                 report=reporter.report,
-                room=room(sweep.file.limits, plan, spec.recordings, before),
+                limit=limit_of(sweep.file.limits, plan, spec.recordings, before),
                 accept_changes=spec.accept_changes,
             )
         reporter.send(status)
@@ -79,7 +79,7 @@ def _locked_sweep(spec: JobSpec, stop: Callable[[], bool]) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         while True:
             try:
-                stack.enter_context(state.held(spec.name, spec.recordings))
+                stack.enter_context(state.locked(spec.name, spec.recordings))
                 break
             except state.SweepBusy:
                 if time.monotonic() > deadline or stop():

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from runner.config import ExperimentConfig
     from runner.execution.session import Progress
+    from runner.sweep.cluster import RayActor
 
 REPORT_SECONDS: Final = 0.25
 OTHER_OWNER_SECONDS: Final = 60.0
@@ -248,12 +249,12 @@ def run_seed_on_ray(
     Raises:
         RunnerError: the cluster cannot be reached, the run fails, or the actor dies.
     """
-    from runner.sweep.cluster import connect
+    from runner.sweep.cluster import connect, start_actor
 
     ray = connect(spec.ray)
     try:
-        actor = ray.remote(RayWorker).options(num_cpus=1, max_concurrency=3, max_restarts=0).remote()
-        result = actor.run.remote(spec, config.to_mapping(), seed, number)
+        actor = start_actor(ray)
+        result = actor.run.remote(_run_seed_in_actor, spec, config.to_mapping(), seed, number)
         is_over = False
         while not is_over:
             is_over = bool(ray.wait([result], timeout=REPORT_SECONDS)[0])
@@ -271,38 +272,13 @@ def run_seed_on_ray(
     return str(status)
 
 
-class RayWorker:
-    """A Ray actor that runs one seed, and is its channel: it holds messages until they are fetched."""
+def _run_seed_in_actor(
+    actor: RayActor, spec: JobSpec, values: dict[str, Any], seed: int, number: int
+) -> tuple[str, str]:
+    """Run the seed; return the run's status, and the error message if it failed."""
+    from runner.config import from_mapping
 
-    def __init__(self) -> None:
-        self._stopping = threading.Event()
-        self._messages: list[tuple[str, Any]] = []
-        self._lock = threading.Lock()
-
-    def run(self, spec: JobSpec, values: dict[str, Any], seed: int, number: int) -> tuple[str, str]:
-        """Run the seed; return the run's status, and the error message if it failed."""
-        from runner.config import from_mapping
-
-        try:
-            return run_seed(spec, self, from_mapping(values), seed, number), ""
-        except RunnerError as error:
-            return "failed", str(error)
-
-    def send(self, kind: str, data: Any) -> None:
-        """Hold a message of the run."""
-        with self._lock:
-            self._messages.append((kind, data))
-
-    def take_messages(self) -> list[tuple[str, Any]]:
-        """Return the messages since the last call."""
-        with self._lock:
-            messages, self._messages = self._messages, []
-        return messages
-
-    def stop(self) -> bool:
-        """Return whether the run must stop."""
-        return self._stopping.is_set()
-
-    def request_stop(self) -> None:
-        """Stop the run."""
-        self._stopping.set()
+    try:
+        return run_seed(spec, actor, from_mapping(values), seed, number), ""
+    except RunnerError as error:
+        return "failed", str(error)

@@ -24,7 +24,7 @@ from runner.service.pages.problems import message_of
 from runner.service.pages.rendering import page, picture_address, templates
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ALWAYS, ResponseCache
-from runner.sweep.names import folder_of, sweeps_in, tag_of
+from runner.sweep import folder_of, sweeps_in, tag_of
 from runner.sweep.state import read_sweep
 
 router = APIRouter(prefix="/sweeps", include_in_schema=False)

@@ -16,8 +16,9 @@ from runner.runs.run import list_runs
 from runner.service.jobs.store import JobStore
 from runner.sweep import state
 from runner.sweep.loading import from_values
+from runner.sweep.running import run_sweep
 from runner.sweep.task import do
-from runner.sweep.trials import Trials, recorded, run_sweep
+from runner.sweep.trials import Trials, recorded
 
 CONFIG = {
     "name": "quick",

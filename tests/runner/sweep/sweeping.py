@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from runner.sweep import state
+from runner.sweep.running import run_sweep
 from runner.sweep.task import do
-from runner.sweep.trials import run_sweep
 
 BASE = {
     "env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": False}},
@@ -65,5 +65,5 @@ def digests(trials):
     """Return what is compared of trials: values, and the digest of every run."""
     return [
         (t.values, t.state, t.value, {seed: t.results[seed].digest for seed in sorted(t.results)})
-        for t in trials.told
+        for t in trials.done
     ]

@@ -35,7 +35,7 @@ def typed(*words):
 
 def test_each_trial_stands_at_its_values(results, done):
     picture = picture_of(results)
-    by_number = {trial.number: trial for trial in done[1].told}
+    by_number = {trial.number: trial for trial in done[1].done}
     assert picture.trials[0].number == done[1].best().number
     step_size, discount = picture.axes
     for place, choice, value, trial in zip(

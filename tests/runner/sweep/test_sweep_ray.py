@@ -22,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, about its future
 
 def workers_of_ray():
     """Return the processes in which a sweep's tasks are done; idle ones of Ray's are called otherwise."""
-    return [p for p in psutil.Process().children(recursive=True) if "Doer" in " ".join(p.cmdline())]
+    return [p for p in psutil.Process().children(recursive=True) if "RayActor" in " ".join(p.cmdline())]
 
 
 def test_ray_gives_what_local_workers_give_also_when_one_is_killed(tmp_path):

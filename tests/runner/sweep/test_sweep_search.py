@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from sweeping import described
 
+from runner import sweep as names
 from runner.recording.reader import Recording, open_recording
-from runner.sweep import names, state
+from runner.sweep import state
 from runner.sweep.loading import from_values
 from runner.sweep.model import Objective, SweepFile
-from runner.sweep.readings import curve_of, hopeless, value_of
-from runner.sweep.search import Search, bounds
+from runner.sweep.objective import curve_of, pruning_bounds, should_prune, value_of
+from runner.sweep.search import Search
 
 CURVE = {0: 0.0, 100: 40.0, 200: 80.0, 300: 60.0}
 
@@ -96,20 +97,20 @@ def test_a_run_without_readings_is_worth_nothing_known():
 
 def test_a_run_may_be_worse_than_the_share_that_is_said():
     curves = [{100: float(reading)} for reading in range(11)]
-    assert bounds(Objective(), curves, 80.0) == {100: 2.0}
-    assert bounds(Objective(direction="minimize"), curves, 80.0) == {100: 8.0}
+    assert pruning_bounds(Objective(), curves, 80.0) == {100: 2.0}
+    assert pruning_bounds(Objective(direction="minimize"), curves, 80.0) == {100: 8.0}
 
 
 def test_a_run_is_hopeless_when_its_best_is_worse_than_most():
     up = Objective()
-    limit = bounds(up, [CURVE, {0: 0.0, 100: 20.0, 200: 20.0}, {0: 0.0, 100: 60.0, 200: 10.0}], 50.0)
+    limit = pruning_bounds(up, [CURVE, {0: 0.0, 100: 20.0, 200: 20.0}, {0: 0.0, 100: 60.0, 200: 10.0}], 50.0)
     assert limit == {0: 0.0, 100: 40.0, 200: 60.0, 300: 80.0}
-    assert not hopeless(up, {0: 0.0}, limit)
-    assert not hopeless(up, {0: 0.0, 100: 45.0}, limit)
-    assert hopeless(up, {0: 0.0, 100: 45.0, 200: 30.0}, limit)
+    assert not should_prune(up, {0: 0.0}, limit)
+    assert not should_prune(up, {0: 0.0, 100: 45.0}, limit)
+    assert should_prune(up, {0: 0.0, 100: 45.0, 200: 30.0}, limit)
     down = Objective(direction="minimize")
-    assert hopeless(down, {100: 30.0}, {100: 20.0})
-    assert not hopeless(down, {100: 10.0}, {100: 20.0})
+    assert should_prune(down, {100: 30.0}, {100: 20.0})
+    assert not should_prune(down, {100: 10.0}, {100: 20.0})
 
 
 def test_exact_measures_belong_to_their_own_evaluation(done, monkeypatch):

@@ -28,14 +28,14 @@ from runner.sweep.local import LocalWorkers
 from runner.sweep.model import Objective
 from runner.sweep.plan import plan_of
 from runner.sweep.results import ranking, results_of, sections
+from runner.sweep.running import run_sweep
 from runner.sweep.task import Task, move_whole
-from runner.sweep.trials import run_sweep
 
 
 def test_each_run_is_an_ordinary_one_tagged_with_the_sweep(done):
     folder, trials, standing = done
     assert (standing.done, standing.failed, standing.stopped) == (12, 0, "")
-    for trial in trials.told:
+    for trial in trials.done:
         for seed, result in trial.results.items():
             run = find_run(result.run_id, folder)
             assert (run.status, run.name, run.seed) == ("finished", "small", seed)
@@ -44,7 +44,7 @@ def test_each_run_is_an_ordinary_one_tagged_with_the_sweep(done):
 
 def test_a_run_is_what_it_would_be_alone_and_can_be_recorded_again(done, tmp_path):
     folder, trials, _ = done
-    trial = trials.told[3]
+    trial = trials.done[3]
     config = from_mapping(trial.config, ["recording.steps=all"])
     alone = run_job(Job(config, 1), create_run(tmp_path, config, 1))
     assert alone.summary["content_digest"] == trial.results[1].digest
@@ -124,8 +124,8 @@ def test_a_worker_that_dies_twice_is_told_and_the_sweep_goes_on(tmp_path):
     sweep = from_values(described(strategy="random", seeds=[0]))
     trials, standing = swept(tmp_path, sweep, Here(dying={1, 2}))
     assert (standing.done, standing.failed) == (5, 1)
-    assert [trial.state for trial in trials.told] == ["failed", *["finished"] * 5]
-    assert trials.told[0].errors == ["seed 0: its worker died twice"]
+    assert [trial.state for trial in trials.done] == ["failed", *["finished"] * 5]
+    assert trials.done[0].errors == ["seed 0: its worker died twice"]
     again, standing = swept(tmp_path, sweep)
     assert (standing.begun, digests(again)) == (0, digests(trials))
     assert len(results_of(sweep, tmp_path).ranking) == 6
@@ -167,7 +167,7 @@ def test_a_process_that_is_gone_before_its_task_comes_is_replaced(done, monkeypa
 
     monkeypatch.setattr(local._Worker, "ask", ask)
     folder, trials, _ = done
-    said = trials.told[0].results[0]
+    said = trials.done[0].results[0]
     task = Task("", 0, {}, "small", (), str(folder), Objective(metric="mean_length"), run_id=said.run_id)
     with LocalWorkers(1) as workers:
         workers.give(task)
@@ -203,16 +203,16 @@ def test_hopeless_runs_are_given_up_and_stay_so(tmp_path):
     changes = {"trials": 12, "pruning": pruning, "objective": objective, "parameters": parameters}
     sweep = from_values(described(strategy="random", seeds=[0], **changes))
     trials, standing = swept(tmp_path / "a", sweep)
-    given_up = [trial for trial in trials.told if trial.state == "pruned"]
+    given_up = [trial for trial in trials.done if trial.state == "pruned"]
     assert 0 < standing.pruned == len(given_up) < 12
     run = find_run(given_up[0].results[0].run_id, tmp_path / "a")
     assert run.status == "interrupted"
     assert "pruned" in read_labels(run.folder).tags
     with LocalWorkers(2) as workers:
         others, _ = swept(tmp_path / "b", sweep, workers)
-    states = [(trial.values, trial.state, trial.value) for trial in trials.told]
-    assert states == [(trial.values, trial.state, trial.value) for trial in others.told]
-    assert {entry.state for entry in ranking(sweep, trials.told)[-len(given_up) :]} == {"pruned"}
+    states = [(trial.values, trial.state, trial.value) for trial in trials.done]
+    assert states == [(trial.values, trial.state, trial.value) for trial in others.done]
+    assert {entry.state for entry in ranking(sweep, trials.done)[-len(given_up) :]} == {"pruned"}
 
 
 def test_two_trials_that_want_one_job_share_its_run(tmp_path):
@@ -234,8 +234,8 @@ def test_values_that_do_not_go_together_are_left_out(tmp_path):
         described(strategy="grid", trials=None, seeds=[0], base=base, parameters=parameters, objective={})
     )
     trials, standing = swept(tmp_path, sweep)
-    assert [trial.state for trial in trials.told] == ["finished", "finished", "finished", "excluded"]
-    assert "found tables: joint" in trials.told[3].errors[0]
+    assert [trial.state for trial in trials.done] == ["finished", "finished", "finished", "excluded"]
+    assert "found tables: joint" in trials.done[3].errors[0]
     assert (standing.runs, standing.done, standing.failed, standing.excluded) == (3, 3, 0, 1)
     assert plan_of(sweep).excluded == 1
     assert "found tables: joint" in str(sections(results_of(sweep, tmp_path)))
@@ -254,9 +254,9 @@ def test_a_changed_sweep_is_refused_with_what_changed(sweep, tmp_path):
 
 def test_two_of_one_name_and_two_at_once_are_refused(sweep, tmp_path):
     state.begin(sweep, tmp_path, resume=False, accept_changes=False)
-    with pytest.raises(RunnerError, match="--resume goes on with it"):
+    with pytest.raises(RunnerError, match="--resume continues it"):
         state.begin(sweep, tmp_path, resume=False, accept_changes=False)
-    one, other = state.held("small", tmp_path), state.held("small", tmp_path)
+    one, other = state.locked("small", tmp_path), state.locked("small", tmp_path)
     with one, pytest.raises(RunnerError, match="by another process"), other:
         pass
 

@@ -1,7 +1,8 @@
-"""What a run is measured by: any recorded metric, at a moment of its training."""
+"""The objective of a sweep: readings of a metric during a run, the value of the run, and pruning."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,20 +22,20 @@ Curve = dict[int, float]
 
 
 def curve_of(recording: Recording, metric: str) -> Curve:
-    """Return the readings of a metric at the evaluations of a recording; those that are unknown left out.
+    """Return the finite readings of a metric at the evaluations of a recording.
 
     Raises:
         RunnerError: the metric is in none of them.
     """
     agents, events = recording.agents, recording.event_names
     exact = {measures["evaluation"]: measures for measures in recording.optimality()}
-    found = [
+    evaluations = [
         (metrics["episode"], readings(metrics, exact.get(metrics["evaluation"]), agents, events))
         for metrics in recording.metrics("eval")
     ]
-    curve = {episode: read[metric] for episode, read in found if metric in read}
+    curve = {episode: read[metric] for episode, read in evaluations if metric in read}
     if not curve:
-        raise never_recorded(metric, {name for _, read in found for name in read})
+        raise never_recorded(metric, {name for _, read in evaluations for name in read})
     return {episode: reading for episode, reading in curve.items() if math.isfinite(reading)}
 
 
@@ -47,21 +48,21 @@ def readings(
     """Return the readings of an evaluation by name; `mean_return` without an agent if there is but one.
 
     Args:
-        metrics: of the evaluation, as recorded.
-        exact: its exact measures, if they were taken.
+        metrics: the recorded metrics of the evaluation.
+        exact: its exact measures, if there are any.
         agents: the learners.
-        events: the environment's.
+        events: the events of the environment.
     """
     record = evaluation_record(metrics, agents, events)
-    told = evaluation_readings(record) | training_readings(record["training"])
+    by_metric = evaluation_readings(record) | training_readings(record["training"])
     if exact is not None:
-        told |= exact_readings(exact, agents)
+        by_metric |= exact_readings(exact, agents)
     flat = {
         (f"{metric}.{line}" if line else metric): value
-        for metric, lines in told.items()
+        for metric, lines in by_metric.items()
         for line, value in lines.items()
     }
-    alone = {metric: next(iter(lines.values())) for metric, lines in told.items() if len(lines) == 1}
+    alone = {metric: next(iter(lines.values())) for metric, lines in by_metric.items() if len(lines) == 1}
     return flat | alone
 
 
@@ -80,7 +81,7 @@ def never_recorded(metric: str, known: set[str]) -> RunnerError:
 
 
 def value_of(objective: Objective, curve: Curve) -> float:
-    """Return what a run is worth; NEVER for a level that is not reached; nan without a reading."""
+    """Return the value of a run; NEVER for a level that is not reached; NaN without a reading."""
     if not curve:
         return math.nan
     episodes = sorted(curve)
@@ -100,8 +101,28 @@ def value_of(objective: Objective, curve: Curve) -> float:
             return NEVER if at is None else float(at)
 
 
+def pruning_bounds(objective: Objective, curves: Sequence[Curve], percentile: float) -> Curve:
+    """Return by episode the bound that the best reading of a run so far must reach.
+
+    Args:
+        objective: states which readings are better.
+        curves: the readings of the finished trials.
+        percentile: the share of the finished trials, in percent, that a run may be worse than.
+    """
+    bests: dict[int, list[float]] = {}
+    for curve in curves:
+        episodes = sorted(curve)
+        best = itertools.accumulate((objective.sign * curve[episode] for episode in episodes), max)
+        for episode, value in zip(episodes, best, strict=True):
+            bests.setdefault(episode, []).append(value)
+    return {
+        episode: objective.sign * float(np.percentile(values, 100 - percentile))
+        for episode, values in sorted(bests.items())
+    }
+
+
 def should_prune(objective: Objective, curve: Curve, bounds: Mapping[int, float]) -> bool:
-    """Return whether the best reading so far is worse than the last bound that a curve came to."""
+    """Return whether the best reading so far is worse than the bound at the last episode that has one."""
     passed = [episode for episode in bounds if curve and episode <= max(curve)]
     if not passed:
         return False

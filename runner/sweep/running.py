@@ -1,0 +1,183 @@
+"""Running a sweep: batches of trials become tasks for workers, and their results the next batch."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from runner.sweep import state, tag_of
+from runner.sweep.local import Workers
+from runner.sweep.model import Sweep
+from runner.sweep.objective import Curve
+from runner.sweep.task import Result, Task
+from runner.sweep.trials import JobResults, Trial, Trials
+
+INTERRUPTED: Final = "interrupted"
+_WAIT_SECONDS: Final = 0.2
+
+
+@dataclass
+class SweepStatus:
+    """The progress of a sweep."""
+
+    runs: int
+    """All runs of the sweep, done or not."""
+    trials: int
+    done: int = 0
+    running: int = 0
+    pruned: int = 0
+    failed: int = 0
+    excluded: int = 0
+    """Trials without runs, because their values contradict each other."""
+    begun: int = 0
+    """Runs that this process started or resumed."""
+    resumed: int = 0
+    """Those of them that existed before."""
+    bytes: int = 0
+    seconds: float = 0.0
+    best: Trial | None = None
+    stopped: str = ""
+    """The reason why it stopped before its end; empty if it did not."""
+
+
+Limit = Callable[[SweepStatus, Task], str]
+"""Returns why a task may not be started; empty if it may."""
+
+
+def run_sweep(
+    sweep: Sweep,
+    recordings: Path,
+    workers: Workers,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    report: Callable[[SweepStatus], None] = lambda _: None,
+    limit: Limit = lambda *_: "",
+    accept_changes: bool = False,
+) -> tuple[Trials, SweepStatus]:
+    """Run what is left of a sweep; return its trials and its status.
+
+    Args:
+        sweep: written to disk by `state.begin`.
+        recordings: the folder of its runs.
+        workers: the workers that do the runs.
+        stop: called several times a second; returns whether to stop.
+        report: called with the status several times a second.
+        limit: returns why a task may not be started; empty if it may.
+        accept_changes: resume runs that other code started.
+
+    Raises:
+        RunnerError: an existing run cannot be read.
+    """
+    runner = _Runner(sweep, recordings, workers, stop, report, limit)
+    trials, status = runner.trials, runner.status
+    while batch := trials.ask():
+        runner.prepare(batch, trials.bounds(), accept_changes)
+        runner.run(batch)
+        if status.stopped:
+            break
+        trials.tell(batch)
+        status.best = trials.best()
+    report(status)
+    return trials, status
+
+
+class _Runner:
+    """The runs of a sweep's batches: each job once, also if several trials need it."""
+
+    def __init__(
+        self,
+        sweep: Sweep,
+        recordings: Path,
+        workers: Workers,
+        stop: Callable[[], bool],
+        report: Callable[[SweepStatus], None],
+        limit: Limit,
+    ) -> None:
+        self._sweep, self._recordings, self._workers = sweep, recordings, workers
+        self._stop, self._report, self._limit = stop, report, limit
+        self.trials = Trials(sweep)
+        self.status = SweepStatus(self.trials.search.trials * len(sweep.seeds), self.trials.search.trials)
+        self._results = JobResults(sweep, recordings)
+        self._counted: set[str] = set()
+        """Ids of the runs whose bytes are counted."""
+        self._retried: set[str] = set()
+        self._waiting: deque[Task] = deque()
+
+    def prepare(self, batch: list[Trial], bounds: Curve, accept_changes: bool) -> None:
+        """Add the results of runs that are over, and queue the others: those that can be resumed first."""
+        tasks: dict[str, Task] = {}
+        for trial in batch:
+            if trial.error:
+                self.status.excluded += 1
+                self.status.runs -= len(self._sweep.seeds)
+            for seed, identity in trial.identities.items():
+                result = self._results.get(identity)
+                if result is not None:
+                    self._add(trial, seed, result)
+                elif identity not in tasks:
+                    tasks[identity] = Task(
+                        identity=identity,
+                        seed=seed,
+                        config=trial.config,
+                        name=self._sweep.name,
+                        tags=(tag_of(self._sweep.name), f"trial={trial.number}"),
+                        recordings=str(self._recordings),
+                        objective=self._sweep.objective,
+                        bounds=bounds,
+                        run_id=self._results.run_id(identity),
+                        accept_changes=accept_changes,
+                    )
+        self._waiting = deque(sorted(tasks.values(), key=lambda task: not task.run_id))
+
+    def run(self, batch: list[Trial]) -> None:
+        """Have every queued run done; or set `status.stopped`, and wait for the runs in progress."""
+        began, before, status = time.monotonic(), self.status.seconds, self.status
+        while status.running or (self._waiting and not status.stopped):
+            if not status.stopped and self._stop():
+                status.stopped = INTERRUPTED
+                self._workers.stop()
+            self._start_tasks()
+            status.seconds = before + time.monotonic() - began
+            self._report(status)
+            for task, answer in self._workers.collect(_WAIT_SECONDS):
+                status.running -= 1
+                if answer is None and task.identity not in self._retried:  # its worker died
+                    self._retried.add(task.identity)
+                    run = state.runs_of(self._sweep.name, self._recordings).get(task.identity)
+                    self._waiting.appendleft(replace(task, run_id=run.run_id if run else ""))
+                    continue
+                result = answer or Result("failed", task.run_id, error="its worker died twice")
+                if result.status == "interrupted":
+                    status.stopped = status.stopped or INTERRUPTED
+                self._results.add(task.identity, result)
+                for trial in batch:
+                    for seed, identity in trial.identities.items():
+                        if identity == task.identity:
+                            self._add(trial, seed, result)
+
+    def _start_tasks(self) -> None:
+        status = self.status
+        while self._waiting and self._workers.idle and not status.stopped:
+            task = self._waiting[0]
+            status.stopped = self._limit(status, task)
+            if not status.stopped:
+                self._workers.give(self._waiting.popleft())
+                status.running += 1
+                if task.identity not in self._retried:
+                    status.begun += 1
+                    status.resumed += bool(task.run_id)
+
+    def _add(self, trial: Trial, seed: int, result: Result) -> None:
+        """Add a result to a trial and to the status."""
+        trial.add(seed, result, self._sweep)
+        status = self.status
+        if result.run_id not in self._counted:
+            self._counted.add(result.run_id)
+            status.bytes += result.bytes
+        status.done += result.status in ("finished", "pruned")
+        status.pruned += result.status == "pruned"
+        status.failed += result.status == "failed"
