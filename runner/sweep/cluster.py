@@ -62,7 +62,7 @@ def connect(address: str | None, processors: int | None = None) -> Any:
 
 
 class RayActor:
-    """Runs one function at a time in a process of Ray, and is its channel: it keeps messages until fetched."""
+    """Runs one function at a time in a process of Ray, and keeps its messages until fetched."""
 
     def __init__(self) -> None:
         self._stopping = threading.Event()

@@ -94,9 +94,8 @@ def _problems_at(key: tuple[str, ...], document: Document) -> Iterator[None]:
 
 
 def _check_sweep(text: str, source: str, document: Document, recordings: Path) -> CheckedJob:
-    from runner.sweep import state
+    from runner.sweep import state, sweeps_in
     from runner.sweep.loading import from_text as sweep_from_text
-    from runner.sweep import sweeps_in
     from runner.sweep.search import Search, require_optuna
 
     require_optuna()

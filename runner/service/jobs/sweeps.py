@@ -19,8 +19,8 @@ from runner.service.jobs.worker import (
 
 if TYPE_CHECKING:
     from runner.sweep.local import Workers
-    from runner.sweep.task import Result, Task
     from runner.sweep.running import SweepStatus
+    from runner.sweep.task import Result, Task
 
 
 def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
@@ -29,9 +29,8 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
     Raises:
         RunnerError: it cannot be run, or another process runs it.
     """
-    from runner.sweep import state
+    from runner.sweep import state, sweeps_in
     from runner.sweep.loading import from_values
-    from runner.sweep import sweeps_in
     from runner.sweep.plan import limit_of, plan_of, require_disk
     from runner.sweep.running import INTERRUPTED, run_sweep
 
