@@ -2,39 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import click
-
-from runner.cli.options import all_option
 from runner.cli.output import say
-from runner.cli.parameters import EpisodeRanges, NumberList
 
 if TYPE_CHECKING:
     from runner.export.rerun.selection import Request, Selection
-
-
-def choice_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that choose steps."""
-    for option in (
-        all_option,
-        click.option("--every", type=click.IntRange(1), metavar="N", help="Every Nth training episode."),
-        click.option(
-            "--evaluations",
-            type=NumberList(),
-            metavar="N[,N]",
-            help="The trials of the evaluations after N training episodes.",
-        ),
-        click.option(
-            "--episodes",
-            type=EpisodeRanges(),
-            metavar="RANGES",
-            help="Training episodes, such as 0:20,49980:50000.",
-        ),
-    ):
-        command = option(command)
-    return command
 
 
 def request_of(

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from runner.analysis.outcomes import events_of
-from runner.cli.output import number
 from runner.drawing.text import Drawing
 from runner.environments.naming import actions_in_words, event_in_words, states_in_words
+from runner.util.humanize import number
 
 if TYPE_CHECKING:
     from rich.text import Text

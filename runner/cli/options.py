@@ -1,37 +1,208 @@
-"""The arguments and options that commands share."""
+"""The types of arguments and options, how they complete, and those that several commands share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import click
+from click.shell_completion import CompletionItem
 
-from runner.cli.parameters import ConfigName, FilterWord, RunName, Setting, TrialName
+from runner.errors import RunnerError
 
 EXPORTS: Final = Path("exports")
-"""Where commands write files unless -o says where; in a clone, Git ignores it."""
+"""Where commands write files by default; Git ignores it in a clone."""
+
+Decorator = Callable[[Callable[..., Any]], Any]
+Ranges = tuple[tuple[int, int | None], ...]
+"""Ranges of episodes: the first, and the one after the last or None."""
+
+# --- types ------------------------------------------------------------------------------------------------
+
+
+class Completed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+    """Text that completes to the names which a function returns, each with an explanation."""
+
+    def __init__(self, name: str, complete: Callable[[click.Context, str], Mapping[str, str]]) -> None:
+        self.name, self.complete = name, complete
+
+    def shell_complete(
+        self,
+        ctx: click.Context,
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        """Return the names that begin with the incomplete word."""
+        names = self.complete(ctx, incomplete)
+        return [
+            CompletionItem(name, help=text) for name, text in names.items() if name.startswith(incomplete)
+        ]
+
+
+class Parsed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
+    """Text that a function parses; the function raises ValueError or RunnerError."""
+
+    def __init__(self, name: str, expected: str, parse: Callable[[str], Any]) -> None:
+        self.name, self.expected, self.parse = name, expected, parse
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the parsed value."""
+        try:
+            return self.parse(value) if isinstance(value, str) else value
+        except ValueError:
+            self.fail(f"found {value!r}, expected {self.expected}", param, ctx)
+        except RunnerError as error:
+            self.fail(str(error), param, ctx)
+
+
+class RunName(Completed):
+    """The name of a run; completes ids and names, and paths after a slash."""
+
+    def __init__(self) -> None:
+        super().__init__("run", _runs)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Return ids and names, newest first."""
+        if "/" in incomplete or "\\" in incomplete:
+            return [CompletionItem(incomplete, type="file")]
+        return super().shell_complete(ctx, param, incomplete)
+
+
+def _runs(ctx: click.Context, incomplete: str) -> Mapping[str, str]:
+    from runner.runs.resolve import completions
+    from runner.runs.run import recordings_folder
+
+    try:
+        return completions(incomplete, recordings_folder(ctx.params.get("recordings")))
+    except RunnerError:
+        return {}
+
+
+class ConfigName(click.Path):
+    """A file, or the name of a shipped `experiment` or `sweep`; completes both."""
+
+    def __init__(self, kind: str = "experiment") -> None:
+        super().__init__(path_type=Path)
+        self.kind = kind
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Return the shipped names, and have the shell add files."""
+        from runner.config.shipped import shipped
+
+        names = {each.name for each in shipped().values() if each.kind == self.kind}
+        own = [item for item in SHIPPED.shell_complete(ctx, param, incomplete) if item.value in names]
+        return [*own, *super().shell_complete(ctx, param, incomplete)]
+
+
+def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
+    from runner.config.shipped import shipped
+
+    return {each.name: each.about for each in shipped().values()}
+
+
+def _filter_words(_ctx: click.Context, incomplete: str) -> Mapping[str, str]:
+    from runner.runs.catalogue.fields import FIELDS, SETTING, STATUSES
+
+    if incomplete.startswith("status:"):
+        return {f"status:{status}": "" for status in STATUSES}
+    words = {f"{name}:": field.meaning for name, field in FIELDS.items()}
+    return words | {SETTING: "a value of the configuration, such as config.discount"}
+
+
+def _settings(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
+    from runner.config import json_schema
+
+    return {f"{key}=": text for key, text in _keys(json_schema()).items()}
+
+
+def _keys(schema: dict[str, Any], part: dict[str, Any] | None = None, prefix: str = "") -> dict[str, str]:
+    """Return the paths of a schema's values, sections included, and what each means."""
+    keys = {}
+    for name, value in (schema if part is None else part).get("properties", {}).items():
+        path = f"{prefix}{name}"
+        keys[path] = str(value.get("description", ""))
+        for kind in (value, *value.get("anyOf", ())):
+            if reference := kind.get("$ref"):
+                section = schema["$defs"][reference.rpartition("/")[2]]
+                keys |= _keys(schema, section, f"{path}.")
+    return keys
+
+
+def _number(text: str) -> int:
+    """Return a number from 0; `int` would accept signs, blanks and underscores."""
+    if not text.strip().isdecimal():
+        raise ValueError(text)
+    return int(text)
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    return tuple(map(_number, text.split(",")))
+
+
+def _trial(text: str) -> tuple[int, int]:
+    after, colon, trial = text.partition(":")
+    return _number(after), _number(trial) if colon else 0
+
+
+def _ranges(text: str) -> Ranges:
+    ranges = []
+    for part in text.split(","):
+        start, colon, stop = part.strip().partition(":")
+        first = 0 if colon and not start else _number(start)
+        end = first + 1 if not colon else _number(stop) if stop else None
+        ranges.append((first, end))
+    return tuple(ranges)
+
+
+def _picture_size(text: str) -> str:
+    width, _, height = text.partition("x")
+    if not 1 <= _number(width) <= 8192 >= _number(height) >= 1:
+        raise ValueError(text)
+    return text
+
+
+def _step(text: str) -> tuple[int, ...]:
+    from runner.analysis.step_reference import parse_step_reference
+
+    return parse_step_reference(text)
+
+
+SHIPPED: Final = Completed("name", _shipped)
+SETTING: Final = Completed("setting", _settings)
+FILTER_WORD: Final = Completed("filter", _filter_words)
+TRIAL: Final = Parsed("N:TRIAL", "N:TRIAL, such as 3000:0", _trial)
+RANGES: Final = Parsed("ranges", "START:STOP or N, such as 0:20,49980:50000", _ranges)
+NUMBERS: Final = Parsed("numbers", "numbers such as 1000,49000", _numbers)
+PICTURE_SIZE: Final = Parsed("WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", _picture_size)
+STEP: Final = Parsed("step", "EPISODE:T, or eval:N:TRIAL:T", _step)
+DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
+FILE: Final = click.Path(dir_okay=False, path_type=Path)
+COUNT: Final = click.IntRange(1)
+INDEX: Final = click.IntRange(0)
+
+# --- arguments --------------------------------------------------------------------------------------------
 
 run_argument: Final = click.argument("run_name", metavar="RUN", type=RunName())
-
 runs_argument: Final = click.argument("run_names", metavar="RUN...", nargs=-1, required=True, type=RunName())
-
 config_argument: Final = click.argument("config", metavar="CONFIG", type=ConfigName())
+filter_argument: Final = click.argument("words", metavar="[FILTER]...", nargs=-1, type=FILTER_WORD)
+
+# --- options ----------------------------------------------------------------------------------------------
 
 recordings_option: Final = click.option(
     "--recordings",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=DIRECTORY,
     metavar="DIR",
     help="The folder of runs.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
 )
 
 
-def _folders(
-    ctx: click.Context,  # noqa: ARG001
-    param: click.Parameter,  # noqa: ARG001
-    value: tuple[Path, ...],
-) -> tuple[Path, ...]:
+def _folders(_ctx: click.Context, _param: click.Parameter, value: tuple[Path, ...]) -> tuple[Path, ...]:
     from runner.runs.run import recordings_folder
 
     return value or (recordings_folder(),)
@@ -39,60 +210,75 @@ def _folders(
 
 folders_option: Final = click.option(
     "--recordings",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=DIRECTORY,
     metavar="DIR",
     multiple=True,
     callback=_folders,
     help="A folder of runs; may be repeated.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
 )
-
-filter_argument: Final = click.argument("words", metavar="[FILTER]...", nargs=-1, type=FilterWord())
-
-json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-
 set_option: Final = click.option(
     "--set",
     "overrides",
     multiple=True,
-    type=Setting(),
+    type=SETTING,
     metavar="KEY=VALUE",
     help="Override a value of the configuration, such as evaluation.trials=50; may be repeated.",
 )
-
-episode_option: Final = click.option(
-    "--episode", type=click.IntRange(0), metavar="N", help="A training episode, counted from 0."
+json_option: Final = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+markdown_option: Final = click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
+html_option: Final = click.option(
+    "--html", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML page instead."
 )
-
+force_option: Final = click.option("--force", is_flag=True, help="Replace existing output.")
+accept_changes_option: Final = click.option(
+    "--accept-changes",
+    is_flag=True,
+    help="Resume although code, environment, file or numerical libraries have changed.",
+)
+all_option: Final = click.option(
+    "--all", "everything", is_flag=True, help="Include everything, not only a selection."
+)
+episode_option: Final = click.option(
+    "--episode", type=INDEX, metavar="N", help="A training episode, counted from 0."
+)
+episodes_option: Final = click.option(
+    "--episodes", type=RANGES, metavar="RANGES", help="Episodes, such as 0:20,49980:50000."
+)
 trial_option: Final = click.option(
     "--eval",
     "trial",
-    type=TrialName(),
+    type=TRIAL,
     metavar="N:TRIAL",
     help="A trial, counted from 0, of the evaluation after N training episodes.",
 )
 
-force_option: Final = click.option("--force", is_flag=True, help="Replace existing output.")
 
-markdown_option: Final = click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown.")
+def output_option(default: Path | str, metavar: str = "FILE") -> Decorator:
+    """Return the option -o, with a default path, or a text that describes the default."""
+    return click.option(
+        "-o",
+        "--output",
+        type=click.Path(path_type=Path),
+        default=default if isinstance(default, Path) else None,
+        show_default=default if isinstance(default, str) else True,
+        metavar=metavar,
+        help="The file to write." if metavar.startswith("FILE") else "The folder to write.",
+    )
 
-all_option: Final = click.option(
-    "--all", "everything", is_flag=True, help="Include everything, not only a selection."
-)
 
-
-def limit_option(default: int | None, described: str = "") -> Callable[[Callable[..., Any]], Any]:
+def limit_option(default: int | None, described: str = "") -> Decorator:
     """Return the option --limit: the maximum number of rows, 0 for all."""
     return click.option(
         "--limit",
-        type=click.IntRange(min=0),
+        type=INDEX,
         default=default,
-        show_default=described or default is not None,
+        show_default=described or True,
         metavar="N",
         help="Maximum number of rows, 0 for all.",
     )
 
 
-def workers_option(default: int | None, described: str = "") -> Callable[[Callable[..., Any]], Any]:
+def workers_option(default: int | None, described: str = "") -> Decorator:
     """Return the option --workers: the number of runs done in parallel."""
     return click.option(
         "--workers",
@@ -104,8 +290,8 @@ def workers_option(default: int | None, described: str = "") -> Callable[[Callab
     )
 
 
-def target_option(multiple: bool) -> Callable[[Callable[..., Any]], Any]:
-    """Return the option --target: a level of a metric, and when a run first reaches it."""
+def target_option(multiple: bool) -> Decorator:
+    """Return the option --target: a level of a metric; runs are compared when they first reach it."""
     return click.option(
         "--target",
         "targets" if multiple else "target",
@@ -114,3 +300,20 @@ def target_option(multiple: bool) -> Callable[[Callable[..., Any]], Any]:
         help="Compare when this level is first reached, such as success_percent=80"
         + ("; may be repeated." if multiple else "."),
     )
+
+
+def selection_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the options that select the steps to export."""
+    for option in (
+        all_option,
+        click.option("--every", type=COUNT, metavar="N", help="Every Nth training episode."),
+        click.option(
+            "--evaluations",
+            type=NUMBERS,
+            metavar="N[,N]",
+            help="The trials of the evaluations after N training episodes.",
+        ),
+        episodes_option,
+    ):
+        command = option(command)
+    return command

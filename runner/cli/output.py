@@ -1,14 +1,16 @@
-"""How results look: JSON, tables, sizes and times in words."""
+"""Print results: JSON on stdout, tables fitted to the terminal, notices on stderr."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
-from runner.util.humanize import UNKNOWN, age, amount, duration, number, size
+from runner.analysis.sections import markdown
+from runner.export.places import require_new
 from runner.util.values import finite
 
 if TYPE_CHECKING:  # imported when something is drawn
@@ -16,28 +18,13 @@ if TYPE_CHECKING:  # imported when something is drawn
     from rich.table import Table
     from rich.text import Text
 
-__all__ = [
-    "UNKNOWN",
-    "age",
-    "amount",
-    "console",
-    "draw",
-    "duration",
-    "facts",
-    "json_list",
-    "number",
-    "print_json",
-    "say",
-    "size",
-    "table",
-    "title",
-]
+    from runner.analysis.sections import Section
 
 SHRUNK: Final = 10
-"""Characters that a shrinking column of a table keeps."""
+"""Minimum characters of a shrinking column."""
 
 UNBOUNDED: Final = 1000
-"""The width where there is no terminal to fit."""
+"""Width without a terminal."""
 
 
 def print_json(value: Any, indent: int | None = 1) -> None:
@@ -60,12 +47,12 @@ def json_list(name: str, rows: Iterable[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def say(text: str) -> None:
-    """Tell the user something beside the result, on stderr."""
+    """Print a notice on stderr."""
     click.echo(text, err=True)
 
 
 def console() -> Console:
-    """Return the console of stdout: colours on a terminal only, and lines as long as they come elsewhere."""
+    """Return the console of stdout: colours on a terminal only, and lines of any length elsewhere."""
     from rich.console import Console
 
     drawn = Console(highlight=False, markup=False, emoji=False)
@@ -75,11 +62,11 @@ def console() -> Console:
 
 
 def draw(*parts: RenderableType) -> None:
-    """Print tables and lines on stdout; elsewhere than on a terminal without the blanks that fill them up."""
+    """Print tables and lines on stdout; without trailing blanks unless stdout is a terminal."""
     drawn = console()
     if drawn.is_terminal:
         for part in parts:
-            # Lines too long for the terminal are broken by it: no figure is cut short.
+            # The terminal wraps lines that are too long: no number is truncated.
             drawn.print(part, width=max(drawn.width, _least_width(part)), crop=False)
         return
     with drawn.capture() as captured:
@@ -89,7 +76,7 @@ def draw(*parts: RenderableType) -> None:
 
 
 def _least_width(part: RenderableType) -> int:
-    """Return the width that a table needs so that only its shrinking columns are shortened."""
+    """Return the width at which only the shrinking columns of a table are truncated."""
     from rich.cells import cell_len
     from rich.table import Table
 
@@ -108,44 +95,92 @@ def _least_width(part: RenderableType) -> int:
 
 
 def title(text: str) -> Text:
-    """Return the heading of what follows, an empty line above it."""
+    """Return a heading with an empty line above it."""
     from rich.text import Text
 
     return Text.assemble("\n", (text, "bold underline"))
 
 
 def table(*headings: str, left: tuple[str, ...] = (), shrinking: tuple[str, ...] = ()) -> Table:
-    """Return an empty table with these headings.
-
-    Headings of several lines end on the same line; the cells of a row begin on the same line.
+    """Return an empty table; cells of a row and headings of several lines are aligned.
 
     Args:
         headings: of the columns, in order.
-        left: the columns to be aligned to the left, as text is; the others to the right, as numbers are.
-        shrinking: the columns that give way, with an ellipsis, where a terminal is too narrow.
+        left: the headings of columns that are aligned to the left, as text is; numbers are aligned right.
+        shrinking: the headings of columns that are truncated where a terminal is too narrow.
     """
     from rich.align import Align
     from rich.table import Table
 
-    made = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
+    grid = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
     for heading in headings:
         side: Literal["left", "right"] = "left" if heading in left else "right"
-        made.add_column(
+        grid.add_column(
             Align(heading, side, vertical="bottom"),
             justify=side,
             overflow="ellipsis",
             no_wrap=heading not in shrinking,
         )
-    return made
+    return grid
 
 
 def facts(pairs: Mapping[str, str]) -> Table:
-    """Return a table of names and what they are."""
+    """Return a table of names and values."""
     from rich.table import Table
 
-    made = Table.grid(padding=(0, 2, 0, 0))
-    made.add_column(style="bold", no_wrap=True)
-    made.add_column(overflow="fold")
+    grid = Table.grid(padding=(0, 2, 0, 0))
+    grid.add_column(style="bold", no_wrap=True)
+    grid.add_column(overflow="fold")
     for name, text in pairs.items():
-        made.add_row(name, text)
-    return made
+        grid.add_row(name, text)
+    return grid
+
+
+def aligned(lines: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:
+    """Return lines of cells aligned in columns; far quicker than a table where there are many."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    columns = list(zip(widths, left, strict=True))
+    return [
+        "  ".join(
+            cell.ljust(width) if is_left else cell.rjust(width)
+            for cell, (width, is_left) in zip(line, columns, strict=True)
+        ).rstrip()
+        for line in lines
+    ]
+
+
+def printable(text: str) -> str:
+    """Return a text on one line, without control characters of terminals."""
+    return "".join(character if character.isprintable() else " " for character in text)
+
+
+# --- sections of comparisons ------------------------------------------------------------------------------
+
+
+def print_sections(sections: Sequence[Section], as_markdown: bool) -> None:
+    """Print sections as tables, or as Markdown."""
+    if as_markdown:
+        click.echo("\n".join(markdown(sections)))
+        return
+    for section in sections:
+        draw(title(section.title), *section.sentences)
+        for part in section.grids:
+            shrinking = part.headings if console().is_terminal else ()
+            grid = table(*part.headings, left=part.headings, shrinking=shrinking)
+            for row in part.rows:
+                grid.add_row(*row)
+            draw(grid)
+
+
+def require_one_form(as_json: bool, as_markdown: bool) -> None:
+    """Refuse --json together with --markdown."""
+    if as_json and as_markdown:
+        raise click.UsageError("--json and --markdown exclude each other: choose one.")
+
+
+def require_page(path: Path, force: bool) -> None:
+    """Refuse a page that could not be written in the end, before anything is computed."""
+    from runner.export.reports.report import require_packages
+
+    require_packages()
+    require_new(path, force)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.cli.output import UNKNOWN, age, console, draw, number, print_json, say, size, table
+from runner.cli.output import console, draw, print_json, say, table
 from runner.errors import RunnerError
+from runner.util.humanize import UNKNOWN, age, number, size
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.removal import Removal

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli.finding import find
 from runner.cli.options import json_option, recordings_option, runs_argument
-from runner.cli.output import draw, facts, print_json, say, size
+from runner.cli.output import draw, facts, print_json, say
+from runner.cli.runs import find
+from runner.util.humanize import size
 
 if TYPE_CHECKING:
     from runner.archive.runs import Archived
@@ -51,12 +52,12 @@ def command(
     from runner.archive.places import default_target
     from runner.archive.runs import archive_run
     from runner.cli.progress import steps_line
-    from runner.cli.working import announcing
+    from runner.cli.runs import compilation_notice
     from runner.runs.run import recordings_folder
 
     target = to or default_target(recordings_folder(recordings))
     for run in _to_do([find(name, recordings) for name in dict.fromkeys(run_names)]):
-        with announcing(), steps_line(f"archiving {run.run_id}") as report:
+        with compilation_notice(), steps_line(f"archiving {run.run_id}") as report:
             done = archive_run(run, target, remove, report, dry_run)
         if as_json:
             print_json(_as_json(done, dry_run), indent=None)

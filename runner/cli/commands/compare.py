@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.finding import find_all_recorded
 from runner.cli.options import json_option, markdown_option, recordings_option, runs_argument, target_option
-from runner.cli.output import print_json, say
-from runner.cli.sections import print_sections, require_one_form, require_page
+from runner.cli.output import print_json, print_sections, require_one_form, require_page, say
+from runner.cli.runs import find_all_recorded
 
 if TYPE_CHECKING:
     from runner.analysis.compare import Comparison

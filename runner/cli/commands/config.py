@@ -7,9 +7,8 @@ from pathlib import Path
 import click
 
 from runner.cli import Group
-from runner.cli.options import config_argument, json_option, set_option
+from runner.cli.options import SHIPPED, config_argument, json_option, set_option
 from runner.cli.output import draw, print_json, say, table
-from runner.cli.parameters import ShippedName
 
 
 @click.group("config", cls=Group)
@@ -50,7 +49,7 @@ def ls(as_json: bool) -> None:
 
 
 @command.command("copy")
-@click.argument("name", metavar="NAME", type=ShippedName())
+@click.argument("name", metavar="NAME", type=SHIPPED)
 @click.option(
     "-o",
     "--output",

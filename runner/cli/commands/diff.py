@@ -7,12 +7,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.finding import find_recorded
-from runner.cli.options import all_option, json_option, markdown_option, recordings_option, target_option
-from runner.cli.output import print_json, say, size
-from runner.cli.parameters import RunName
-from runner.cli.sections import print_sections, require_one_form, require_page
+from runner.cli.options import (
+    RunName,
+    all_option,
+    json_option,
+    markdown_option,
+    recordings_option,
+    target_option,
+)
+from runner.cli.output import print_json, print_sections, require_one_form, require_page, say
+from runner.cli.runs import find_recorded
 from runner.errors import ExitCode
+from runner.util.humanize import size
 
 if TYPE_CHECKING:
     from runner.analysis.diff import RunDiff

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli.options import filter_argument, folders_option, json_option, limit_option
-from runner.cli.output import UNKNOWN, draw, facts, print_json, say, size, table, title
+from runner.cli.output import draw, facts, print_json, say, table, title
+from runner.util.humanize import UNKNOWN, size
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.usage import Sums, Usage

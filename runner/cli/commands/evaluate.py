@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.finding import find_recorded, suggested
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, print_json, say
-from runner.cli.working import at_work, run_as_json, run_in_words
+from runner.cli.runs import command_for, find_recorded, job_progress, run_as_json, run_facts
 from runner.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -80,7 +79,7 @@ def command(
     source, folder = find_recorded(run_name, recordings), recordings_folder(recordings)
     count = None if start == "each" else trials or TRIALS
     start_state: Start = int(start) if start.isdecimal() else "random"
-    with at_work("", 0) as (report, interrupt):
+    with job_progress("", 0) as (report, interrupt):
         run = evaluate(source, folder, step, count, start_state, seed, report, interrupt)
     origin = run.file.config["initial_q"]
     if as_json:
@@ -88,7 +87,7 @@ def command(
     elif run.status == "finished":
         _summarise(run, origin)
     if interrupt.came and run.status == "interrupted":
-        say(f"Interrupted: what was played is kept; `{suggested(run, 'resume')}` plays the rest.")
+        say(f"Interrupted: what was played is kept; `{command_for(run, 'resume')}` plays the rest.")
         ctx.exit(ExitCode.INTERRUPTED)
 
 
@@ -101,6 +100,6 @@ def _summarise(run: Run, origin: dict[str, object]) -> None:
         table = evaluation_table(
             evaluation_records(recording), recording.environment["success_events"], console()
         )
-    told = run_in_words(run)
+    told = run_facts(run)
     told |= {"table": f"of run {origin['run']} after {origin['step']:,} training steps"}
-    draw(table, "", facts(told | {"next": suggested(run, "play", "--eval 0:0")}))
+    draw(table, "", facts(told | {"next": command_for(run, "play", "--eval 0:0")}))

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find_recorded
 from runner.cli.options import EXPORTS, episode_option, recordings_option, run_argument, trial_option
-from runner.cli.output import say, size
-from runner.cli.progress import counting
+from runner.cli.output import say
+from runner.cli.progress import count_line
+from runner.cli.runs import find_recorded
+from runner.util.humanize import size
 
 
 @click.command("gif")
@@ -96,7 +97,7 @@ def command(
                 episode = replay.last_episode(recording)
                 say(f"There is no whole evaluation: this is the last training episode, {episode:,}.")
             shown = replay.training_episode(recording, episode, steps)
-        with counting("frames", shown.steps + 1) as progress:
+        with count_line("frames", shown.steps + 1) as progress:
 
             def write(path: Path) -> None:
                 frames.append(write_gif(path, recording, shown, speed, width, progress))

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find_recorded
 from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import draw, facts, print_json, say, size
+from runner.cli.output import draw, facts, print_json, say
+from runner.cli.runs import find_recorded
+from runner.util.humanize import size
 
 
 @click.command("mcap")
@@ -37,12 +38,12 @@ def command(
       dualtaxi export mcap @latest
       dualtaxi export mcap k3v9m2xq --anonymous -o for_review.mcap
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.cli.progress import waiting
+    from runner.cli.progress import stage_line
     from runner.export.mcap import export_mcap
 
     run = find_recorded(run_name, recordings)
     path = output or Path(f"{run.file_stem}.mcap")
-    with waiting(f"exporting {run.run_id}"):
+    with stage_line(f"exporting {run.run_id}"):
         exported = export_mcap(run, path, anonymous, force)
     for warning in exported.warnings:
         say(warning)

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find_recorded
-from runner.cli.options import EXPORTS, recordings_option, run_argument
+from runner.cli.options import EXPORTS, RANGES, recordings_option, run_argument
 from runner.cli.output import say
-from runner.cli.parameters import EpisodeRanges
-from runner.cli.progress import counting
+from runner.cli.progress import count_line
+from runner.cli.runs import find_recorded
 
 
 @click.command("minari")
@@ -31,9 +30,7 @@ from runner.cli.progress import counting
     show_default=True,
     help="The phase of the episodes.",
 )
-@click.option(
-    "--episodes", type=EpisodeRanges(), metavar="RANGES", help="Episodes, such as 0:20,49980:50000."
-)
+@click.option("--episodes", type=RANGES, metavar="RANGES", help="Episodes, such as 0:20,49980:50000.")
 @click.option("--force", is_flag=True, help="Replace the dataset if it exists.")
 @recordings_option
 def command(
@@ -64,7 +61,7 @@ def command(
         require_steps(recording, "export")
         path = output / dataset_id(recording)
         total = recording.count(recording.topic(f"/{phase}/episode"))
-        with new_folder(path, force, OURS) as folder, counting("episodes", total) as report:
+        with new_folder(path, force, OURS) as folder, count_line("episodes", total) as report:
             written = write_dataset(recording, folder, phase, episodes or (), report)
         for note in (*shortcomings(recording), *written.notes):
             say(note)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find_recorded
 from runner.cli.options import recordings_option, run_argument
 from runner.cli.output import say
+from runner.cli.runs import find_recorded
 
 
 @click.command("mlflow")

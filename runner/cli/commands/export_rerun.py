@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from runner.cli.choosing import choice_options, request_of, tell
-from runner.cli.finding import find_recorded
-from runner.cli.options import EXPORTS, recordings_option, run_argument
-from runner.cli.output import duration, size
+from runner.cli.choosing import request_of, tell
+from runner.cli.options import EXPORTS, recordings_option, run_argument, selection_options
+from runner.cli.runs import find_recorded
+from runner.util.humanize import duration, size
 
 
 @click.command("rerun")
@@ -21,7 +21,7 @@ from runner.cli.output import duration, size
     metavar="FILE.rrd",
     help="The file to write.  [default: exports/NAME-RUN.rrd]",
 )
-@choice_options
+@selection_options
 @click.option("--force", is_flag=True, help="Replace the file if it exists.")
 @recordings_option
 def command(
@@ -48,7 +48,7 @@ def command(
     import time
 
     from runner.cli.progress import stage_line
-    from runner.cli.working import announcing
+    from runner.cli.runs import compilation_notice
     from runner.export.places import require_new
     from runner.export.rerun.viewer import require_rerun
     from runner.recording.reader import open_recording
@@ -61,7 +61,7 @@ def command(
     path = output or EXPORTS / f"{run.file_stem}.rrd"
     require_new(path, force)
     request = request_of(episodes, evaluations, every, everything)
-    with open_recording(run.recording) as recording, announcing(), stage_line("exporting"):
+    with open_recording(run.recording) as recording, compilation_notice(), stage_line("exporting"):
         source = Source(recording, f"{run.title} ({run.run_id})")
         (selection,) = export([source], request, path)
     tell(selection)

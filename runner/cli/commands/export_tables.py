@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find_recorded
-from runner.cli.options import EXPORTS, recordings_option, run_argument
-from runner.cli.output import say, size
-from runner.cli.parameters import EpisodeRanges
-from runner.cli.progress import counting
+from runner.cli.options import EXPORTS, RANGES, recordings_option, run_argument
+from runner.cli.output import say
+from runner.cli.progress import count_line
+from runner.cli.runs import find_recorded
+from runner.util.humanize import size
 
 Ranges = tuple[tuple[int, int | None], ...]
 
@@ -28,7 +28,7 @@ _OPTIONS = (
     ),
     click.option(
         "--episodes",
-        type=EpisodeRanges(),
+        type=RANGES,
         metavar="RANGES",
         help="Episodes of the phase (train unless given), such as 0:20,49980:50000.",
     ),
@@ -83,7 +83,7 @@ def _export(
     with open_recording(run.recording) as recording:
         require_steps(recording, "export")
         total = (recording.result.train_steps or 0) + (recording.result.eval_steps or 0)
-        with new_folder(path, force, OURS) as folder, counting("steps", total) as report:
+        with new_folder(path, force, OURS) as folder, count_line("steps", total) as report:
             rows = write_tables(recording, folder, form, choice, gz, report)
         for shortcoming in shortcomings(recording):
             say(shortcoming)

@@ -26,14 +26,14 @@ def command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) ->
       dualtaxi import quick-k3v9m2xq.mcap
       dualtaxi import quick-k3v9m2xq.mcap --as-new --recordings from_anna
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.cli.progress import waiting
-    from runner.cli.working import tell_received
+    from runner.cli.progress import stage_line
+    from runner.cli.runs import print_received
     from runner.errors import RunnerError
     from runner.runs.importing import Occupied, import_recording
     from runner.runs.run import recordings_folder
 
     try:
-        with waiting(f"importing {file}"):
+        with stage_line(f"importing {file}"):
             imported = import_recording(file, recordings_folder(recordings), as_new=as_new)
     except Occupied as error:
         raise RunnerError(f"{error} --as-new imports it under a new id.") from error
@@ -42,4 +42,4 @@ def command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) ->
         "this content" if run.summary.get("content_digest", digest) == digest else "this content and more"
     )
     already = content if imported.already else ""
-    tell_received(run, digest, already, as_json, anonymous=imported.anonymous)
+    print_received(run, digest, already, as_json, anonymous=imported.anonymous)

@@ -12,8 +12,9 @@ import click
 
 from runner.cli import Group
 from runner.cli.options import folders_option, json_option
-from runner.cli.output import duration, facts, print_json, say
+from runner.cli.output import facts, print_json, say
 from runner.errors import ExitCode
+from runner.util.humanize import duration
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index

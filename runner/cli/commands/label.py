@@ -7,10 +7,11 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find
 from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import UNKNOWN, draw, facts, print_json, say
+from runner.cli.output import draw, facts, print_json, say
+from runner.cli.runs import find
 from runner.errors import RunnerError
+from runner.util.humanize import UNKNOWN
 
 
 @click.command("label")

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.cli.finding import find_recorded
 from runner.cli.options import episode_option, json_option, recordings_option, run_argument, trial_option
 from runner.cli.output import print_json
+from runner.cli.runs import find_recorded
 
 if TYPE_CHECKING:
     from rich.text import Text

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find_all_recorded
 from runner.cli.options import EXPORTS, recordings_option, runs_argument
 from runner.cli.output import say
-from runner.cli.progress import counting, stage_line
+from runner.cli.progress import count_line, stage_line
+from runner.cli.runs import find_all_recorded
 
 
 @click.command("plot")
@@ -60,7 +60,7 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
         return
     series = []
     runs = find_all_recorded(run_names, folder)
-    with counting("runs read", len(runs)) as progress:
+    with count_line("runs read", len(runs)) as progress:
         for run in runs:
             with open_recording(run.recording) as recording:
                 series.append(read_series(recording))

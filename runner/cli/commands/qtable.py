@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.cli.finding import find_recorded
 from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import UNKNOWN, draw, facts, number, print_json, say, table, title
+from runner.cli.output import draw, facts, print_json, say, table, title
+from runner.cli.runs import find_recorded
+from runner.util.humanize import UNKNOWN, number
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -62,7 +63,7 @@ def command(
         raise click.UsageError("--step and --episode exclude each other: choose one.")
     from runner.analysis.qtable import at_moment, told_of
     from runner.cli.progress import stage_line
-    from runner.cli.working import announcing
+    from runner.cli.runs import compilation_notice
     from runner.export.places import require_new
     from runner.recording.reader import open_recording
 
@@ -71,7 +72,7 @@ def command(
     run = find_recorded(run_name, recordings)
     with (
         open_recording(run.recording) as recording,
-        announcing(),
+        compilation_notice(),
         stage_line("replaying recorded steps"),
     ):
         replay = at_moment(recording, step, episode)

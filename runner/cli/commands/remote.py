@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli import Group, error_as_json, exit_code_of
-from runner.cli.finding import find_recorded
-from runner.cli.options import json_option, limit_option, recordings_option
-from runner.cli.output import UNKNOWN, draw, facts, print_json, say, size, table
-from runner.cli.parameters import ConfigName, RunName
+from runner.cli.options import ConfigName, RunName, json_option, limit_option, recordings_option
+from runner.cli.output import draw, facts, print_json, say, table
+from runner.cli.runs import find_recorded
 from runner.errors import ExitCode, RunnerError
+from runner.util.humanize import UNKNOWN, size
 
 if TYPE_CHECKING:
     from runner.client.client import Client
@@ -201,13 +201,13 @@ def pull(run_name: str, server: Server, recordings: Path | None, as_json: bool) 
       dualtaxi remote pull k3v9m2xq --server https://runs.example.org --token-file ~/.dualtaxi-token
     """  # noqa: D301 - Click wants the backspace itself
     from runner.cli.progress import bytes_line
-    from runner.cli.working import tell_received
+    from runner.cli.runs import print_received
     from runner.runs.run import recordings_folder
 
     with server.client() as client, bytes_line(f"pulling {run_name}") as report:
         pulled = client.pull(run_name, recordings_folder(recordings), report)
     already = "this content" if pulled.already else ""
-    tell_received(pulled.run, pulled.content_digest, already, as_json)
+    print_received(pulled.run, pulled.content_digest, already, as_json)
 
 
 # --- jobs -------------------------------------------------------------------------------------------------

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.cli.finding import suggested
 from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import draw, facts, print_json, size
-from runner.cli.working import recording_of
+from runner.cli.output import draw, facts, print_json
+from runner.cli.runs import command_for, find_recording
 from runner.errors import ExitCode
+from runner.util.humanize import size
 
 if TYPE_CHECKING:
     from runner.recording.repair import Repair
@@ -63,7 +63,7 @@ def command(ctx: click.Context, run_name: str, recordings: Path | None, as_json:
     from runner.execution.verify import refuse_foreign
     from runner.recording.repair import repair
 
-    path, run = recording_of(run_name, recordings)
+    path, run = find_recording(run_name, recordings)
     refuse_foreign(path)
     with _kept(run), bytes_line("repairing") as report:
         done = repair(path, report)
@@ -113,7 +113,7 @@ def _next(done: Repair, run: Run | None) -> dict[str, str]:
     """Return what brings back what was lost, if anything does: a loop cannot be done again here."""
     if run is None or done.lossless or "made_by" in run.file.config:
         return {}
-    return {"next": suggested(run, "resume")}
+    return {"next": command_for(run, "resume")}
 
 
 def _losses(done: Repair) -> list[str]:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find_all_recorded
-from runner.cli.options import EXPORTS, recordings_option, runs_argument
-from runner.cli.output import say, size
-from runner.cli.parameters import TrialName
+from runner.cli.options import EXPORTS, TRIAL, recordings_option, runs_argument
+from runner.cli.output import say
 from runner.cli.progress import stage_line
+from runner.cli.runs import find_all_recorded
+from runner.util.humanize import size
 
 
 @click.command("report")
@@ -35,7 +35,7 @@ from runner.cli.progress import stage_line
 @click.option(
     "--eval",
     "trials",
-    type=TrialName(),
+    type=TRIAL,
     multiple=True,
     metavar="N:TRIAL",
     help="Show this trial of the evaluation after N training episodes too; may be repeated.",

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find, suggested
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, say
-from runner.cli.working import at_work, refuse_running, run_as_json, run_in_words
+from runner.cli.runs import command_for, find, job_progress, require_over, run_as_json, run_facts
 
 
 @click.command("rerecord")
@@ -30,14 +29,14 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     from runner.execution.rerecord import holds_steps, rerecord
 
     run = find(run_name, recordings)
-    refuse_running(run)
+    require_over(run)
     nothing_to_do = run.status == "finished" and holds_steps(run)
-    with at_work("", run.episodes_to_do or 0) as (report, interrupt):
+    with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
         run = rerecord(run, report, interrupt)
     if as_json:
         print_json(run_as_json(run), indent=None)
     elif not nothing_to_do:
         proof = {"proof": "the content digest is the one that the run had"}
-        draw(facts(run_in_words(run) | proof | {"next": suggested(run, "play")}))
+        draw(facts(run_facts(run) | proof | {"next": command_for(run, "play")}))
     if nothing_to_do:
         say(f"Run {run.run_id} holds its steps already; there is nothing to do.")

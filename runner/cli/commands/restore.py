@@ -6,10 +6,9 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find
-from runner.cli.options import json_option, recordings_option
+from runner.cli.options import RunName, json_option, recordings_option
 from runner.cli.output import draw, facts, print_json
-from runner.cli.parameters import RunName
+from runner.cli.runs import find
 
 
 @click.command("restore")
@@ -32,11 +31,11 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     from runner.archive.runs import restore_place, restore_run
     from runner.archive.store import S3
     from runner.cli.progress import steps_line
-    from runner.cli.working import announcing, run_as_json, run_in_words
+    from runner.cli.runs import compilation_notice, run_as_json, run_facts
     from runner.runs.run import recordings_folder
 
     is_place = run_name.startswith(S3) or (Path(run_name) / MANIFEST).is_file()
-    with announcing(), steps_line("restoring") as report:
+    with compilation_notice(), steps_line("restoring") as report:
         if is_place:
             place = run_name if run_name.startswith(S3) else str(Path(run_name).absolute())
             run = restore_place(place, recordings_folder(recordings), report)
@@ -45,4 +44,4 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     if as_json:
         print_json(run_as_json(run))
     else:
-        draw(facts(run_in_words(run)))
+        draw(facts(run_facts(run)))

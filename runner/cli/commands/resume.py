@@ -6,10 +6,9 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find, suggested
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, say
-from runner.cli.working import at_work, run_as_json, run_in_words
+from runner.cli.runs import command_for, find, job_progress, run_as_json, run_facts
 from runner.errors import ExitCode
 
 
@@ -44,14 +43,14 @@ def command(
 
     run = find(run_name, recordings)
     nothing_to_do = is_finished(run)
-    with at_work("", run.episodes_to_do or 0) as (report, interrupt):
+    with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
         run = resume(run, accept_changes, report, interrupt)
     if as_json:
         print_json(run_as_json(run), indent=None)
     elif not nothing_to_do:
-        draw(facts(run_in_words(run) | {"next": suggested(run, "show")}))
+        draw(facts(run_facts(run) | {"next": command_for(run, "show")}))
     if nothing_to_do:
         say(f"Run {run.run_id} is finished; there is nothing to do.")
     if interrupt.came and run.status == "interrupted":
-        say(f"Interrupted again; `{suggested(run, 'resume')}` goes on from what is kept.")
+        say(f"Interrupted again; `{command_for(run, 'resume')}` goes on from what is kept.")
         ctx.exit(ExitCode.INTERRUPTED)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from runner.cli.finding import find
 from runner.cli.options import json_option, recordings_option, runs_argument
 from runner.cli.removing import carry_out, dry_run_option, force_option, yes_option
+from runner.cli.runs import find
 from runner.errors import RunnerError
 from runner.runs.run import recordings_folder
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.cli.finding import suggested
 from runner.cli.options import config_argument, json_option, recordings_option, set_option, workers_option
-from runner.cli.output import amount, print_json, say, size
-from runner.cli.working import announcing, run_as_json, run_in_words
+from runner.cli.output import print_json, say
+from runner.cli.runs import command_for, compilation_notice, run_as_json, run_facts
 from runner.errors import ExitCode
+from runner.util.humanize import amount, size
 
 if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
     from rich.console import RenderableType
@@ -120,7 +120,7 @@ def _run_parallel(
 ) -> None:
     """Run an experiment's seeds side by side, and tell of each run."""
     from runner.api import interruptible, jobs_in, run_parallel
-    from runner.cli.progress import counting
+    from runner.cli.progress import count_line
     from runner.environments.loading import load_mdp
 
     load_mdp(config.env.id, config.env.kwargs, config.rewards)  # refused before all else
@@ -128,8 +128,8 @@ def _run_parallel(
     runs: list[Run] = []
     with (
         interruptible(second=signal.SIG_DFL) as interrupt,
-        announcing(),
-        counting("runs", len(config.seeds)) as done,
+        compilation_notice(),
+        count_line("runs", len(config.seeds)) as done,
     ):
         for run in run_parallel(jobs_in(config, folder), folder, name, workers, interrupt):
             runs.append(run)
@@ -138,7 +138,7 @@ def _run_parallel(
     if interrupt.came:
         for run in runs:
             if run.status == "interrupted":
-                say(f"Interrupted: {run.recording}; `{suggested(run, 'resume')}` goes on from there.")
+                say(f"Interrupted: {run.recording}; `{command_for(run, 'resume')}` goes on from there.")
         _tell_left(config, len(runs))
         ctx.exit(ExitCode.INTERRUPTED)
 
@@ -178,7 +178,7 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch
         ):
             from runner.execution.session import run_job
 
-            with announcing():
+            with compilation_notice():
                 run = run_job(job, run, report, interrupt, view)
     if view is not None and (view.dropped or view.failure):
         say(f"Recorded in full, but not all was shown live: {view.failure or 'the viewer was too slow'}.")
@@ -190,7 +190,7 @@ def _tell_interrupted(run: Run, config: ExperimentConfig, begun: int) -> None:
     done = run.summary["episodes"]
     say(f"Interrupted: {done:,} of {config.episodes:,} episodes are kept in {run.recording}.")
     if run.status == "interrupted":
-        say(f"`{suggested(run, 'resume')}` goes on from there.")
+        say(f"`{command_for(run, 'resume')}` goes on from there.")
     _tell_left(config, begun)
 
 
@@ -232,7 +232,7 @@ def _someone_answers() -> bool:
 def _summarise(run: Run, blank: bool) -> None:
     """Print what came of a run and what to type next."""
     from runner.analysis.frames import evaluation_records
-    from runner.cli.evaluations import evaluation_table, some
+    from runner.cli.evaluations import evaluation_table, spread
     from runner.cli.output import console, draw, facts
     from runner.recording.reader import open_recording
 
@@ -241,10 +241,10 @@ def _summarise(run: Run, blank: bool) -> None:
         successes = recording.environment["success_events"]
     parts: list[RenderableType] = [""] if blank else []
     if records:
-        shown = some(records)
+        shown = spread(records)
         parts.append(evaluation_table(shown, successes, console()))
         if len(shown) < len(records):
-            parts.append(f"{len(shown)} of {len(records)} evaluations; `{suggested(run, 'show')}` has all.")
+            parts.append(f"{len(shown)} of {len(records)} evaluations; `{command_for(run, 'show')}` has all.")
         parts.append("")
     draw(*parts, facts(_result(run, records[-1]["episode"] if records else None)))
 
@@ -252,14 +252,14 @@ def _summarise(run: Run, blank: bool) -> None:
 def _result(run: Run, evaluated: int | None) -> dict[str, str]:
     """Return what there is to say of a run at its end; `evaluated` is when it was last evaluated."""
     summary = run.summary
-    more = [suggested(run, "show")]
+    more = [command_for(run, "show")]
     if not summary["steps_recorded"]:
-        more += [suggested(run, "rerecord")] * (run.status == "finished")
+        more += [command_for(run, "rerecord")] * (run.status == "finished")
     elif evaluated is not None:
-        more.append(suggested(run, "play", f"--eval {evaluated}:0"))
+        more.append(command_for(run, "play", f"--eval {evaluated}:0"))
     elif summary["train_steps"]:
-        more.append(suggested(run, "play", "--episode 0"))
-    told = run_in_words(run)
+        more.append(command_for(run, "play", "--episode 0"))
+    told = run_facts(run)
     steps = (summary["train_steps"] + summary["eval_steps"]) * summary["steps_recorded"]
     if steps:
         told["file"] += f", {summary['bytes'] / steps:.0f} bytes a step"

@@ -8,22 +8,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.cli.finding import find, restored
 from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import (
-    UNKNOWN,
-    age,
-    console,
-    draw,
-    duration,
-    facts,
-    number,
-    print_json,
-    say,
-    size,
-    title,
-)
+from runner.cli.output import console, draw, facts, print_json, say, title
 from runner.cli.progress import stage_line
+from runner.cli.runs import find, restored
+from runner.util.humanize import UNKNOWN, age, duration, number, size
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

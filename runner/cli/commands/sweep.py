@@ -14,10 +14,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli import Group
-from runner.cli.options import all_option, json_option, markdown_option, recordings_option, workers_option
-from runner.cli.output import amount, draw, facts, print_json, say, size
-from runner.cli.parameters import ConfigName
+from runner.cli.options import (
+    ConfigName,
+    all_option,
+    json_option,
+    markdown_option,
+    recordings_option,
+    workers_option,
+)
+from runner.cli.output import draw, facts, print_json, say
 from runner.errors import ExitCode
+from runner.util.humanize import amount, size
 
 if TYPE_CHECKING:
     from runner.sweep.local import Workers
@@ -164,8 +171,8 @@ def show(
       dualtaxi sweep show hyperparameters
       dualtaxi sweep show hyperparameters --best best.yaml
     """  # noqa: D301 - Click wants the backspace itself
+    from runner.cli.output import print_sections, require_one_form
     from runner.cli.progress import stage_line
-    from runner.cli.sections import print_sections, require_one_form
     from runner.errors import RunnerError
     from runner.export.places import require_new, write_text_new
     from runner.runs.run import recordings_folder
@@ -256,8 +263,8 @@ def _table(sweep: Sweep) -> Iterator[Any]:
 
 def _status(sweep: Sweep, status: SweepStatus) -> dict[str, str]:
     """Return how a sweep stands, in words."""
-    from runner.cli.output import duration
     from runner.sweep.results import reading, words
+    from runner.util.humanize import duration
 
     left = status.runs - status.done - status.failed
     here = status.begun - status.running

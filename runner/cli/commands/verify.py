@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import UNKNOWN, draw, facts, print_json
-from runner.cli.working import at_work, recording_of, refuse_running
+from runner.cli.output import draw, facts, print_json
+from runner.cli.runs import find_recording, job_progress, require_over
 from runner.errors import ExitCode
+from runner.util.humanize import UNKNOWN
 
 if TYPE_CHECKING:
     from runner.errors import Diverged
@@ -46,12 +47,12 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
     from runner.cli.progress import bytes_line
     from runner.execution.verify import damage_of, verify
 
-    path, run = recording_of(run_name, recordings)
-    refuse_running(run)
+    path, run = find_recording(run_name, recordings)
+    require_over(run)
     episodes = (run.episodes_to_do or 0) if run else 0
     with bytes_line("reading") as reading:
         damage = damage_of(path, reading)
-    with at_work("verifying", episodes) as (report, _):
+    with job_progress("verifying", episodes) as (report, _):
         found = verify(path, rerun, report, damage)
     if as_json:
         print_json(_as_json(found, rerun))

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.choosing import choice_options, request_of, tell
-from runner.cli.finding import find_recorded
-from runner.cli.options import recordings_option
+from runner.cli.choosing import request_of, tell
+from runner.cli.options import PICTURE_SIZE, STEP, RunName, recordings_option, selection_options
 from runner.cli.output import say
-from runner.cli.parameters import PictureSize, RunName, StepReference
+from runner.cli.runs import find_recorded
 
 if TYPE_CHECKING:
     from runner.export.rerun.positions import Spot
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 @click.option(
     "--at",
     "spot",
-    type=StepReference(),
+    type=STEP,
     metavar="EPISODE:T",
     help="The point in training to show: EPISODE:T, or eval:N:TRIAL:T of an evaluation. "
     "T and TRIAL default to 0.",
@@ -47,14 +46,14 @@ if TYPE_CHECKING:
 @click.option(
     "--size",
     "picture_size",
-    type=PictureSize(),
+    type=PICTURE_SIZE,
     default="1600x900",
     show_default=True,
     metavar="WxH",
     help="Size of the screenshot in pixels.",
 )
 @click.option("--force", is_flag=True, help="Replace the screenshot if it exists.")
-@choice_options
+@selection_options
 @recordings_option
 def command(
     run_names: tuple[str, ...],
@@ -86,7 +85,7 @@ def command(
     if len(run_names) > 2:
         raise click.UsageError(f"found {len(run_names)} runs, expected one or two.")
     from runner.cli.progress import stage_line
-    from runner.cli.working import announcing
+    from runner.cli.runs import compilation_notice
     from runner.export.places import require_new
     from runner.export.rerun.viewer import require_rerun
 
@@ -107,7 +106,7 @@ def command(
         if parting is not None:
             _tell_steps(place.time, with_spot(runs[1], request, parting).time)
         stage("exporting")
-        with announcing():
+        with compilation_notice():
             path, selections = exported(runs, place.request)
     for selection in selections:
         tell(selection)

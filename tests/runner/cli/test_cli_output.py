@@ -5,10 +5,11 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from runner.cli import cli, output
-from runner.cli.evaluations import evaluation_table, some
+from runner.cli.evaluations import evaluation_table, spread
 from runner.config import from_mapping
 from runner.drawing.text import Drawing, signs
 from runner.execution.estimate import estimate, step_limit
+from runner.util import humanize
 
 
 @pytest.mark.parametrize(
@@ -32,7 +33,7 @@ from runner.execution.estimate import estimate, step_limit
     ],
 )
 def test_size(count, words):
-    assert output.size(count) == words
+    assert humanize.size(count) == words
 
 
 @pytest.mark.parametrize(
@@ -40,7 +41,7 @@ def test_size(count, words):
     [(0, "0"), (9_999, "9,999"), (12_345, "12 thousand"), (1_940_000, "1.9 million"), (2e9, "2.0 billion")],
 )
 def test_amount(count, words):
-    assert output.amount(count) == words
+    assert humanize.amount(count) == words
 
 
 @pytest.mark.parametrize(
@@ -48,19 +49,19 @@ def test_amount(count, words):
     [(-1, "0.0 s"), (0.83, "0.8 s"), (59.4, "59 s"), (125, "2 min 5 s"), (4320, "1 h 12 min"), (3e5, "3 d")],
 )
 def test_duration(seconds, words):
-    assert output.duration(seconds) == words
+    assert humanize.duration(seconds) == words
 
 
 @pytest.mark.parametrize(
     ("seconds", "words"), [(-3, "0 s"), (59, "59 s"), (61, "1 min"), (7300, "2 h"), (1e6, "11 d")]
 )
 def test_age(seconds, words):
-    assert output.age(seconds) == words
+    assert humanize.age(seconds) == words
 
 
 def test_numbers_that_are_unknown_are_a_dash():
-    assert [output.number(value) for value in (None, float("nan"), 98.54)] == ["–", "–", "98.5"]
-    assert output.number(1234.5, 0) == "1,234"
+    assert [humanize.number(value) for value in (None, float("nan"), 98.54)] == ["–", "–", "98.5"]
+    assert humanize.number(1234.5, 0) == "1,234"
 
 
 def test_json_has_no_nan(capsys):
@@ -130,10 +131,10 @@ def test_an_environment_without_events():
 
 def test_some_evaluations_stand_for_many():
     records = [_record({}, episode) for episode in range(0, 51_000, 1000)]
-    shown = [record["episode"] for record in some(records)]
+    shown = [record["episode"] for record in spread(records)]
     assert (len(shown), shown[0], shown[-1]) == (20, 0, 50_000)
     assert shown == sorted(set(shown))
-    assert some(records[:20]) == records[:20]
+    assert spread(records[:20]) == records[:20]
 
 
 SCENE = {

@@ -1,0 +1,193 @@
+"""What commands on recorded runs share: find them, work on them, print what came of it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import signal
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from runner.archive.places import at_hand
+from runner.cli.output import draw, facts, print_json, say
+from runner.cli.progress import progress_line, steps_line
+from runner.errors import RecordingError, RunnerError, RunNotFound
+from runner.runs.resolve import find_run, find_runs
+from runner.runs.run import RECORDING_FILE, RUN_FILE, recordings_folder
+from runner.util.humanize import UNKNOWN, duration, size
+
+if TYPE_CHECKING:
+    from runner.api import Interrupt
+    from runner.execution.session import Report
+    from runner.runs.run import Run
+
+# --- finding ----------------------------------------------------------------------------------------------
+
+
+def find(name: str, recordings: Path | None) -> Run:
+    """Return the run of a name or path in a recordings folder."""
+    return find_run(name, recordings, report=say)
+
+
+def find_recorded(name: str, recordings: Path | None) -> Run:
+    """Return the run of a name with its recording, restored into the cache if it is archived."""
+    return recorded(find(name, recordings))
+
+
+def find_all_recorded(names: Iterable[str], recordings: Path | None) -> list[Run]:
+    """Return all runs of these names, each once, with their recordings."""
+    runs: dict[Path, Run] = {}
+    for name in names:
+        for run in find_runs(name, recordings_folder(recordings), say):
+            runs.setdefault(run.recording.absolute(), run)
+    return [recorded(run) for run in runs.values()]
+
+
+def recorded(run: Run) -> Run:
+    """Return a run with its recording, restored into the cache if it is archived.
+
+    Raises:
+        RunnerError: the recording is missing.
+    """
+    run = restored(run)
+    if run.recording.exists():
+        return run
+    if run.status == "running":
+        raise RunnerError(f"run {run.run_id} has no recording yet: it has just begun.")
+    if "made_by" in run.file.config:
+        raise RunnerError(
+            f"run {run.run_id} has no recording, and only the loop that recorded it can make another."
+        )
+    raise RunnerError(
+        f"run {run.run_id} has no recording: {run.recording} is missing. "
+        f"`{command_for(run, 'resume')}` trains it from the beginning."
+    )
+
+
+def restored(run: Run) -> Run:
+    """Return a run, restored into the cache if it is archived."""
+    if run.status != "archived":
+        return run
+    with steps_line(f"restoring {run.run_id}") as report:
+        return at_hand(run, say, report)
+
+
+def find_recording(name: str, recordings: Path | None) -> tuple[Path, Run | None]:
+    """Return a recording, however damaged, by run name or path; and its run, if it is in a run's folder.
+
+    Raises:
+        RunnerError: there is no such recording.
+    """
+    try:
+        run = find_recorded(name, recordings)
+        in_folder = run.recording.name == RECORDING_FILE and (run.folder / RUN_FILE).is_file()
+        return run.recording, run if in_folder else None
+    except (RunNotFound, RecordingError):
+        folders = (Path(name), recordings_folder(recordings) / name)
+        for path in (Path(name), *(folder / RECORDING_FILE for folder in folders)):
+            if path.is_file():
+                return path, None
+        raise
+
+
+def require_over(run: Run | None) -> None:
+    """Refuse a run that is still running.
+
+    Raises:
+        RunnerError: it is.
+    """
+    if run is not None and run.status == "running":
+        raise RunnerError(f"run {run.run_id} is running; wait until it has finished, or interrupt it.")
+
+
+def command_for(run: Run, verb: str, *options: str) -> str:
+    """Return the command line of a verb for a run, with --recordings if its folder is not the default."""
+    words, root = ["dualtaxi", verb, run.run_id, *options], run.folder.parent
+    if root.absolute() != recordings_folder().absolute():
+        words += ["--recordings", shlex.quote(os.fspath(root))]
+    return " ".join(words)
+
+
+# --- working ----------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def compilation_notice() -> Iterator[None]:
+    """Print a notice when a kernel is compiled, which takes seconds the first time."""
+    from runner.learning.compilation import MESSAGE, announced
+
+    with announced(lambda: say(MESSAGE)):
+        yield
+
+
+@contextlib.contextmanager
+def job_progress(label: str, episodes: int) -> Iterator[tuple[Report, Interrupt]]:
+    """Yield the function that a job reports its progress to, and whether it was interrupted."""
+    from runner.api import interruptible
+
+    with (
+        interruptible(second=signal.SIG_DFL) as interrupt,
+        progress_line(label, episodes) as report,
+        compilation_notice(),
+    ):
+        yield report, interrupt
+
+
+# --- printing ---------------------------------------------------------------------------------------------
+
+
+def identity(run: Run) -> dict[str, Any]:
+    """Return what identifies a run, as JSON."""
+    path = str(run.recording.absolute())
+    return {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status, "path": path}
+
+
+def run_as_json(run: Run) -> dict[str, Any]:
+    """Return a run that is over and its results as JSON."""
+    summary = _summary(run)
+    keys = ("content_digest", "episodes", "train_steps", "eval_steps", "seconds", "bytes", "last_evaluation")
+    return identity(run) | {key: summary.get(key) for key in keys}
+
+
+def run_facts(run: Run) -> dict[str, str]:
+    """Return a run that is over and its results as text by name."""
+    summary = _summary(run)
+    took = "" if summary.get("seconds") is None else f", in {duration(summary['seconds'])}"
+    return {
+        "run": f"{run.run_id}  {run.title}, {run.status}",
+        "steps": f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation{took}",
+        "digest": summary.get("content_digest") or UNKNOWN,
+        "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
+    }
+
+
+def _summary(run: Run) -> Mapping[str, Any]:
+    """Return the summary of a run; of one that was killed, what its recording holds."""
+    from runner.recording.reader import open_recording
+
+    if run.summary.train_steps is not None and run.summary.eval_steps is not None:
+        return run.summary
+    with open_recording(run.recording) as recording:
+        return {**recording.done(), **run.summary}
+
+
+def print_received(run: Run, digest: str, existing: str, as_json: bool, **more: object) -> None:
+    """Print a run that was imported or downloaded.
+
+    Args:
+        run: the run in the recordings folder.
+        digest: its content digest.
+        existing: what was in the folder before, such as `this content`; empty if the run is new.
+        as_json: print JSON.
+        more: further keys of the JSON object.
+    """
+    if existing:
+        say(f"Run {run.run_id} is there already with {existing}; nothing was written.")
+    if as_json:
+        print_json(identity(run) | {"already": bool(existing), "content_digest": digest} | more)
+        return
+    file = f"{run.recording}  {size(run.recording.stat().st_size)}"
+    title = f"{run.run_id}  {run.title}, {run.status}"
+    draw(facts({"run": title, "digest": digest, "file": file, "next": command_for(run, "show")}))
