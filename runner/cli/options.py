@@ -106,7 +106,7 @@ def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
 
 
 def _filter_words(_ctx: click.Context, incomplete: str) -> Mapping[str, str]:
-    from runner.runs.catalogue.fields import FIELDS, SETTING, STATUSES
+    from runner.runs.catalogue.columns import FIELDS, SETTING, STATUSES
 
     if incomplete.startswith("status:"):
         return {f"status:{status}": "" for status in STATUSES}
