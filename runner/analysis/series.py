@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 
 from runner.environments.naming import event_in_words
+from runner.errors import RunnerError
 from runner.recording.metrics import LARGEST, METRIC_OF, SHARES
 
 Readings = dict[str, dict[str, float]]
@@ -83,6 +85,37 @@ def title_of(metric: str) -> tuple[str, str]:
         name = " ".join(metric.removeprefix(LOGGED).split())
         return f"Logged: {name if len(name) <= _TITLE else name[: _TITLE - 1] + '…'}", "as logged, mean"
     return METRIC_OF[metric].title, METRIC_OF[metric].unit
+
+
+def first_crossing(points: Mapping[int, float], level: float) -> int | None:
+    """Return the first episode at which a curve is at a level, or on the other side than where it began."""
+    below = points[min(points)] < level
+    for episode in sorted(points):
+        if points[episode] >= level if below else points[episode] <= level:
+            return episode
+    return None
+
+
+def mean_height(episodes: Sequence[int], values: Sequence[float]) -> float:
+    """Return the area under a curve, by the trapezoid rule, over its span; nan for fewer than two points."""
+    if len(episodes) < 2:
+        return math.nan
+    return float(np.trapezoid(values, episodes)) / (episodes[-1] - episodes[0])
+
+
+def parse_target(text: str) -> tuple[str, float]:
+    """Return metric and level of a target such as `success_percent=80`.
+
+    Raises:
+        RunnerError: the text is no target.
+    """
+    metric, _, level = text.partition("=")
+    try:
+        return metric, float(level)
+    except ValueError:
+        raise RunnerError(
+            f"target: found {text!r}, expected METRIC=LEVEL such as success_percent=80."
+        ) from None
 
 
 def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[int, float]:

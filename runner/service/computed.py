@@ -193,14 +193,14 @@ def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequ
         RecordingError: a recording cannot be read.
         RunnerError: a target is none.
     """
-    from runner.analysis.diff import diff
-    from runner.analysis.diff.asked import as_json as told
-    from runner.analysis.diff.asked import level_of, with_seconds, without
+    from runner.analysis import diff as differences
+    from runner.analysis.series import parse_target
 
-    levels = dict(level_of(target) for target in targets)
+    levels = dict(parse_target(target) for target in targets)
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
-        found = diff(ours, theirs, levels, first)
-    return as_json(told(without(found if first else with_seconds(found, a, b), ignore)))
+        found = differences.diff(ours, theirs, levels, first)
+    found = found if first else differences.with_seconds(found, a, b)
+    return as_json(differences.as_json(differences.without_ignored(found, ignore)))
 
 
 def comparison(

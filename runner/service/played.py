@@ -98,12 +98,11 @@ def learned(path: Path) -> bytes:
 
 def difference(a: Run, b: Run) -> bytes:
     """Return in what two runs differ, as JSON: what the page of `dualtaxi diff` tells and shows."""
-    from runner.analysis.diff import diff
-    from runner.analysis.diff.asked import with_seconds, without
+    from runner.analysis.diff import diff, with_seconds, without_ignored
     from runner.export.reports.diff import told_of
 
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
-        told = told_of(without(with_seconds(diff(ours, theirs), a, b), ()), ours, theirs)
+        told = told_of(without_ignored(with_seconds(diff(ours, theirs), a, b), ()), ours, theirs)
     return json.dumps(told, default=asdict).encode()
 
 

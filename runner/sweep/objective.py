@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from runner.analysis.compare.moments import first_crossing
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.frames import evaluation_record
 from runner.analysis.readings import evaluation_readings, exact_readings, training_readings
+from runner.analysis.series import first_crossing, mean_height
 from runner.errors import RunnerError, nearest
 from runner.recording.reader import Recording
 from runner.sweep.model import Objective
@@ -94,7 +94,7 @@ def value_of(objective: Objective, curve: Curve) -> float:
         case "area":
             if len(values) == 1:
                 return values[0]
-            return float(np.trapezoid(values, episodes)) / (episodes[-1] - episodes[0])
+            return mean_height(episodes, values)
         case "first_over":
             assert objective.level is not None
             at = first_crossing(curve, objective.level)

@@ -6,11 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
-from runner.analysis.series import RunSeries, has_goal, points_of
+from runner.analysis.series import RunSeries, first_crossing, has_goal, mean_height, parse_target, points_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF
 
@@ -64,12 +62,8 @@ def moment_of(at: str, target: str | None, chosen: Sequence[str]) -> tuple[Momen
     if target is not None:
         if at != "last" or chosen:
             raise RunnerError("target: found at or a metric as well, expected it alone.")
-        metric, _, level = target.partition("=")
-        try:
-            return Moment("crossing", level=float(level)), (metric,)
-        except ValueError:
-            message = f"target: found {target!r}, expected METRIC=LEVEL such as success_percent=80."
-            raise RunnerError(message) from None
+        metric, level = parse_target(target)
+        return Moment("crossing", level=level), (metric,)
     if at.isascii() and at.isdecimal():
         return Moment("episode", number=int(at)), chosen
     if at not in ("last", "best", "area"):
@@ -104,15 +98,6 @@ def _of_curve(points: dict[int, float], higher: bool | None, moment: Moment) -> 
     return points[max(points)]
 
 
-def first_crossing(points: dict[int, float], level: float) -> int | None:
-    """Return the first episode at which a curve is at a level, or on the other side than at its beginning."""
-    below = points[min(points)] < level
-    for episode in sorted(points):
-        if points[episode] >= level if below else points[episode] <= level:
-            return episode
-    return None
-
-
 def _shared_episodes(metric: str, line: str, groups: Sequence[Group]) -> list[int]:
     """Return the episodes at which every finished run that has the metric has it."""
     runs = [run for group in groups for run in group.runs if run.finished]
@@ -123,5 +108,4 @@ def _shared_episodes(metric: str, line: str, groups: Sequence[Group]) -> list[in
 def _area(points: dict[int, float], episodes: Sequence[int]) -> tuple[float | None, str]:
     if len(episodes) < 2:
         return None, "fewer than two evaluations after as many episodes as in the other runs"
-    values = [points[episode] for episode in episodes]
-    return float(np.trapezoid(values, episodes)) / (episodes[-1] - episodes[0]), ""
+    return mean_height(episodes, [points[episode] for episode in episodes]), ""

@@ -1,54 +1,51 @@
-"""What differs between two runs: one object, which text, JSON, Markdown and HTML are made of.
+"""What differs between two runs: one object, from which text, JSON, Markdown and HTML are rendered.
 
 with open_recording(path_a) as a, open_recording(path_b) as b:
     difference = diff(a, b)
-print(difference.parting, difference.cause)
+print(difference.divergence, difference.cause)
 """
 
 from __future__ import annotations
 
+import dataclasses
+import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final, TypedDict
 
-from runner.analysis.diff.causes import Cause, Row, Update, cause_of, kind_of
-from runner.analysis.diff.loops import (
-    comparable,
-    loop_environment_diff,
-    loop_means,
-    loop_parting,
-    parted_topics,
+from runner.analysis.diff.causes import Cause, Row, Update, find_cause, find_kind
+from runner.analysis.diff.divergence import (
+    Divergence,
+    evaluation_divergences,
+    have_same_spaces,
+    loop_divergence,
+    training_divergence,
+    unbroken,
 )
-from runner.analysis.diff.metrics import MetricDiff, metric_diffs
+from runner.analysis.diff.metrics import MetricDiff, loop_means, metric_diffs
+from runner.analysis.diff.overlap import Overlap, StateVisits, VisitsDiff, training_overlap, visits_diff
 from runner.analysis.diff.settings import (
     Change,
     EnvironmentDiff,
     TransitionChange,
-    alike_in,
     changes_in,
     environment_diff,
+    equal_values,
+    loop_environment_diff,
 )
 from runner.analysis.diff.tables import Cell, TableDiff, table_diffs
-from runner.analysis.diff.trajectory import (
-    Overlap,
-    Parting,
-    evaluation_partings,
-    training_overlap,
-    training_parting,
-    unbroken,
-)
-from runner.analysis.diff.visits import StateVisits, VisitsDiff, visits_diff
 from runner.recording import schema
 from runner.recording.reader import Recording
+from runner.runs.run import Run
 
 __all__ = [
     "Cause",
     "Cell",
     "Change",
+    "Divergence",
     "EnvironmentDiff",
     "MetricDiff",
     "Overlap",
-    "Parting",
     "Row",
     "RunDiff",
     "StateVisits",
@@ -56,37 +53,48 @@ __all__ = [
     "TransitionChange",
     "Update",
     "VisitsDiff",
+    "as_json",
     "can_compare_steps",
     "diff",
+    "with_seconds",
+    "without_ignored",
 ]
 
-NOT_CONTENT = ("name", "recording")
+NOT_CONTENT: Final = ("name", "recording")
 """Keys of the configuration whose difference alone leaves the content the same."""
+_BY_PATH: Final = ("config", "provenance", "costs")
+"""Fields of a `RunDiff` that are lists of values by path."""
 
 
-PARTS = ("config", "provenance", "costs")
-"""What of a `RunDiff` is a list of values by path."""
+class Identity(TypedDict):
+    """What identifies a run."""
+
+    run_id: str
+    name: str
+    seed: int | None
+    status: str
 
 
 @dataclass(frozen=True)
 class RunDiff:
-    """Everything in which two runs differ; `a` and `b` say who they are."""
+    """Everything in which two runs, `a` and `b`, differ."""
 
-    a: dict[str, Any]
-    b: dict[str, Any]
+    a: Identity
+    b: Identity
     same_content: bool
     """Whether both are finished and have the same content digest."""
     config: list[Change]
     provenance: list[Change]
     environment: EnvironmentDiff
-    parting: Parting | None = None
+    divergence: Divergence | None = None
+    """The first step of training that differs."""
     cause: Cause | None = None
+    """Why it differs; None for loops, whose learning is unknown."""
     overlap: Overlap | None = None
     visits: VisitsDiff | None = None
-    evaluations: list[tuple[Parting, Cause]] = field(default_factory=list)
-    """The first evaluation that parts: where, and why; empty if none does."""
-    loop_evaluation: Parting | None = None
-    """The first step of evaluation at which somebody's own loops part."""
+    evaluation_divergence: Divergence | None = None
+    """The first step of evaluation that differs."""
+    evaluation_cause: Cause | None = None
     tables: list[TableDiff] = field(default_factory=list)
     metrics: list[MetricDiff] = field(default_factory=list)
     costs: list[Change] = field(default_factory=list)
@@ -94,7 +102,7 @@ class RunDiff:
     alike: dict[str, dict[str, Any]] = field(default_factory=dict)
     """What is the same in both, by path, of config, provenance and costs."""
     ignored: list[str] = field(default_factory=list)
-    """Paths of what differs, and was left out as asked."""
+    """Paths that differ but were excluded by the options."""
     notes: list[str] = field(default_factory=list)
     """What could not be compared, and why."""
 
@@ -107,99 +115,136 @@ def diff(
     Args:
         a: one run, finished or not.
         b: another.
-        targets: metric to a level, whose first crossing is to be told.
-        first: only settings, the first step of training at which they part, and what differs there; why the
-            tables came to differ is left out.
+        targets: metric to a level, whose first crossing is reported.
+        first: compare only settings, and where and in what training first diverges, not the tables.
     """
-    if not (a.is_job and b.is_job):
-        return _diff_of_loops(a, b)
+    jobs = a.is_job and b.is_job
     digests = [recording.result.content_digest for recording in (a, b)]
     same = digests[0] is not None and digests[0] == digests[1]
-    notes = _notes(a, b)
-    facts: dict[str, Any] = {
-        "a": _who(a),
-        "b": _who(b),
-        "same_content": same,
-        "environment": environment_diff(a.mdp, b.mdp),
-        "notes": notes,
-        **_values(a, b, ("config",) if first else PARTS),
-    }
-    if same:
-        return RunDiff(**facts)
+    changes, alike = _values_by_path(a, b, ("config",) if first and jobs else _BY_PATH)
+    difference = RunDiff(
+        a=_identity(a),
+        b=_identity(b),
+        same_content=same,
+        environment=environment_diff(a.mdp, b.mdp) if jobs else loop_environment_diff(a, b),
+        config=changes["config"],
+        provenance=changes["provenance"],
+        costs=changes["costs"],
+        alike=alike,
+    )
+    if not jobs:
+        return dataclasses.replace(difference, **_diff_loops(a, b, same))
+    facts: dict[str, Any] = {"notes": _notes(a, b)}
     seen = None
-    if can_compare_steps(a, b):
-        parting = training_parting(a, b)
-        cause = None if parting is None else (kind_of if first else cause_of)(parting, a, b)
-        facts |= {"parting": parting, "cause": cause}
+    if not same and can_compare_steps(a, b):
+        divergence = training_divergence(a, b)
+        cause = None if divergence is None else (find_kind if first else find_cause)(divergence, a, b)
+        facts |= {"divergence": divergence, "cause": cause}
         if not first:
             facts["overlap"], visits = training_overlap(a, b)
             facts["visits"] = visits_diff(a.mdp, *visits)
             seen = visits[0] + visits[1]
-            known = None if parting is None or cause is None else (parting, cause)
-            parted = next(evaluation_partings(a, b), None)
-            facts["evaluations"] = [] if parted is None else [(parted, cause_of(parted, a, b, known))]
-    if first:
-        return RunDiff(**facts)
-    facts["tables"] = list(table_diffs(a, b, seen)) if _same_sizes(a, b) else []
-    facts["metrics"] = metric_diffs(a, b, targets or {})
-    return RunDiff(**facts)
+            known = None if divergence is None or cause is None else (divergence, cause)
+            if (found := next(evaluation_divergences(a, b), None)) is not None:
+                facts["evaluation_divergence"] = found
+                facts["evaluation_cause"] = find_cause(found, a, b, known)
+    if not same and not first:
+        facts["tables"] = list(table_diffs(a, b, seen)) if _same_sizes(a, b) else []
+        facts["metrics"] = metric_diffs(a, b, targets or {})
+    return dataclasses.replace(difference, **facts)
 
 
-def _diff_of_loops(a: Recording, b: Recording) -> RunDiff:
-    """Return in what two runs differ of which one is somebody's own loop."""
-    digests = [recording.result.content_digest for recording in (a, b)]
-    same = digests[0] is not None and digests[0] == digests[1]
-    notes = ["recorded from a loop: what it learned is not known, so no cause and no tables are told"]
-    alike = comparable(a, b)
-    if not alike:
-        notes.append("the environments have other spaces: no steps are compared")
-    partings = [loop_parting(a, b, phase) if alike and not same else None for phase in ("train", "eval")]
-    if alike and not any(partings) and (topics := parted_topics(a, b)):
-        notes.append(f"all steps are the same; what differs is in {', '.join(topics)}")
-    return RunDiff(
-        a=_who(a),
-        b=_who(b),
-        same_content=same,
-        environment=loop_environment_diff(a, b),
-        parting=partings[0],
-        loop_evaluation=partings[1],
-        notes=notes,
-        **_values(a, b, PARTS),
-    )
+def with_seconds(difference: RunDiff, a: Run, b: Run) -> RunDiff:
+    """Return the difference with the duration of the runs, which recordings do not hold."""
+    seconds = [{"seconds": run.summary.get("seconds")} for run in (a, b)]
+    return dataclasses.replace(difference, costs=[*difference.costs, *changes_in(*seconds)])
 
 
-def _values(a: Recording, b: Recording, parts: Sequence[str]) -> dict[str, Any]:
-    """Return what differs in these parts of a `RunDiff`, nothing for the others; and what is alike."""
-    jobs = a.is_job and b.is_job
-    told = {
-        "config": (_settings(a), _settings(b)),
-        "provenance": (a.provenance, b.provenance),
-        "costs": [_costs(one) | ({} if jobs else loop_means(one)) for one in (a, b)],
+def without_ignored(difference: RunDiff, ignore: Sequence[str], everything: bool = False) -> RunDiff:
+    """Return the difference without the paths that match a pattern; they are listed as ignored.
+
+    Args:
+        difference: of two runs.
+        ignore: patterns of paths.
+        everything: also keep what is alike.
+    """
+
+    def is_ignored(path: str) -> bool:
+        return any(fnmatch.fnmatchcase(path, pattern) for pattern in ignore)
+
+    changes: dict[str, list[Change]] = {name: getattr(difference, name) for name in _BY_PATH}
+    facts: dict[str, Any] = {
+        name: [change for change in some if not is_ignored(change.path)] for name, some in changes.items()
     }
-    changes = {part: changes_in(*told[part]) if part in parts else [] for part in PARTS}
-    return changes | {"alike": {part: alike_in(*told[part]) for part in parts}}
+    facts["alike"] = {
+        name: {path: value for path, value in values.items() if not is_ignored(path)}
+        for name, values in difference.alike.items()
+        if everything
+    }
+    ignored = [change.path for some in changes.values() for change in some if is_ignored(change.path)]
+    return dataclasses.replace(difference, **facts, ignored=ignored)
 
 
-def _same_sizes(a: Recording, b: Recording) -> bool:
-    """Return whether states and actions of both can be the same."""
-    return a.mdp.next_state.shape[:2] == b.mdp.next_state.shape[:2]
+def as_json(difference: RunDiff) -> dict[str, Any]:
+    """Return the difference as JSON can hold it, without the whole records of steps."""
+    facts = dataclasses.asdict(difference)
+    for divergence in (facts["divergence"], facts["evaluation_divergence"]):
+        if divergence is not None:
+            del divergence["a_step"], divergence["b_step"]
+    return facts
 
 
 def can_compare_steps(a: Recording, b: Recording) -> bool:
-    """Return whether both have steps, of as many states and actions."""
+    """Return whether two jobs have recorded steps of the same number of states and actions."""
     return _same_sizes(a, b) and all(recording.count(schema.TRAIN_STEP) for recording in (a, b))
 
 
-def _who(recording: Recording) -> dict[str, Any]:
-    run = recording.run
-    named = {"run_id": run["run_id"], "name": recording.name, "seed": recording.seed}
-    return named | {"status": recording.status}
+def _same_sizes(a: Recording, b: Recording) -> bool:
+    return a.mdp.next_state.shape[:2] == b.mdp.next_state.shape[:2]
 
 
-def _settings(recording: Recording) -> dict[str, Any]:
-    """Return the configuration with the run's own seed instead of the list."""
-    settings = {key: value for key, value in recording.config.items() if key != "seeds"}
-    return settings | {"seed": recording.seed}
+def _diff_loops(a: Recording, b: Recording, same: bool) -> dict[str, Any]:
+    """Return what else differs of two runs of which one is a loop."""
+    notes = ["recorded from a loop: what it learned is unknown, so neither a cause nor tables are reported"]
+    comparable = have_same_spaces(a, b)
+    if not comparable:
+        notes.append("the environments have other spaces: no steps are compared")
+    train, evaluation = (
+        loop_divergence(a, b, phase) if comparable and not same else None for phase in ("train", "eval")
+    )
+    digests = [recording.result.topic_digests for recording in (a, b)]
+    if comparable and train is evaluation is None and all(digests):
+        names = digests[0].keys() | digests[1].keys()
+        differing = sorted(name for name in names if digests[0].get(name) != digests[1].get(name))
+        if differing:
+            notes.append(f"all steps are the same; what differs is in {', '.join(differing)}")
+    return {"divergence": train, "evaluation_divergence": evaluation, "notes": notes}
+
+
+def _identity(recording: Recording) -> Identity:
+    return {
+        "run_id": recording.run_id,
+        "name": recording.name,
+        "seed": recording.seed,
+        "status": recording.status,
+    }
+
+
+def _values_by_path(
+    a: Recording, b: Recording, names: Sequence[str]
+) -> tuple[dict[str, list[Change]], dict[str, dict[str, Any]]]:
+    """Return what differs in these fields of a `RunDiff`, nothing for the others, and what is alike."""
+    jobs = a.is_job and b.is_job
+    values = {
+        "config": [
+            {key: value for key, value in one.config.items() if key != "seeds"} | {"seed": one.seed}
+            for one in (a, b)
+        ],
+        "provenance": [one.provenance for one in (a, b)],
+        "costs": [_costs(one) | ({} if jobs else loop_means(one)) for one in (a, b)],
+    }
+    changes = {name: changes_in(*values[name]) if name in names else [] for name in _BY_PATH}
+    return changes, {name: equal_values(*values[name]) for name in names}
 
 
 def _costs(recording: Recording) -> dict[str, Any]:

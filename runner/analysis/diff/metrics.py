@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-import numpy as np
-
+from runner.analysis.series import first_crossing, mean_height
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRIC_OF, METRICS
 from runner.recording.reader import Recording
+from runner.recording.schema import TRAIN_EPISODE
 
 _COMPARED: Final = (*METRICS, METRIC_OF["training.mean_length"], METRIC_OF["training.percent_filled"])
 
@@ -29,10 +29,9 @@ class MetricDiff:
     """The last value of all, also where the other has none."""
     end_b: float
     area: float
-    """Area between the curves by the trapezoid rule, over the episodes both have, by their span: a mean
-    difference b - a."""
+    """Mean difference b - a: the area between the curves over the episodes both have, by their span."""
     crossings: dict[str, tuple[int | None, int | None]] = field(default_factory=dict)
-    """Level asked for, as text, to the episodes at which a and b first reach it."""
+    """Target level, as text, to the episodes at which a and b first reach it."""
 
     @property
     def same(self) -> bool:
@@ -46,7 +45,7 @@ def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> li
     Args:
         a: one run.
         b: another.
-        targets: metric to a level, whose first crossing is to be told.
+        targets: metric to a level, whose first crossing is reported.
 
     Raises:
         RunnerError: they have no metric of that name.
@@ -77,16 +76,19 @@ def _values(recording: Recording) -> dict[str, dict[int, float]]:
 def _metric_diff(name: str, a: dict[int, float], b: dict[int, float], level: float | None) -> MetricDiff:
     episodes = sorted(a.keys() & b.keys())
     left, right = [a[e] for e in episodes], [b[e] for e in episodes]
-    span = episodes[-1] - episodes[0] if len(episodes) > 1 else 0
-    area = float(np.trapezoid(np.subtract(right, left), episodes)) / span if span else math.nan
-    crossings = {} if level is None else {f"{level:g}": (_crossing(a, level), _crossing(b, level))}
+    area = mean_height(episodes, [y - x for x, y in zip(left, right, strict=True)])
+    crossings = {} if level is None else {f"{level:g}": (first_crossing(a, level), first_crossing(b, level))}
     return MetricDiff(name, episodes, left, right, a[max(a)], b[max(b)], area, crossings)
 
 
-def _crossing(values: dict[int, float], level: float) -> int | None:
-    """Return the first episode at which a curve is on the other side of a level than at its beginning."""
-    first = values[min(values)]
-    for episode in sorted(values):
-        if values[episode] >= level if first < level else values[episode] <= level:
-            return episode
-    return None
+def loop_means(recording: Recording) -> dict[str, float]:
+    """Return mean length and return over the training episodes of a recording; nothing without any."""
+    episodes = length = 0
+    total = 0.0
+    for block in recording.blocks(TRAIN_EPISODE):
+        episodes += len(block)
+        length += int(block["length"].sum())
+        total += float(block["returns"].sum())
+    if not episodes:
+        return {}
+    return {"mean_length": round(length / episodes, 3), "mean_return": round(total / episodes, 3)}

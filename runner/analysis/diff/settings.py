@@ -1,20 +1,21 @@
-"""What two runs were asked to do, what made them, and in what environment: the differences."""
+"""How configurations and environments of two runs differ, down to single transitions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
+from runner.recording.reader import Recording
 from runner.util.values import flatten
 
-EXAMPLES = 10
-"""How many differing transitions are spelled out."""
+_MAX_EXAMPLES: Final = 10
+"""Differing transitions that are described."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def changes_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Change]:
     paths = dict.fromkeys([*left, *right])
 
     def filled(path: str) -> bool:
-        """Whether a mapping is empty in one, and what the other has in it is told anyway."""
+        """Return whether a mapping is empty in one, and the other's entries in it are listed anyway."""
         return {} in (left.get(path), right.get(path)) and any(p.startswith(f"{path}.") for p in paths)
 
     return [
@@ -71,8 +72,8 @@ def changes_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[Change]:
     ]
 
 
-def alike_in(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what two nested mappings have alike, by dotted path."""
+def equal_values(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values that two nested mappings share, by dotted path."""
     left, right = flatten(a, keep_empty=True), flatten(b, keep_empty=True)
     return {path: value for path, value in left.items() if path in right and right[path] == value}
 
@@ -89,9 +90,15 @@ def environment_diff(a: Mdp, b: Mdp) -> EnvironmentDiff:
         description=description,
         transitions=len(pairs),
         of=differs.size,
-        examples=_examples(a, b, pairs[:: max(1, len(pairs) // EXAMPLES)][:EXAMPLES]),
+        examples=_examples(a, b, pairs[:: max(1, len(pairs) // _MAX_EXAMPLES)][:_MAX_EXAMPLES]),
         other_starts=not np.array_equal(a.start, b.start),
     )
+
+
+def loop_environment_diff(a: Recording, b: Recording) -> EnvironmentDiff:
+    """Return how the descriptions of two environments and their spaces differ."""
+    described = [{"spaces": {} if one.is_job else one.spaces, **one.environment} for one in (a, b)]
+    return EnvironmentDiff(changes_in(*described))
 
 
 def _pairs_that_differ(a: Mdp, b: Mdp) -> NDArray[np.bool_]:

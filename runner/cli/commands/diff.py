@@ -71,29 +71,28 @@ def command(
       dualtaxi diff tutorial_cooperative cooperative --target success_percent=80
       dualtaxi diff first second --html difference.html
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.analysis.diff import diff
-    from runner.analysis.diff.asked import as_json as told
-    from runner.analysis.diff.asked import level_of, with_seconds, without
+    from runner.analysis import diff as differences
+    from runner.analysis.series import parse_target
     from runner.cli.progress import stage_line
     from runner.recording.reader import open_recording
 
     require_one_form(as_json, as_markdown)
-    levels = dict(level_of(target) for target in targets)
+    levels = dict(parse_target(target) for target in targets)
     if html is not None:
         require_page(html, force)
     left, right = find_recorded(a, recordings), find_recorded(b, recordings)
     with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
         with stage_line("comparing") as stage:
-            difference = diff(recording_a, recording_b, levels, first)
-            difference = difference if first else with_seconds(difference, left, right)
-            difference = without(difference, ignore, everything)
+            difference = differences.diff(recording_a, recording_b, levels, first)
+            difference = difference if first else differences.with_seconds(difference, left, right)
+            difference = differences.without_ignored(difference, ignore, everything)
             if html is not None:
                 stage("drawing the page")
                 page = _write_page(html, force, difference, recording_a, recording_b)
         if html is not None:
             (say if as_json or as_markdown else click.echo)(page)
     if as_json:
-        print_json(told(difference))
+        print_json(differences.as_json(difference))
     elif html is None or as_markdown:
         _print(difference, everything, as_markdown)
     ctx.exit(ExitCode.OK if difference.same_content else ExitCode.DIFFERENT)

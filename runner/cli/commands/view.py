@@ -98,13 +98,13 @@ def command(
         from runner.export.rerun.cache import exported
         from runner.export.rerun.positions import with_spot
 
-        parting = None
+        divergence = None
         if len(runs) == 2 and spot is None:
             stage("comparing the runs")
-            parting = _parting(runs)
-        place = with_spot(runs[0], request, spot or parting)
-        if parting is not None:
-            _tell_steps(place.time, with_spot(runs[1], request, parting).time)
+            divergence = _divergence(runs)
+        place = with_spot(runs[0], request, spot or divergence)
+        if divergence is not None:
+            _tell_steps(place.time, with_spot(runs[1], request, divergence).time)
         stage("exporting")
         with compilation_notice():
             path, selections = exported(runs, place.request)
@@ -113,17 +113,17 @@ def command(
     _show(path, place, web, port, screenshot, picture_size)
 
 
-def _parting(runs: list[Run]) -> tuple[int, ...] | None:
-    """Return where two runs part, and say it."""
-    from runner.export.rerun.positions import where_they_part
+def _divergence(runs: list[Run]) -> tuple[int, ...] | None:
+    """Return where two runs diverge, and print it."""
+    from runner.export.rerun.positions import where_they_diverge
 
-    spot, told = where_they_part(runs)
+    spot, told = where_they_diverge(runs)
     say(told)
     return spot
 
 
 def _tell_steps(first: int, second: int) -> None:
-    """Say where on the timeline two runs part: trials before it that differ shift the second one's."""
+    """Print where on the timeline two runs diverge: trials before it that differ shift the second one's."""
     also = "" if first == second else f" in the first run, step {second:,} in the second"
     say(f"On the timeline that is step {first:,}{also}.")
 

@@ -8,14 +8,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.diff import Cause, Parting, Row, RunDiff
+from runner.analysis.diff import Cause, Divergence, Row, RunDiff
 from runner.analysis.diff.sections import (
-    evaluation_told,
-    in_short,
+    evaluation_updates,
+    overlap_in_words,
     sections,
+    summary,
     updates_in_words,
     visits_grids,
-    visits_told,
     where_in_words,
 )
 from runner.analysis.diff.tables import common_snapshots
@@ -78,11 +78,11 @@ def told_of(difference: RunDiff, a: Recording, b: Recording) -> dict[str, Any]:
     told = {section.title: section for section in sections(difference, everything=True)}
     return {
         "title": f"{difference.a['name']} against {difference.b['name']}",
-        "lead": in_short(difference),
+        "lead": summary(difference),
         "notes": difference.notes,
         "legend": [(i, "AB"[i], name) for i, name in enumerate(names)],
-        "partings": [_parting(difference, *pair, a, b) for pair in _partings(difference)],
-        "training": _overlap_told(told["Training"], difference) + _loops_told(told, difference),
+        "divergences": [_divergence(difference, *pair, a, b) for pair in _divergences(difference)],
+        "training": overlap_in_words(difference) + _loop_divergences(told, difference),
         "visits": visits_grids(difference),
         "tables": {"figures": _table_figures(difference, a, b), **_parts(told["Q-tables"])},
         "metrics": _parts(told["Metrics"]),
@@ -98,59 +98,59 @@ def _parts(section: Section) -> dict[str, Any]:
     return {"sentences": section.sentences, "grids": section.grids}
 
 
-def _partings(difference: RunDiff) -> Iterator[tuple[Parting, Cause]]:
-    if difference.parting is not None and difference.cause is not None:
-        yield difference.parting, difference.cause
-    yield from difference.evaluations
+def _divergences(difference: RunDiff) -> Iterator[tuple[Divergence, Cause]]:
+    """Yield where two jobs diverge, and why."""
+    if difference.divergence is not None and difference.cause is not None:
+        yield difference.divergence, difference.cause
+    if difference.evaluation_divergence is not None and difference.evaluation_cause is not None:
+        yield difference.evaluation_divergence, difference.evaluation_cause
 
 
-def _overlap_told(section: Section, difference: RunDiff) -> list[str]:
-    """Return how far training is the same, in sentences: the last ones of its section."""
-    told = 1 + len(visits_told(difference))
-    return section.sentences[-told:] if difference.overlap is not None else []
+def _loop_divergences(told: Mapping[str, Section], difference: RunDiff) -> list[str]:
+    """Return where loops diverge: their cause is unknown, so there is nothing to picture."""
+    sentences = []
+    if difference.divergence is not None and difference.cause is None:
+        sentences += told["Training"].sentences
+    if difference.evaluation_divergence is not None and difference.evaluation_cause is None:
+        sentences += told["Evaluation"].sentences
+    return sentences
 
 
-def _loops_told(told: Mapping[str, Section], difference: RunDiff) -> list[str]:
-    """Return where somebody's own loops part: nobody knows why, so there is nothing to picture."""
-    parted = difference.parting is not None and difference.cause is None
-    return (told["Training"].sentences if parted else []) + (
-        told["Evaluation"].sentences if difference.loop_evaluation is not None else []
-    )
+# --- where they diverge -------------------------------------------------------------------------------
 
 
-# --- where they part ----------------------------------------------------------------------------------
-
-
-def _parting(
-    difference: RunDiff, parting: Parting, cause: Cause, a: Recording, b: Recording
+def _divergence(
+    difference: RunDiff, divergence: Divergence, cause: Cause, a: Recording, b: Recording
 ) -> dict[str, Any]:
-    where = where_in_words(parting)
+    where = where_in_words(divergence)
     return {
-        "id": f"parting-{parting.phase}",
-        "spot": _spot(parting),
-        "title": "Where training parts" if parting.phase == "train" else "Where an evaluation parts",
+        "id": f"divergence-{divergence.phase}",
+        "at": _step_reference(divergence),
+        "title": f"Where {'training' if divergence.phase == 'train' else 'an evaluation'} diverges",
         "where": where[0].upper() + where[1:],
         "cause": cause.text[0].upper() + cause.text[1:],
-        "updates": evaluation_told(difference, cause) if parting.phase == "eval" else updates_in_words(cause),
-        "pictures": list(_pictures(parting, a, b)),
+        "updates": evaluation_updates(difference, cause)
+        if divergence.phase == "eval"
+        else updates_in_words(cause),
+        "pictures": list(_pictures(divergence, a, b)),
         "rows": [_values(row) for row in cause.rows],
     }
 
 
-def _spot(parting: Parting) -> list[int]:
+def _step_reference(divergence: Divergence) -> list[int]:
     """Return (episode, t) of training, or (training episodes before, trial, t) of an evaluation."""
-    before = [] if parting.after is None else [parting.after]
-    return [int(part) for part in (*before, parting.episode, parting.t)]
+    before = [] if divergence.after is None else [divergence.after]
+    return [*before, divergence.episode, divergence.t]
 
 
-def _pictures(parting: Parting, a: Recording, b: Recording) -> Iterator[dict[str, str]]:
+def _pictures(divergence: Divergence, a: Recording, b: Recording) -> Iterator[dict[str, str]]:
     """Yield the grid before the step, if that is the same in both, and after it in each."""
     alike = a.environment.get("scene") == b.environment.get("scene")
-    steps = [step for step in (parting.a_step, parting.b_step) if step is not None]
+    steps = [step for step in (divergence.a_step, divergence.b_step) if step is not None]
     starts = len({int(step["state"]) for step in steps}) > 1
     if alike and not starts and steps:
-        yield _picture(a if parting.a_step is not None else b, steps[0], "Before, in both", False)
-    for name, recording, step in (("A", a, parting.a_step), ("B", b, parting.b_step)):
+        yield _picture(a if divergence.a_step is not None else b, steps[0], "Before, in both", False)
+    for name, recording, step in (("A", a, divergence.a_step), ("B", b, divergence.b_step)):
         if step is not None:
             yield _picture(
                 recording, step, f"{name}, {'where it stood' if starts else 'after its step'}", not starts
@@ -182,7 +182,7 @@ def _picture(recording: Recording, step: np.void, title: str, after: bool) -> di
 
 
 def _values(row: Row) -> Grid:
-    """Return the highest Q-values of both runs in the state in which they part."""
+    """Return the highest Q-values of both runs in the state in which they diverge."""
     a, b = np.array(row.a), np.array(row.b)
     shown = dict.fromkeys(
         int(j) for values in (a, b) for j in np.argsort(-values, kind="stable")[:_MOST_VALUES]

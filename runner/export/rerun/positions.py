@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from runner.analysis.diff import can_compare_steps
+from runner.analysis.diff.divergence import evaluation_divergences, training_divergence
 from runner.analysis.diff.sections import where_in_words
-from runner.analysis.diff.trajectory import evaluation_partings, training_parting
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.errors import RecordingError
 from runner.export.contents import require_steps
@@ -48,30 +48,30 @@ def with_spot(run: Run, request: Request, spot: tuple[int, ...] | None) -> Spot:
     return Spot(int(record["log_time"]) // schema.STEP_NANOSECONDS, _including(request, more))
 
 
-def where_they_part(runs: Sequence[Run]) -> tuple[tuple[int, ...] | None, str]:
-    """Return where two runs part, as `with_spot` takes it, and a sentence about it.
+def where_they_diverge(runs: Sequence[Run]) -> tuple[tuple[int, ...] | None, str]:
+    """Return where two runs diverge, as `with_spot` takes it, and a sentence about it.
 
     That is the first step of training that differs, or else the first evaluation's. None where they do not
-    part, or where it cannot be known.
+    diverge, or where it cannot be known.
     """
     with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
         if not (a.is_job and b.is_job):
-            return None, "Where two loops part is told by `dualtaxi diff`."
+            return None, "`dualtaxi diff` shows where two loops diverge."
         if not can_compare_steps(a, b):
             return (
                 None,
-                "Where they part cannot be told: states or actions differ, or steps were not recorded.",
+                "Where they diverge is unknown: states or actions differ, or steps were not recorded.",
             )
-        parting = training_parting(a, b)
-        if parting is None or None in (parting.a_step, parting.b_step):
-            further = parting is not None
-            parting = next(evaluation_partings(a, b), None)
-            if parting is None:
+        divergence = training_divergence(a, b)
+        if divergence is None or None in (divergence.a_step, divergence.b_step):
+            further = divergence is not None
+            divergence = next(evaluation_divergences(a, b), None)
+            if divergence is None:
                 ends = ", as far as the shorter goes" if further else ""
-                return None, f"They never part: every step is the same{ends}."
-    if parting.after is None:
-        return (parting.episode, parting.t), f"They part {where_in_words(parting)}."
-    return (parting.after, parting.episode, parting.t), f"They part {where_in_words(parting)}."
+                return None, f"They never diverge: every step is the same{ends}."
+    if divergence.after is None:
+        return (divergence.episode, divergence.t), f"They diverge {where_in_words(divergence)}."
+    return (divergence.after, divergence.episode, divergence.t), f"They diverge {where_in_words(divergence)}."
 
 
 def _train_step(recording: Recording, episode: int, t: int) -> tuple[str, int, Request]:

@@ -1,4 +1,4 @@
-"""Runs against each other: what differs, where they part, both replays in step, their Q-tables."""
+"""Runs against each other: what differs, where they diverge, both replays in step, their Q-tables."""
 
 from __future__ import annotations
 
@@ -99,12 +99,12 @@ async def replay(
     run: Names = None,
     at: Annotated[str, Query(max_length=60)] = "",
 ) -> Response:
-    """Show an episode of two runs, in step; the one in which they part unless another is asked for."""
+    """Show an episode of two runs, in step; the one in which they diverge unless another is asked for."""
     found = _two(await _chosen(catalogue, run))
     spot = parse_step_reference(at) if at else ()
     if not spot:
-        partings = (await _difference(found, cache, processes))["partings"]
-        spot = after_step(partings[0]["spot"]) if partings else (0, 0)
+        divergences = (await _difference(found, cache, processes))["divergences"]
+        spot = after_step(divergences[0]["at"]) if divergences else (0, 0)
     return await run_in_threadpool(_replays, request, found, spot)
 
 

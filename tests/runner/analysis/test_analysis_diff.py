@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from runner.analysis.diff import Change, RunDiff, diff
+from runner.analysis.diff.divergence import FIELDS, first_difference
 from runner.analysis.diff.sections import sections
 from runner.analysis.diff.settings import changes_in
-from runner.analysis.diff.trajectory import FIELDS, first_difference
 from runner.analysis.sections import markdown
 from runner.cli import cli
 from runner.config import from_mapping
@@ -82,14 +82,14 @@ def test_a_name_and_a_compression_change_nothing(compare):
         "recording.compression",
         "recording.level",
     }
-    assert difference.parting is None
+    assert difference.divergence is None
     assert difference.environment.same
 
 
 def test_another_seed_starts_elsewhere(compare):
     difference = compare("seed=1")
     assert [(change.path, change.a, change.b) for change in difference.config] == [("seed", 0, 1)]
-    assert (difference.parting.step, difference.cause.kind) == (0, "start")
+    assert (difference.divergence.step, difference.cause.kind) == (0, "start")
     assert difference.overlap.equal_episodes == 0
 
 
@@ -103,7 +103,7 @@ def test_another_discount_shows_in_the_first_update_that_used_it(compare, record
         after = [tables_at(recording, update.step + 1) for recording in (a, b)]
     assert all(np.array_equal(x, y) for x, y in zip(*before, strict=True))
     assert any(not np.array_equal(x, y) for x, y in zip(*after, strict=True))
-    assert update.step < difference.parting.step
+    assert update.step < difference.divergence.step
 
 
 def test_the_first_difference_alone_is_what_the_whole_tells_first(compare, record):
@@ -111,9 +111,10 @@ def test_the_first_difference_alone_is_what_the_whole_tells_first(compare, recor
     with open_recording(record()) as a, open_recording(record("discount=0.9")) as b:
         difference = diff(a, b, first=True)
     assert (difference.cause.kind, difference.cause.text) == (whole.cause.kind, whole.cause.text)
-    assert (difference.parting.step, difference.config) == (whole.parting.step, whole.config)
+    assert (difference.divergence.step, difference.config) == (whole.divergence.step, whole.config)
     assert difference.cause.update is difference.overlap is None
-    assert not difference.tables + difference.metrics + difference.evaluations
+    assert not difference.tables + difference.metrics
+    assert difference.evaluation_divergence is None
 
 
 def test_the_second_tables_quirk_shows_in_the_second_table(compare):
@@ -127,7 +128,7 @@ def test_another_reward_is_an_other_environment(compare):
     difference = compare("env.kwargs.rewards.illegal_action=-7")
     assert difference.environment.transitions > 1000
     assert "reward -7" in " ".join(change.b for change in difference.environment.examples)
-    assert (difference.cause.kind, difference.parting.field) == ("transition", "rewards")
+    assert (difference.cause.kind, difference.divergence.field) == ("transition", "rewards")
     assert "reward -2 and -10 in A, -2 and -7 in B" in difference.cause.text
 
 
@@ -135,7 +136,7 @@ def test_other_modes_are_compared_as_far_as_they_can_be(compare):
     difference = compare("mode=cooperative", "quirks.second_table_uses_first_action=false")
     assert any("other modes" in note for note in difference.notes)
     assert not any("return" in metric.name for metric in difference.metrics)
-    assert difference.parting is not None
+    assert difference.divergence is not None
     assert difference.tables == []
     assert difference.metrics
 
@@ -178,7 +179,7 @@ def test_a_mapping_that_one_leaves_empty_is_told_by_what_is_in_the_other():
 def test_what_is_left_out_as_asked_is_named(record, folder):
     ids = [record(*overrides).parent.name for overrides in ((), ("discount=0.9",))]
     told = CliRunner().invoke(cli, ["diff", *ids, "--recordings", str(folder), "--ignore", "disc*"])
-    assert "Note: left out as asked, though it differs: discount." in told.stdout
+    assert "Note: ignored, though it differs: discount." in told.stdout
     assert "No other setting that determines the content differs." in told.stdout
 
 
@@ -205,7 +206,7 @@ def test_what_an_interrupted_run_has_is_compared(record, folder):
 
 def test_without_steps_only_the_rest_is_compared(compare):
     difference = compare("recording.steps=none", "seed=3")
-    assert difference.parting is None
+    assert difference.divergence is None
     assert any("rerecord" in note for note in difference.notes)
     assert difference.metrics
     assert difference.tables
@@ -261,7 +262,7 @@ def test_the_diff_of_an_altered_copy_names_the_step_and_what_was_altered(small, 
     copy = altered(small, tmp_path / "copy.mcap", schema.TRAIN_STEP, alter, result=without_digest)
     with open_recording(small) as a, open_recording(copy) as b:
         difference = diff(a, b)
-    assert (difference.parting.step, difference.parting.field) == (at, field)
+    assert (difference.divergence.step, difference.divergence.field) == (at, field)
     assert f"training step {at:,}" in "\n".join(markdown(sections(difference)))
     assert difference.cause is not None
     assert difference.overlap.equal_steps >= difference.overlap.compared_steps - 1
@@ -294,7 +295,7 @@ def test_the_command_says_what_differs_and_ends_with_1(record, folder):
     run = CliRunner().invoke
     told = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder)])
     assert told.exit_code == 1
-    assert "They part in training episode" in told.stdout
+    assert "They diverge in training episode" in told.stdout
     assert "discount (0.8 in A, 0.9 in B) differs" in told.stdout
     assert "Why that update differs: the discount was 0.8 in A, 0.9 in B." in told.stdout
     as_json = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--json", "--ignore", "disc*"])
@@ -341,7 +342,7 @@ class TestIndependentExploration:
             )
             with open_recording(path) as a, open_recording(forged) as b:
                 difference = diff(a, b, first=True)
-            assert difference.parting.step == step
+            assert difference.divergence.step == step
             return difference.cause
 
         return cause_of_change
@@ -387,8 +388,8 @@ def lossy(record, tmp_path):
 def test_lost_metrics_of_an_evaluation_shift_no_others(lossy):
     for pair in (lossy, lossy[::-1]):
         difference = diff(*pair)
-        assert difference.parting is None
-        assert difference.evaluations == []
+        assert difference.divergence is None
+        assert difference.evaluation_divergence is None
         assert any("lost parts of evaluations" in note for note in difference.notes)
 
 
@@ -400,10 +401,11 @@ def test_an_evaluation_after_a_lost_one_is_compared_with_its_own_tables(lossy, r
     damaged, _ = lossy
     forged = altered(record(), tmp_path / "forged.mcap", schema.EVAL_STEP, change, result=without_digest)
     with open_recording(forged) as other:
-        ((parting, cause),) = diff(damaged, other).evaluations
-    assert (parting.evaluation, parting.after, parting.episode, parting.t) == (2, 120, 4, 0)
+        difference = diff(damaged, other)
+    divergence, cause = difference.evaluation_divergence, difference.evaluation_cause
+    assert (divergence.evaluation, divergence.after, divergence.episode, divergence.t) == (2, 120, 4, 0)
     trained = damaged.metrics("eval")[-1]["step"]
-    state = int(parting.a_step["state"])
+    state = int(divergence.a_step["state"])
     assert cause.rows[0].a == tables_at(damaged, trained)[0][state].tolist()
 
 
@@ -417,5 +419,5 @@ def test_lost_trials_leave_out_their_evaluation_alone(record, tmp_path):
     path.write_bytes(record().read_bytes())
     without_chunk(path, schema.EVAL_STEP, 0)
     with open_recording(path) as damaged, open_recording(forged) as other:
-        ((parting, _),) = diff(damaged, other).evaluations
-    assert (parting.after, parting.episode) == (120, 4)
+        divergence = diff(damaged, other).evaluation_divergence
+    assert (divergence.after, divergence.episode) == (120, 4)

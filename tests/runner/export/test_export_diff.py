@@ -37,8 +37,8 @@ def test_the_page_of_another_discount_shows_where_and_why_the_runs_part(world, p
     difference, page = page_of(pictured(world), pictured(world, discount=0.7))
     check_page(page)
     text = text_of(page)
-    parting = difference.parting
-    assert f"In training episode {parting.episode:,}, at t = {parting.t}" in text
+    divergence = difference.divergence
+    assert f"In training episode {divergence.episode:,}, at t = {divergence.t}" in text
     assert "Why that update differs: the discount was" in text
     assert text.count("\N{BLACK LEFT-POINTING TRIANGLE} greedy") >= 2
     drawn = world != "corridor"
@@ -51,7 +51,7 @@ def test_the_page_of_another_discount_shows_where_and_why_the_runs_part(world, p
 def test_the_page_of_another_seed_shows_where_the_runs_part(world, pictured):
     difference, page = page_of(pictured(world), pictured(world, seed=5))
     check_page(page)
-    assert f"at t = {difference.parting.t}" in text_of(page)
+    assert f"at t = {difference.divergence.t}" in text_of(page)
     starts = difference.cause.kind == "start"
     drawn = page.count("B, where it stood: " if starts else "B, after its step: ")
     assert (drawn > 0) == (world != "corridor")

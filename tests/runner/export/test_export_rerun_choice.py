@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from runner.analysis.diff import diff
 from runner.cli import cli
 from runner.errors import MissingExtra, RecordingError
-from runner.export.rerun.positions import where_they_part, with_spot
+from runner.export.rerun.positions import where_they_diverge, with_spot
 from runner.export.rerun.selection import Request, episodes_of, select
 from runner.export.rerun.viewer import ViewerError, check_port, require_rerun
 from runner.recording import schema
@@ -173,29 +173,29 @@ class TestCommand:
 
 
 class TestTwoRuns:
-    """Where two runs are looked at: the step at which they part."""
+    """Where two runs are looked at: the step at which they diverge."""
 
     def test_the_spot_is_the_first_step_that_differs(self, pictured):
         runs = [pictured("taxi"), pictured("taxi", discount=0.5)]
-        spot, told = where_they_part(runs)
+        spot, told = where_they_diverge(runs)
         with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
-            parting = diff(a, b).parting
-            step = next(a.blocks(schema.TRAIN_STEP, parting.step, parting.step + 1))[0]
-        assert spot == (parting.episode, parting.t)
-        assert f"training step {parting.step:,}" in told
+            divergence = diff(a, b).divergence
+            step = next(a.blocks(schema.TRAIN_STEP, divergence.step, divergence.step + 1))[0]
+        assert spot == (divergence.episode, divergence.t)
+        assert f"training step {divergence.step:,}" in told
         place = with_spot(runs[0], Request(), spot)
         assert place.time == step["log_time"] // schema.STEP_NANOSECONDS
-        assert place.request.episodes == ((parting.episode, parting.episode + 1),)
+        assert place.request.episodes == ((divergence.episode, divergence.episode + 1),)
 
-    def test_runs_that_never_part_and_such_that_cannot_be_compared_are_told(self, pictured):
+    def test_runs_that_never_diverge_and_runs_that_cannot_be_compared(self, pictured):
         run = pictured("taxi")
-        assert where_they_part([run, run]) == (None, "They never part: every step is the same.")
+        assert where_they_diverge([run, run]) == (None, "They never diverge: every step is the same.")
         for other in (pictured("lake"), pictured("taxi", recording={"steps": "none"})):
-            spot, told = where_they_part([run, other])
+            spot, told = where_they_diverge([run, other])
             assert spot is None
-            assert "cannot be told" in told
+            assert "is unknown" in told
 
     def test_a_longer_run_is_the_same_as_far_as_the_shorter_goes(self, pictured):
         shorter = pictured("rivals", evaluation=None, episodes=20)
-        _, told = where_they_part([shorter, pictured("rivals", evaluation=None, episodes=30)])
-        assert told == "They never part: every step is the same, as far as the shorter goes."
+        _, told = where_they_diverge([shorter, pictured("rivals", evaluation=None, episodes=30)])
+        assert told == "They never diverge: every step is the same, as far as the shorter goes."

@@ -159,7 +159,7 @@ def test_diff_says_where_loops_part(folder):
     assert same.exit_code == 0
     assert "the same, to the last byte" in same.stdout
     differing = json.loads(dualtaxi(folder, "diff", "lake", "other", "--json").stdout)
-    parting = differing["parting"]
+    divergence = differing["divergence"]
     with (
         open_recording(runner.find_run("lake", folder).recording) as a,
         open_recording(runner.find_run("other", folder).recording) as b,
@@ -167,8 +167,8 @@ def test_diff_says_where_loops_part(folder):
         left, right = (next(recording.blocks(schema.TRAIN_STEP)) for recording in (a, b))
     names = [name for name in left.dtype.names if not name.startswith("tag_")]
     first = next(k for k in range(len(left)) if left[k][names].tolist() != right[k][names].tolist())
-    assert parting["step"] == first
-    assert parting["field"] in ("state", "action", "next_state")
+    assert divergence["step"] == first
+    assert divergence["field"] in ("state", "action", "next_state")
     foreign = dualtaxi(folder, "diff", "pole", "rooms")
     assert foreign.exit_code == 1
     assert "other spaces" in foreign.stdout
@@ -205,12 +205,12 @@ def told_of_two(folder: Path, tested: int = 0, logged: float = 0.0) -> str:
 def test_diff_says_where_evaluations_of_loops_part(tmp_path):
     told = told_of_two(tmp_path, tested=1)
     assert "Training took the same steps, evaluation did not." in told
-    assert "They part in the reset before evaluation step 0" in told
-    parted = json.loads(dualtaxi(tmp_path, "diff", "one", "two", "--json").stdout)
-    assert (parted["parting"], parted["loop_evaluation"]["step"]) == (None, 0)
+    assert "They diverge in the reset before evaluation step 0" in told
+    diverged = json.loads(dualtaxi(tmp_path, "diff", "one", "two", "--json").stdout)
+    assert (diverged["divergence"], diverged["evaluation_divergence"]["step"]) == (None, 0)
     page = tmp_path / "diff.html"
     dualtaxi(tmp_path, "diff", "one", "two", "--html", str(page))
-    assert "They part in the reset before evaluation step 0" in page.read_text()
+    assert "They diverge in the reset before evaluation step 0" in page.read_text()
 
 
 def test_diff_says_what_differs_between_loops_of_the_same_steps(tmp_path):
@@ -263,10 +263,12 @@ def test_diff_names_the_reset_in_which_loops_part(tmp_path):
                     env.step(actions if episode == 2 else 0)
     for other in ("0.75", "0.5"):  # the actions of the last differ too, but after the reset
         told = dualtaxi(tmp_path, "diff", "at0.25", f"at{other}").stdout
-        assert "They part in the reset before training step 6, of episode 2: observation is [0.25, " in told
+        assert (
+            "They diverge in the reset before training step 6, of episode 2: observation is [0.25, " in told
+        )
         assert f" in A, [{other}, " in told
-    parted = json.loads(dualtaxi(tmp_path, "diff", "at0.25", "at0.5", "--json").stdout)["parting"]
-    assert (parted["step"], parted["episode"], parted["field"]) == (6, 2, "reset.observation")
+    diverged = json.loads(dualtaxi(tmp_path, "diff", "at0.25", "at0.5", "--json").stdout)["divergence"]
+    assert (diverged["step"], diverged["episode"], diverged["field"]) == (6, 2, "reset.observation")
 
 
 def test_diff_of_pictures_tells_the_number_that_differs(tmp_path):
@@ -274,8 +276,8 @@ def test_diff_of_pictures_tells_the_number_that_differs(tmp_path):
         with runner.record(Pictures(number), tmp_path, name=f"of{number}") as env:
             env.reset()
             env.step(1)
-    parting = json.loads(dualtaxi(tmp_path, "diff", "of7", "of8", "--json").stdout)["parting"]
-    assert (parting["field"], parting["a"], parting["b"]) == ("next_observation.picture[3, 4]", 7, 8)
+    divergence = json.loads(dualtaxi(tmp_path, "diff", "of7", "of8", "--json").stdout)["divergence"]
+    assert (divergence["field"], divergence["a"], divergence["b"]) == ("next_observation.picture[3, 4]", 7, 8)
 
 
 @pytest.mark.parametrize("name", ["lake", "pole", "rooms"])

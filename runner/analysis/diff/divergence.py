@@ -1,0 +1,254 @@
+"""The first step at which two runs diverge, in training and in evaluation.
+
+Steps are compared in blocks, so memory does not grow with the runs. Where a repair lost steps, training is
+compared up to the first of them, and evaluations that lost trials are left out.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.analysis.evaluations import evaluations_of
+from runner.recording import schema
+from runner.recording.blocks import HEADER_BYTES
+from runner.recording.messages import decode
+from runner.recording.reader import Recording
+
+Block = NDArray[np.void]
+
+FIELDS: Final = (
+    *("episode", "t", "state", "explored", "action", "next_state"),
+    *("rewards", "terminated", "truncated"),
+)
+"""The fields of a step that are compared, in the order in which a step comes about."""
+_TRANSITION_FIELDS: Final = (
+    *("episode", "t", "acted", "action", "next_observation", "rewards"),
+    *("terminated", "truncated", "agents_terminated", "agents_truncated"),
+)
+"""The same of a step in spaces that are not both `Discrete`."""
+_EVALUATION_FIELDS: Final = FIELDS[1:]
+_MAX_NUMBERS: Final = 16
+"""Of a longer value the first number that differs is reported."""
+
+
+@dataclass(frozen=True, eq=False)
+class Divergence:
+    """The first step at which two runs differ in a phase."""
+
+    phase: str
+    step: int
+    """The step's number in its phase, in run A."""
+    episode: int
+    """Training episode, or trial within the evaluation."""
+    t: int
+    field: str
+    """Field of the step; `step` where one run ends first; `reset.observation` of the reset before it."""
+    a: Any
+    b: Any
+    a_step: np.void | None = None
+    """The whole step in A; None if A has none there."""
+    b_step: np.void | None = None
+    evaluation: int | None = None
+    """Number of the evaluation of run A, from 0; None in training."""
+    after: int | None = None
+    """Training episodes before that evaluation; None in training."""
+    trained: tuple[int, int] | None = None
+    """Training steps before that evaluation, in A and in B; None in training."""
+
+
+def first_difference(
+    a: Iterator[Block], b: Iterator[Block], fields: tuple[str, ...] = FIELDS
+) -> tuple[int, Block | None, Block | None] | None:
+    """Return the first position at which two streams of records differ, and both records there.
+
+    A stream that ends before the other differs there, with None for its record; None if they are the same.
+    """
+    position = 0
+    left: Block | None = None
+    right: Block | None = None
+    while True:
+        left = left if left is not None and len(left) else next(a, None)
+        right = right if right is not None and len(right) else next(b, None)
+        if left is None or right is None:
+            ends = [None if block is None else block[:1] for block in (left, right)]
+            return None if left is right else (position, ends[0], ends[1])
+        n = min(len(left), len(right))
+        differs = differing_rows(left[:n], right[:n], fields)
+        if differs.any():
+            k = int(np.argmax(differs))
+            return position + k, left[k : k + 1], right[k : k + 1]
+        left, right, position = left[n:], right[n:], position + n
+
+
+def differing_rows(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> NDArray[np.bool_]:
+    """Return which of two equally long blocks of records differ in any of the fields."""
+    if a.dtype == b.dtype:
+        left, right = (
+            np.ascontiguousarray(block).view(np.uint8).reshape(-1, block.itemsize) for block in (a, b)
+        )
+        if left[:, HEADER_BYTES:].tobytes() == right[:, HEADER_BYTES:].tobytes():
+            return np.zeros(len(a), np.bool_)
+    differs = np.zeros(len(a), np.bool_)
+    for name in fields:
+        differs |= _differs(a, b, name)
+    return differs
+
+
+def _differs(a: Block, b: Block, name: str) -> NDArray[np.bool_]:
+    """Return where one field differs; rewards of other numbers of learners are compared summed."""
+    left, right = a[name], b[name]
+    if name in ("explored", "rewards") and a["rewards"].shape != b["rewards"].shape:
+        left, right = (left != 0, right != 0) if name == "explored" else (left.sum(1), right.sum(1))
+    differs: NDArray[np.bool_] = np.not_equal(_bits(left), _bits(right)).reshape(len(a), -1)
+    return np.asarray(differs.any(axis=1))
+
+
+def _bits(values: NDArray[Any]) -> NDArray[Any]:
+    """Return floats and composed values as whole numbers of the same bits, so that NaN equals NaN."""
+    kind, size = values.dtype.kind, values.dtype.itemsize
+    if kind not in "fV":
+        return values
+    return np.ascontiguousarray(values).view(f"u{size}" if kind == "f" and size in (2, 4, 8) else "u1")
+
+
+def training_divergence(a: Recording, b: Recording) -> Divergence | None:
+    """Return where the training of two jobs diverges; None if it takes the same steps, equally many."""
+    streams = [recording.blocks(schema.TRAIN_STEP, 0, unbroken(recording)[0]) for recording in (a, b)]
+    return _divergence("train", first_difference(streams[0], streams[1]))
+
+
+def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
+    """Yield where evaluations diverge that both jobs made after as many training episodes."""
+    others = {one.after: one for one in evaluations_of(b)}
+    for left in evaluations_of(a):
+        right = others.get(left.after)
+        if right is None:
+            continue
+        trials = min(left.stop - left.start, right.stop - right.start)
+        steps = [_trial_steps(one, first, trials) for one, first in ((a, left.start), (b, right.start))]
+        if steps[0] is None or steps[1] is None:
+            continue
+        found = _divergence("eval", first_difference(steps[0], steps[1], _EVALUATION_FIELDS))
+        if found is not None:
+            start = right.start if found.a_step is None else left.start
+            yield replace(
+                found,
+                episode=found.episode - start,
+                evaluation=left.number,
+                after=left.after,
+                trained=(left.train_step, right.train_step),
+            )
+
+
+def unbroken(recording: Recording) -> tuple[int, int]:
+    """Return how many steps and episodes of training precede the first that were lost, if any."""
+    steps, episodes = (
+        min([recording.count(topic), *(start for start, _ in recording.lost.get(topic.name, []))])
+        for topic in schema.PHASES["train"]
+    )
+    return steps, episodes
+
+
+def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Block] | None:
+    """Return the steps of some trials; None unless all of them are there."""
+    ends = recording.episodes("eval", first, first + trials)
+    if not trials or len(ends) < trials:
+        return None
+    start, stop = int(ends[0]["last_step"]) + 1 - int(ends[0]["length"]), int(ends[-1]["last_step"]) + 1
+    lost = recording.lost.get(schema.EVAL_STEP.name, [])
+    if stop > recording.count(schema.EVAL_STEP) or any(a < stop and b > start for a, b in lost):
+        return None
+    return recording.blocks(schema.EVAL_STEP, start, stop)
+
+
+def _divergence(
+    phase: str,
+    found: tuple[int, Block | None, Block | None] | None,
+    fields: tuple[str, ...] = FIELDS,
+) -> Divergence | None:
+    """Return what `first_difference` found of two streams of steps."""
+    if found is None:
+        return None
+    _, left, right = found
+    name, a, b = "step", "none" if left is None else "one more", "none" if right is None else "one more"
+    if left is not None and right is not None:
+        name = next(name for name in fields if _differs(left, right, name)[0])
+        name, a, b = _differing_part(name, left[name][0], right[name][0])
+    ours, theirs = (None if block is None else block[0] for block in (left, right))
+    step = theirs if ours is None else ours
+    assert step is not None
+    return Divergence(
+        phase, int(step["step"]), int(step["episode"]), int(step["t"]), name, a, b, ours, theirs
+    )
+
+
+def _differing_part(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
+    """Return the first part of a value that differs: of a Dict its entry, of many numbers one of them."""
+    for entry in a.dtype.names or ():
+        if a[entry].tobytes() != b[entry].tobytes():
+            return _differing_part(f"{name}.{entry}", a[entry], b[entry])
+    if a.size <= _MAX_NUMBERS:
+        return name, a.tolist(), b.tolist()
+    differs = _bits(a.reshape(-1)) != _bits(b.reshape(-1))
+    place = np.unravel_index(int(differs.argmax()), a.shape)
+    return f"{name}[{', '.join(map(str, place))}]", a[place].tolist(), b[place].tolist()
+
+
+# --- loops --------------------------------------------------------------------------------------------
+
+
+def have_same_spaces(a: Recording, b: Recording) -> bool:
+    """Return whether the steps of two recordings, of which one is of a loop, are in the same spaces."""
+    kinds = {a.kind, b.kind}
+    return kinds <= {"job", "step"} or (len(kinds) == 1 and a.spaces == b.spaces and a.agents == b.agents)
+
+
+def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None:
+    """Return the first step of a phase at which two recordings in the same spaces diverge.
+
+    If they diverge in what a reset observed, it is the step after it, and the field is `reset.observation`.
+    """
+    topics = [recording.topic(f"/{phase}/step") for recording in (a, b)]
+    if topics[0] not in a.dtypes:
+        return _message_divergence(a, b, phase)
+    fields = FIELDS if a.kind in ("job", "step") else _TRANSITION_FIELDS
+    streams = [recording.blocks(topic) for recording, topic in zip((a, b), topics, strict=True)]
+    found = _divergence(phase, first_difference(streams[0], streams[1], fields), fields)
+    if fields is FIELDS:
+        return found  # a step has the state before it
+    return _reset_divergence(a, b, phase, math.inf if found is None else found.step) or found
+
+
+def _reset_divergence(a: Recording, b: Recording, phase: str, last: float) -> Divergence | None:
+    """Return where what a reset observed differs, if that is before the end of the step `last`."""
+    streams = [
+        itertools.takewhile(lambda block: block["step"][0] <= last, one.blocks(one.topic(f"/{phase}/reset")))
+        for one in (a, b)
+    ]
+    _, left, right = first_difference(streams[0], streams[1], ("observation",)) or (0, None, None)
+    if left is None or right is None or left["step"][0] > last:
+        return None
+    part = _differing_part("reset.observation", left["observation"][0], right["observation"][0])
+    return Divergence(phase, int(left["step"][0]), int(left["episode"][0]), 0, *part)
+
+
+def _message_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None:
+    """Return where loops diverge whose steps vary in size."""
+    streams = [recording.messages(recording.topic(f"/{phase}/step")) for recording in (a, b)]
+    for position, pair in enumerate(itertools.zip_longest(*streams)):
+        if None not in pair and pair[0][1] == pair[1][1]:
+            continue
+        steps = [{} if one is None else decode(schema.TRANSITION, one[1]) for one in pair]
+        some = steps[0] or steps[1]
+        names = [name for name in some if steps[0].get(name) != steps[1].get(name)]
+        name = names[0] if all(steps) and names else "step"
+        x, y = (str(step.get(name, "none")) for step in steps)
+        return Divergence(phase, position, some["episode"], some["t"], name, x, y)
+    return None
