@@ -26,7 +26,7 @@ def tell(selection: Selection) -> None:
     """Say what is exported and what is not."""
     for warning in selection.warnings:
         say(warning)
-    if selection.chosen:
-        say("Exported: all metrics; " + "; ".join(selection.chosen) + ".")
+    if selection.exported:
+        say("Exported: all metrics; " + "; ".join(selection.exported) + ".")
     for left in selection.left_out:
         say(f"Left out: {left}.")

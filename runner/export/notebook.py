@@ -143,10 +143,10 @@ def rerun_view(
         RecordingError: a recording cannot be read, or has not what is asked for.
     """
     notebook = require("rerun_notebook", extra="notebook", purpose="the Rerun viewer in a notebook")
-    from runner.export.rerun.cache import exported
     from runner.export.rerun.selection import Request
+    from runner.export.rerun.writing import cached_export
 
-    path, _ = exported(runs, Request(episodes=tuple(episodes), evaluations=tuple(evaluations)))
+    path, _ = cached_export(runs, Request(episodes=tuple(episodes), evaluations=tuple(evaluations)))
     viewer = notebook.Viewer(width=width, height=height)
     viewer.send_rrd(path.read_bytes())
     return viewer

@@ -235,9 +235,9 @@ def replay(runs: Sequence[Run], request: Request) -> Path:
     from runner.export.rerun.viewer import require_rerun
 
     require_rerun("a replay")
-    from runner.export.rerun.cache import exported
+    from runner.export.rerun.writing import cached_export
 
-    return exported(runs, request)[0]
+    return cached_export(runs, request)[0]
 
 
 def as_json(value: Any) -> bytes:

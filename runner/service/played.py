@@ -118,10 +118,9 @@ def _typical_start(recording: Recording) -> int:
 
 def spot(run: Run, at: tuple[int, ...]) -> bytes:
     """Return the step of the viewer's timeline at (episode, t) or (training episodes before, trial, t)."""
-    from runner.export.rerun.positions import with_spot
-    from runner.export.rerun.selection import Request
+    from runner.export.rerun.selection import Request, locate
 
-    return str(with_spot(run, Request(), at or None).time).encode()
+    return str(locate(run, Request(), at or None).time).encode()
 
 
 def load_sweep_libraries() -> None:

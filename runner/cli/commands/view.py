@@ -15,15 +15,14 @@ from runner.cli.output import say
 from runner.cli.runs import find_recorded
 
 if TYPE_CHECKING:
-    from runner.export.rerun.positions import Spot
-    from runner.runs.run import Run
+    from runner.export.rerun.selection import Location
 
 
 @click.command("view")
 @click.argument("run_names", metavar="RUN [RUN]", nargs=-1, required=True, type=RunName())
 @click.option(
     "--at",
-    "spot",
+    "step",
     type=STEP,
     metavar="EPISODE:T",
     help="The point in training to show: EPISODE:T, or eval:N:TRIAL:T of an evaluation. "
@@ -57,7 +56,7 @@ if TYPE_CHECKING:
 @recordings_option
 def command(
     run_names: tuple[str, ...],
-    spot: tuple[int, ...] | None,
+    step: tuple[int, ...] | None,
     web: bool,
     port: int,
     screenshot: Path | None,
@@ -95,53 +94,44 @@ def command(
     runs = [find_recorded(name, recordings) for name in run_names]
     request = request_of(episodes, evaluations, every, everything)
     with stage_line("loading Rerun") as stage:
-        from runner.export.rerun.cache import exported
-        from runner.export.rerun.positions import with_spot
+        from runner.export.rerun.selection import locate, locate_divergence
+        from runner.export.rerun.writing import cached_export
 
         divergence = None
-        if len(runs) == 2 and spot is None:
+        if len(runs) == 2 and step is None:
             stage("comparing the runs")
-            divergence = _divergence(runs)
-        place = with_spot(runs[0], request, spot or divergence)
+            divergence, message = locate_divergence(runs)
+            say(message)
+        location = locate(runs[0], request, step or divergence)
         if divergence is not None:
-            _tell_steps(place.time, with_spot(runs[1], request, divergence).time)
+            # Trials before it that differ in length shift the second run's timeline.
+            first, second = location.time, locate(runs[1], request, divergence).time
+            also = "" if first == second else f" in the first run, step {second:,} in the second"
+            say(f"On the timeline that is step {first:,}{also}.")
         stage("exporting")
         with compilation_notice():
-            path, selections = exported(runs, place.request)
+            path, selections = cached_export(runs, location.request)
     for selection in selections:
         tell(selection)
-    _show(path, place, web, port, screenshot, picture_size)
+    _show(path, location, web, port, screenshot, picture_size)
 
 
-def _divergence(runs: list[Run]) -> tuple[int, ...] | None:
-    """Return where two runs diverge, and print it."""
-    from runner.export.rerun.positions import where_they_diverge
-
-    spot, told = where_they_diverge(runs)
-    say(told)
-    return spot
-
-
-def _tell_steps(first: int, second: int) -> None:
-    """Print where on the timeline two runs diverge: trials before it that differ shift the second one's."""
-    also = "" if first == second else f" in the first run, step {second:,} in the second"
-    say(f"On the timeline that is step {first:,}{also}.")
-
-
-def _show(path: Path, place: Spot, web: bool, port: int, screenshot: Path | None, picture_size: str) -> None:
-    """Show an exported file, in the way that is asked for."""
+def _show(
+    path: Path, location: Location, web: bool, port: int, screenshot: Path | None, picture_size: str
+) -> None:
+    """Show an exported file."""
     from runner.cli.progress import stage_line
     from runner.export.rerun import viewer
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so the viewer is ended too
     if screenshot is not None:
         with stage_line("drawing"):
-            viewer.screenshot(path, place.time, screenshot, picture_size)
+            viewer.screenshot(path, location.time, screenshot, picture_size)
         click.echo(screenshot)
     elif web:
         with viewer.web_viewer(path, viewer.check_port(port)) as (process, address):
             click.echo(address)
-            say(f"The spot is step {place.time:,}: type it at the lower right. Ctrl-C ends the viewer.")
+            say(f"The step is {location.time:,}: enter it at the lower right. Ctrl-C ends the viewer.")
             process.wait()
     else:
-        viewer.open_window(path, place.time, viewer.check_port(port))
+        viewer.open_window(path, location.time, viewer.check_port(port))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -22,51 +22,59 @@ _BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
 
 @dataclass(frozen=True, eq=False)
 class StepValues:
-    """The learners' Q-values at n steps, and maps of them at the steps `renewed` among these."""
+    """The learners' Q-values at n steps, and maps of them at some of these steps."""
 
     values: NDArray[np.float64]
-    """[n, sum of the agents' action counts]: each agent's values of its own actions; of a joint table the
-    best over the others' actions."""
+    """[n, sum of the agents' action counts]: the value of each agent's own actions; with a joint table the
+    best over the actions of the others."""
     greedy: NDArray[np.int64]
     """[n, agents]: each agent's greedy action."""
-    renewed: NDArray[np.int64]
-    """[k]: the rows at which the maps were renewed."""
+    map_rows: NDArray[np.int64]
+    """[k]: the steps that have maps."""
     value_maps: NDArray[np.float32]
-    """[k, learners, pixels]: the greatest value in the state of each pixel; nan where there is none."""
+    """[k, learners, pixels]: the greatest value in the state of each pixel; nan for no state."""
     greedy_maps: NDArray[np.int32]
-    """[k, learners, pixels]: the learner's greedy action there; -1 where there is none."""
+    """[k, learners, pixels]: the learner's greedy action there; -1 for no state."""
+
+    @classmethod
+    def concatenated(cls, parts: Sequence[StepValues]) -> StepValues:
+        """Return the values of successive steps as one."""
+        starts = np.cumsum([0, *(len(part.values) for part in parts[:-1])])
+        return cls(
+            np.concatenate([part.values for part in parts]),
+            np.concatenate([part.greedy for part in parts]),
+            np.concatenate([part.map_rows + start for part, start in zip(parts, starts, strict=True)]),
+            np.concatenate([part.value_maps for part in parts]),
+            np.concatenate([part.greedy_maps for part in parts]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Steps of one phase, with what goes with them."""
+    """Steps of one phase."""
 
     records: NDArray[np.void]
-    values: StepValues | None
-    """None where they are unknown, or not exported."""
     episode: NDArray[np.int64]
     """[n]: training episodes; for evaluation those before it."""
-    before: NDArray[np.void]
-    """The steps before the first, as many as its trail may show."""
     time: NDArray[np.int64]
     """[n]: steps executed, this one included."""
+    values: StepValues | None = None
+    """None where they are unknown, or not exported."""
     trials: int = 0
-    """Trials of an evaluation, of whose steps they are; 0 for training."""
+    """Trials of an evaluation; 0 for training."""
 
-    def number(self, rows: Any = slice(None)) -> NDArray[np.int64]:
-        """Return the number of each row's episode, or of its trial within the evaluation."""
+    def number(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the number of the episode at these rows, or of the trial within its evaluation."""
         own = self.records["episode"][rows].astype(np.int64)
         return np.asarray(own % self.trials) if self.trials else own
 
-    def times(self, rows: Any = None) -> list[rr.TimeColumn]:
-        """Return the timelines of these rows, of all unless given."""
-        return self._all_times if rows is None else self._times(rows)
-
     @cached_property
-    def _all_times(self) -> list[rr.TimeColumn]:
-        return self._times(slice(None))
+    def times(self) -> list[rr.TimeColumn]:
+        """The timelines of all rows."""
+        return self.times_at(slice(None))
 
-    def _times(self, rows: Any) -> list[rr.TimeColumn]:
+    def times_at(self, rows: Any) -> list[rr.TimeColumn]:
+        """Return the timelines of some rows."""
         return [
             rr.TimeColumn("step", sequence=self.time[rows]),
             rr.TimeColumn("episode", sequence=self.episode[rows]),
@@ -75,7 +83,7 @@ class Batch:
 
 
 def new_stream(recording_id: str) -> rr.RecordingStream:
-    """Return a stream that has no other timelines than ours."""
+    """Return a stream without the timelines that Rerun adds by itself."""
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
@@ -83,7 +91,7 @@ def new_stream(recording_id: str) -> rr.RecordingStream:
 
 
 class Sender:
-    """Sends what is under one entity path."""
+    """Sends what is below one entity path."""
 
     def __init__(self, stream: rr.RecordingStream, path: str) -> None:
         self._stream = stream
@@ -93,68 +101,60 @@ class Sender:
         """Send columns of rows."""
         self._stream.send_columns(f"{self.path}/{part}", times, columns)
 
-    def static(self, part: str, *archetypes: Any) -> None:
-        """Log what never changes."""
+    def send_static(self, part: str, *archetypes: Any) -> None:
+        """Send what never changes."""
         for archetype in archetypes:
             self._stream.log(f"{self.path}/{part}", archetype, static=True)
 
     def clear(self, part: str, times: Sequence[int]) -> None:
-        """Say that from these times on nothing is known of a part, until something is sent."""
-        whole = [rr.TimeColumn("step", sequence=times)]
-        self._stream.send_columns(
-            f"{self.path}/{part}", whole, rr.Clear.columns(is_recursive=[True] * len(times))
-        )
+        """Clear a part from each of these times until something is sent for it again."""
+        columns = rr.Clear.columns(is_recursive=[True] * len(times))
+        self.send(part, [rr.TimeColumn("step", sequence=times)], columns)
 
 
-class _Column:
-    """A column whose Arrow array is there already; stands in for Rerun's `ComponentColumn`."""
+class _Column(NamedTuple):
+    """An Arrow array with the interface of Rerun's `ComponentColumn`, which would copy it."""
 
-    def __init__(self, descriptor: Any, array: pa.Array) -> None:
-        self._descriptor = descriptor
-        self._array = array
+    descriptor: Any
+    array: pa.Array
 
     def component_descriptor(self) -> Any:
-        return self._descriptor
+        return self.descriptor
 
     def as_arrow_array(self) -> pa.Array:
-        return self._array
+        return self.array
 
 
-def instances(archetype: Any, n: int, **parts: NDArray[Any]) -> list[Any]:
-    """Return the columns of n rows of equally many instances; each part is [n, instances, ...]."""
-    return [column(getattr(archetype, f"descriptor_{name}")(), n, part) for name, part in parts.items()]
+def instances(archetype: Any, **parts: NDArray[Any]) -> list[Any]:
+    """Return the columns of n rows with equally many instances each.
 
-
-def column(descriptor: Any, n: int, values: NDArray[Any]) -> Any:
-    """Return a component's column of n rows: text or numbers [n, instances], points [n, instances, 2]."""
-    count = values.shape[1]
-    flat = _aligned(values).reshape(n * count, *values.shape[2:])
-    items = pa.FixedSizeListArray.from_arrays(flat.reshape(-1), type=_POINT) if flat.ndim == 2 else flat
-    return _Column(descriptor, pa.ListArray.from_arrays(_offsets(n, count), pa.array(items)))
+    Args:
+        archetype: of Rerun.
+        parts: text or numbers [n, instances], or points [n, instances, 2], by component.
+    """
+    return [
+        _column(archetype, name, _offsets(*part.shape[:2]), part.reshape(-1, *part.shape[2:]))
+        for name, part in parts.items()
+    ]
 
 
 def lists(archetype: Any, lengths: NDArray[np.int64], **parts: NDArray[Any]) -> list[Any]:
-    """Return the columns of rows of so many instances each; each part is [all instances, ...]."""
+    """Return the columns of rows with different numbers of instances; a part is [all instances, ...]."""
     offsets = pa.array(np.concatenate(([0], np.cumsum(lengths))).astype(np.int32))
-    columns = []
-    for name, flat in parts.items():
-        descriptor = getattr(archetype, f"descriptor_{name}")()
-        columns.append(_Column(descriptor, pa.ListArray.from_arrays(offsets, _items(flat))))
-    return columns
+    return [_column(archetype, name, offsets, part) for name, part in parts.items()]
 
 
 def scalars(values: NDArray[np.float64]) -> list[Any]:
     """Return the column of series, [n, series]."""
-    return [column(rr.Scalars.descriptor_scalars(), len(values), values)]
+    return instances(rr.Scalars, scalars=values)
 
 
 def strips(lines: NDArray[np.float32]) -> list[Any]:
-    """Return the column of line strips, given as [n, strips, points, 2]."""
+    """Return the column of line strips, [n, strips, points, 2]."""
     n, count, points, _ = lines.shape
     flat = pa.FixedSizeListArray.from_arrays(pa.array(lines.reshape(-1)), type=_POINT)
     each = pa.ListArray.from_arrays(_offsets(n * count, points), flat, type=_STRIP)
-    rows = pa.ListArray.from_arrays(_offsets(n, count), each)
-    return [_Column(rr.LineStrips2D.descriptor_strips(), rows)]
+    return [_Column(rr.LineStrips2D.descriptor_strips(), pa.ListArray.from_arrays(_offsets(n, count), each))]
 
 
 def images(values: NDArray[np.float32]) -> list[Any]:
@@ -170,23 +170,21 @@ def images(values: NDArray[np.float32]) -> list[Any]:
     return [_Column(rr.DepthImage.descriptor_buffer(), rows), *shown]
 
 
-def _aligned(values: NDArray[Any]) -> NDArray[Any]:
-    """Return values as Arrow wants them in memory; a lone record's field is contiguous but not aligned."""
-    return np.require(values, requirements=["C", "A"])
-
-
-def _items(flat: NDArray[Any]) -> pa.Array:
-    """Return all instances one after another: text or numbers [n], or points [n, 2]."""
-    return (
+def _column(archetype: Any, name: str, offsets: pa.Array, flat: NDArray[Any]) -> _Column:
+    # Arrow refuses memory that is not aligned, which the field of a lone record may be.
+    flat = np.require(flat, requirements=["C", "A"])
+    items = (
         pa.FixedSizeListArray.from_arrays(flat.reshape(-1), type=_POINT) if flat.ndim == 2 else pa.array(flat)
     )
+    descriptor = getattr(archetype, f"descriptor_{name}")()
+    return _Column(descriptor, pa.ListArray.from_arrays(offsets, items))
 
 
 def _offsets(count: int, size: int) -> pa.Array:
     return pa.array(np.arange(count + 1, dtype=np.int32) * size)
 
 
-def centres(height: int, width: int) -> NDArray[np.float32]:
+def pixel_centres(height: int, width: int) -> NDArray[np.float32]:
     """Return the centre of each pixel, row by row, [pixels, 2]."""
     pixel = np.arange(height * width)
     return np.stack((pixel % width + 0.5, pixel // width + 0.5), axis=1).astype(np.float32)
@@ -197,17 +195,11 @@ def place(n: int, x: float, y: float) -> NDArray[np.float32]:
     return np.broadcast_to(np.array([[x, y]], np.float32), (n, 1, 2))
 
 
-def texts(words: Sequence[str]) -> NDArray[Any]:
-    """Return a label a row, [n, 1]."""
-    return np.array(words, dtype=object)[:, None]
-
-
-def ink(n: int) -> NDArray[np.uint32]:
-    """Return the colour of writing for n rows, [n, 1]."""
-    red, green, blue, alpha = rgba(palette.MIDTONE)
-    return np.full((n, 1), red << 24 | green << 16 | blue << 8 | alpha, np.uint32)
+def texts(rows: Sequence[str]) -> NDArray[Any]:
+    """Return a text a row, [n, 1]."""
+    return np.array(rows, dtype=object)[:, None]
 
 
 def rgba(colour: str, alpha: int = 255) -> tuple[int, int, int, int]:
-    """Return the parts of a colour "#rrggbb"."""
+    """Return red, green, blue and alpha of a colour "#rrggbb"."""
     return *palette.rgb(colour), alpha

@@ -6,25 +6,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
-from runner.environments.naming import spoken
-from runner.export.rerun.maps import draw_blocks
+from runner.environments.naming import numbered_actions, spoken
+from runner.export.rerun.columns import rgba
 from runner.export.rerun.metrics import TRAINING_MEANS
-from runner.export.rerun.scene import Scene
-from runner.export.rerun.values import TOP, WIDTH, bar_rows, draw_table
+from runner.export.rerun.scene import Placements, Scene
 from runner.recording.metrics import METRICS
 
-FRAMES_A_SECOND: Final = 10.0
+FRAMES_PER_SECOND: Final = 10.0
+GRID_MARGIN: Final = 0.8
 PLOTS: Final = (
     *(
         (
             metric.heading.capitalize(),
             (
-                *(f"train/metrics/{n}" for n in TRAINING_MEANS if n == metric.name),
+                *(f"train/metrics/{name}" for name in TRAINING_MEANS if name == metric.name),
                 f"eval/metrics/{metric.name}",
             ),
         )
@@ -39,237 +41,241 @@ PLOTS: Final = (
 _RESULTS: Final = len(METRICS)
 """Number of views, the first ones, that show results of evaluations."""
 
+NAME_X: Final = 1.0
+BAR_LEFT: Final = 2.5
+BAR_LENGTH: Final = 5.0
+NUMBER_X: Final = 9.4
+GREEDY_X: Final = 12.2
+CHOSEN_X: Final = 15.2
+TABLE_WIDTH: Final = 17.0
+TABLE_TOP: Final = -1.7
+"""Columns and top of the table of values, in rows of height 1."""
+LABEL_RISE: Final = 0.5
+"""From a row of the table up to the point of a label in it, which is written below that point."""
+MAP_LABEL_Y: Final = -2.6
+_AGENT_GAP: Final = 2.0
 
-@dataclass(frozen=True)
-class Shown:
-    """What the blueprint needs to know of a run."""
+
+@dataclass(frozen=True, eq=False)
+class RunView:
+    """A run as the blueprint sees it."""
 
     root: str
+    """Entity path of everything of the run; empty for the root."""
     title: str
     mdp: Mdp
     scene: Scene | None
     learners: tuple[str, ...]
-    steps: bool
-    """Whether any steps are exported."""
-    last: int
-    """Steps executed in the whole run; 0 if that is not known yet."""
-    paths: frozenset[str] | None
-    """Metrics that there are; None if that is not known yet."""
-    values: bool = True
-    """Whether values of the tables are exported."""
+    has_steps: bool = True
+    has_values: bool = False
+    last: int = 0
+    """Steps executed in the whole run; 0 if not known yet."""
+
+    def draw_background(self, stream: rr.RecordingStream) -> None:
+        """Log what never changes: cells, walls, landmarks, and the frames of table and maps."""
+        if self.has_values:
+            _draw_table(stream, f"{self.root}/table/words", self.mdp)
+        if self.scene is not None:
+            _draw_grid(stream, f"{self.root}/scene", self.scene)
+            if self.scene.placements is not None:
+                _draw_blocks(stream, f"{self.root}/frame", self.scene.placements)
+
+    def grid_view(self) -> Any:
+        """Return the view of the grid; without a scene that of state and action as lines."""
+        if self.scene is None:
+            entities = [f"{phase}/{name}" for phase in ("train", "eval") for name in ("state", "action")]
+            return self._view(
+                rrb.TimeSeriesView, f"{self.title}: state and action", entities, axis_x=whole_axis(self.last)
+            )
+        bounds = rrb.VisualBounds2D(
+            x_range=(-GRID_MARGIN, self.scene.columns + GRID_MARGIN),
+            y_range=(-GRID_MARGIN - 0.1, self.scene.rows + GRID_MARGIN + 0.1),
+        )
+        entities = ["scene/**", "train/grid/**", "eval/grid/**", "notice/**"]
+        return self._view(rrb.Spatial2DView, self.title, entities, visual_bounds=bounds)
+
+    def value_views(self) -> list[Any]:
+        """Return the views of Q-values: the table, and a map of each learner where there are any."""
+        bottom = float(bar_rows(self.mdp)[-1][-1]) + 0.9
+        bounds = rrb.VisualBounds2D(x_range=(-0.4, TABLE_WIDTH), y_range=(TABLE_TOP, bottom))
+        entities = ["table/**", "train/q/**", "eval/q/**"]
+        name = "Q-values of this state, before the move"
+        views = [self._view(rrb.Spatial2DView, name, entities, visual_bounds=bounds)]
+        placements = self.scene.placements if self.scene else None
+        if placements is None:
+            return views
+        bounds = rrb.VisualBounds2D(
+            x_range=(-0.5, placements.width + 0.5), y_range=(-3.2, placements.height + 0.5)
+        )
+        for learner in self.learners:
+            entities = ["frame/**", f"train/map/{learner}/**", f"eval/map/{learner}/**"]
+            name = f"{spoken(learner)}: max Q, greedy moves"
+            views.append(self._view(rrb.Spatial2DView, name, entities, visual_bounds=bounds))
+        return views
+
+    def event_view(self) -> Any:
+        """Return the view of the log of events."""
+        columns = rrb.TextLogColumns(timeline_columns=["step"], text_log_columns=["body"])
+        return self._view(rrb.TextLogView, "Events", ["train/events", "eval/events"], columns=columns)
+
+    def _view(self, kind: Any, name: str, entities: Sequence[str], **options: Any) -> Any:
+        contents = [f"{self.root}/{entity}" for entity in entities]
+        return kind(origin=f"{self.root}/", contents=contents, name=name, **options)
 
 
-def blueprint(runs: Sequence[Shown]) -> rrb.Blueprint:
-    """Return the arrangement for one run, or for several side by side; it opens at the last step."""
-    last = max(run.last for run in runs)
-    plots = _plots(runs, last)
-    with_steps = [run for run in runs if run.steps]
+def blueprint(runs: Sequence[RunView], entities: set[str] | None) -> rrb.Blueprint:
+    """Return the arrangement of one run, or of several side by side; it opens at the last step.
+
+    Args:
+        runs: the runs.
+        entities: the metrics that there are; None if not known yet.
+    """
+    plots = _plots(runs, entities)
     body: Any
     if len(runs) == 1:
-        parts = [*(_single(with_steps[0]) if with_steps else ()), rrb.Grid(*plots, grid_columns=2)]
-        shares = {3: [4, 3, 4], 2: [4, 5]}.get(len(parts), [1])
-        body = rrb.Horizontal(*parts, column_shares=shares)
+        columns: list[Any] = [rrb.Grid(*plots, grid_columns=2)]
+        shares = [1]
+        if runs[0].has_steps:
+            columns.insert(0, rrb.Vertical(runs[0].grid_view(), runs[0].event_view(), row_shares=[3, 1]))
+            shares = [4, 5]
+        if runs[0].has_values:
+            table, *maps = runs[0].value_views()
+            below = [rrb.Horizontal(*maps)] if len(maps) > 1 else maps
+            columns.insert(1, rrb.Vertical(table, *below, row_shares=[1, 1]) if below else table)
+            shares = [4, 3, 4]
+        body = rrb.Horizontal(*columns, column_shares=shares)
     else:
-        halves = [rrb.Horizontal(*_half(run), name=run.title) for run in with_steps]
+        halves = [
+            rrb.Horizontal(run.grid_view(), rrb.Tabs(*run.value_views(), run.event_view()), name=run.title)
+            for run in runs
+            if run.has_steps
+        ]
         rows = [
             rrb.Horizontal(*plots[:_RESULTS], name="Results"),
             rrb.Horizontal(*plots[_RESULTS:], name="Training"),
         ]
-        below = rrb.Tabs(*(row for row in rows if row.contents))
-        body = rrb.Vertical(rrb.Horizontal(*halves), below, row_shares=[7, 3]) if halves else below
+        body = rrb.Tabs(*(row for row in rows if row.contents))
+        if halves:
+            body = rrb.Vertical(rrb.Horizontal(*halves), body, row_shares=[7, 3])
+    return _with_panels(body, "following")
+
+
+def loop_blueprint(views: Sequence[Any]) -> rrb.Blueprint:
+    """Return the arrangement of loops, whose views are given."""
+    return _with_panels(views[0] if len(views) == 1 else rrb.Vertical(*views), "paused")
+
+
+def _with_panels(body: Any, play_state: Any) -> rrb.Blueprint:
     return rrb.Blueprint(
         body,
-        rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_A_SECOND, play_state="following"),
+        rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_PER_SECOND, play_state=play_state),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
         auto_views=False,
     )
-
-
-def loop_blueprint(parts: Sequence[Any]) -> rrb.Blueprint:
-    """Return the arrangement for somebody's own loops, each arranged already."""
-    return rrb.Blueprint(
-        parts[0] if len(parts) == 1 else rrb.Vertical(*parts),
-        rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_A_SECOND, play_state="paused"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-    )
-
-
-def _single(run: Shown) -> list[Any]:
-    left = rrb.Vertical(_grid(run), _events(run), row_shares=[3, 1])
-    if not run.values:
-        return [left]
-    maps = _maps(run)
-    if not maps:
-        return [left, _values(run)]
-    below = rrb.Horizontal(*maps) if len(maps) > 1 else maps[0]
-    return [left, rrb.Vertical(_values(run), below, row_shares=[1, 1])]
-
-
-def _half(run: Shown) -> list[Any]:
-    return [_grid(run), rrb.Tabs(_values(run), *_maps(run), _events(run))]
-
-
-def _grid(run: Shown) -> Any:
-    if run.scene is None:
-        contents = [
-            f"{run.root}/{phase}/{what}" for phase in ("train", "eval") for what in ("state", "action")
-        ]
-        return rrb.TimeSeriesView(
-            origin=f"{run.root}/",
-            contents=contents,
-            name=f"{run.title}: state and action",
-            axis_x=whole_axis(run.last),
-        )
-    margin = 0.8
-    bounds = rrb.VisualBounds2D(
-        x_range=(-margin, run.scene.columns + margin), y_range=(-margin - 0.1, run.scene.rows + 0.9)
-    )
-    contents = [
-        f"{run.root}/scene/**",
-        f"{run.root}/train/grid/**",
-        f"{run.root}/eval/grid/**",
-        f"{run.root}/notice/**",
-    ]
-    return rrb.Spatial2DView(origin=f"{run.root}/", contents=contents, visual_bounds=bounds, name=run.title)
-
-
-def _values(run: Shown) -> Any:
-    bottom = float(bar_rows(run.mdp)[-1][-1]) + 0.9
-    bounds = rrb.VisualBounds2D(x_range=(-0.4, WIDTH), y_range=(TOP, bottom))
-    contents = [f"{run.root}/table/**", f"{run.root}/train/q/**", f"{run.root}/eval/q/**"]
-    return rrb.Spatial2DView(
-        origin=f"{run.root}/",
-        contents=contents,
-        visual_bounds=bounds,
-        name="Q-values of this state, before the move",
-    )
-
-
-def _maps(run: Shown) -> list[Any]:
-    if run.scene is None or run.scene.placements is None:
-        return []
-    pictures = run.scene.placements
-    bounds = rrb.VisualBounds2D(x_range=(-0.5, pictures.width + 0.5), y_range=(-3.2, pictures.height + 0.5))
-    views = []
-    for learner in run.learners:
-        contents = [
-            f"{run.root}/frame/**",
-            f"{run.root}/train/map/{learner}/**",
-            f"{run.root}/eval/map/{learner}/**",
-        ]
-        views.append(
-            rrb.Spatial2DView(
-                origin=f"{run.root}/",
-                contents=contents,
-                visual_bounds=bounds,
-                name=f"{spoken(learner)}: max Q, greedy moves",
-            )
-        )
-    return views
-
-
-def _events(run: Shown) -> Any:
-    contents = [f"{run.root}/train/events", f"{run.root}/eval/events"]
-    columns = rrb.TextLogColumns(timeline_columns=["step"], text_log_columns=["body"])
-    return rrb.TextLogView(origin=f"{run.root}/", contents=contents, name="Events", columns=columns)
 
 
 def whole_axis(last: int) -> rrb.TimeAxis:
-    """Return a time axis from 0 to the step `last`; to the cursor if that is 0, not known yet."""
-    start, end = rr.TimeRangeBoundary.absolute(seq=0), rr.TimeRangeBoundary.cursor_relative(seq=0)
-    if last:
-        end = rr.TimeRangeBoundary.absolute(seq=last)
-    return rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end))
+    """Return a time axis from 0 to the step `last`, or to the cursor if that is 0."""
+    end = rr.TimeRangeBoundary.absolute(seq=last) if last else rr.TimeRangeBoundary.cursor_relative(seq=0)
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=rr.TimeRangeBoundary.absolute(seq=0), end=end))
 
 
-def _plots(runs: Sequence[Shown], last: int) -> list[Any]:
-    axis = whole_axis(last)
+def _plots(runs: Sequence[RunView], entities: set[str] | None) -> list[Any]:
+    axis = whole_axis(max(run.last for run in runs))
     views = []
     for name, paths in PLOTS:
-        contents = [
-            f"{run.root}/{path}" for run in runs for path in paths if run.paths is None or path in run.paths
-        ]
-        if contents:
+        contents = [f"{run.root}/{path}" for run in runs for path in paths]
+        if shown := [entity for entity in contents if entities is None or entity in entities]:
+            legend = rrb.PlotLegend(visible=True)
             views.append(
-                rrb.TimeSeriesView(
-                    origin="/",
-                    contents=contents,
-                    name=name,
-                    axis_x=axis,
-                    plot_legend=rrb.PlotLegend(visible=True),
-                )
+                rrb.TimeSeriesView(origin="/", contents=shown, name=name, axis_x=axis, plot_legend=legend)
             )
     return views
 
 
-def draw_background(stream: rr.RecordingStream, run: Shown) -> None:
-    """Log what never changes: cells, walls, landmarks, and the frame of the table of values."""
-    if run.steps and run.values:
-        draw_table(stream, f"{run.root}/table/words", run.mdp)
-    if run.scene is not None and run.steps:
-        _draw_scene(stream, f"{run.root}/scene", run.scene)
-        if run.scene.placements is not None:
-            draw_blocks(stream, f"{run.root}/frame", run.scene.placements)
+def bar_rows(mdp: Mdp) -> list[NDArray[np.float64]]:
+    """Return the y of each agent's rows in the table of values, from top to bottom."""
+    rows: list[NDArray[np.float64]] = []
+    top = 1.0
+    for count in mdp.action_counts:
+        rows.append(np.arange(count, dtype=np.float64) + top)
+        top += count + _AGENT_GAP
+    return rows
 
 
-def _draw_scene(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
+def _draw_table(stream: rr.RecordingStream, path: str, mdp: Mdp) -> None:
+    """Log the words around the table of values."""
+    words: list[tuple[float, float, str, str]] = []
+    """x, y, text and colour."""
+    agents = zip(mdp.agents, bar_rows(mdp), numbered_actions(mdp), strict=True)
+    for i, (agent, rows, names) in enumerate(agents):
+        words.append((NAME_X, float(rows[0]) - 1.15, spoken(agent).upper(), palette.agent(i)))
+        words += [(NAME_X, float(y), name, palette.MIDTONE) for y, name in zip(rows, names, strict=True)]
+    middle = BAR_LEFT + BAR_LENGTH / 2
+    headings = {middle: "worst to best", NUMBER_X: "Q", GREEDY_X: "greedy", CHOSEN_X: "chosen"}
+    words += [(x, -0.15, heading, palette.MIDTONE) for x, heading in headings.items()]
+    points = rr.Points2D(
+        [(x, y - LABEL_RISE) for x, y, _, _ in words],
+        labels=[text for _, _, text, _ in words],
+        colors=[rgba(colour) for _, _, _, colour in words],
+        radii=0.0,
+        show_labels=True,
+    )
+    stream.log(path, points, static=True)
+
+
+def _draw_blocks(stream: rr.RecordingStream, path: str, placements: Placements) -> None:
+    """Log the lines between the blocks of a map."""
+    rows, columns = placements.block
+    lines = _lines(range(0, placements.height + 1, rows), range(0, placements.width + 1, columns))
+    stream.log(path, rr.LineStrips2D(lines, colors=[(255, 255, 255)], radii=0.06, draw_order=30), static=True)
+
+
+def _draw_grid(stream: rr.RecordingStream, path: str, scene: Scene) -> None:
+    """Log cells, walls and landmarks."""
     rows, columns = scene.rows, scene.columns
-    across: list[Any] = [[(0, y), (columns, y)] for y in range(rows + 1)]
-    down = [[(x, 0), (x, rows)] for x in range(columns + 1)]
-    stream.log(
-        f"{path}/cells",
-        rr.LineStrips2D(across + down, colors=[(128, 128, 128, 90)], radii=0.008, draw_order=10),
-        static=True,
+    grey = palette.rgb(palette.MIDTONE)
+    cells = rr.LineStrips2D(
+        _lines(range(rows + 1), range(columns + 1)), colors=[(*grey, 90)], radii=0.008, draw_order=10
     )
+    stream.log(f"{path}/cells", cells, static=True)
     border: Any = [(0, 0), (columns, 0), (columns, rows), (0, rows), (0, 0)]
-    walls = [border, *(_wall(first, second) for first, second in scene.description.get("walls", []))]
-    stream.log(
-        f"{path}/walls",
-        rr.LineStrips2D(walls, colors=[(128, 128, 128)], radii=0.05, draw_order=25),
-        static=True,
+    walls = [border, *(_wall(first, second) for first, second in scene.description["walls"])]
+    stream.log(f"{path}/walls", rr.LineStrips2D(walls, colors=[grey], radii=0.05, draw_order=25), static=True)
+    marks = scene.description["landmarks"]
+    if not marks:
+        return
+    # A line 0.46 wide around this square and along its diagonal fills a cell.
+    square = np.array([(0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75), (0.25, 0.25), (0.75, 0.75)])
+    corners = [(float(column), float(row)) for row, column in (mark["cell"] for mark in marks)]
+    colours = [palette.rgb(mark["colour"]) for mark in marks]
+    tints = rr.LineStrips2D(
+        [square + corner for corner in corners],
+        colors=[(*colour, 110) for colour in colours],
+        radii=0.23,
+        draw_order=5,
     )
-    marks = scene.description.get("landmarks", [])
-    tints = [(*palette.rgb(mark["colour"]), 110) for mark in marks]
-    if marks:
-        stream.log(
-            f"{path}/landmarks",
-            rr.LineStrips2D(
-                [_square(*mark["cell"]) for mark in marks], colors=tints, radii=0.23, draw_order=5
-            ),
-            static=True,
-        )
-        stream.log(
-            f"{path}/names",
-            rr.Points2D(
-                [(c + 0.14, r + 0.72) for r, c in (mark["cell"] for mark in marks)],
-                labels=[mark["name"] for mark in marks],
-                colors=[palette.rgb(mark["colour"]) for mark in marks],
-                radii=0.0,
-                show_labels=True,
-                draw_order=26,
-            ),
-            static=True,
-        )
+    stream.log(f"{path}/landmarks", tints, static=True)
+    names = rr.Points2D(
+        [(x + 0.14, y + 0.72) for x, y in corners],
+        labels=[mark["name"] for mark in marks],
+        colors=colours,
+        radii=0.0,
+        show_labels=True,
+        draw_order=26,
+    )
+    stream.log(f"{path}/names", names, static=True)
 
 
-def _square(row: int, column: int) -> list[tuple[float, float]]:
-    """Return a line that fills a cell when it is drawn 0.46 wide."""
-    low, high = 0.25, 0.75
-    x, y = float(column), float(row)
-    return [
-        (x + low, y + low),
-        (x + high, y + low),
-        (x + high, y + high),
-        (x + low, y + high),
-        (x + low, y + low),
-        (x + high, y + high),
-    ]
+def _lines(rows: range, columns: range) -> list[Any]:
+    """Return horizontal lines at these rows and vertical ones at these columns, over all of them."""
+    across: list[Any] = [[(columns[0], y), (columns[-1], y)] for y in rows]
+    return across + [[(x, rows[0]), (x, rows[-1])] for x in columns]
 
 
 def _wall(first: Sequence[int], second: Sequence[int]) -> list[tuple[float, float]]:
+    """Return the line between two neighbouring cells."""
     (row, column), (other_row, other_column) = first, second
     if row == other_row:
         x = max(column, other_column)

@@ -1,7 +1,8 @@
-"""Which steps of a recording are exported: chosen by episode, or a spread of them when nothing is asked."""
+"""Which steps of a recording are exported, and where a step is on the viewer's timeline."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -9,89 +10,105 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.evaluations import Evaluation, evaluation_after
+from runner.analysis.diff import can_compare_steps
+from runner.analysis.diff.divergence import evaluation_divergences, training_divergence
+from runner.analysis.diff.sections import where_in_words
+from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
 from runner.errors import RecordingError
 from runner.export.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.recording import schema
-from runner.recording.reader import Recording
+from runner.recording.reader import Recording, open_recording
+from runner.runs.run import Run
 
-SPREAD: Final = 20
-"""Training episodes of the default choice."""
-SPREAD_STEPS: Final = 50_000
-"""Steps at which the default choice of training episodes stops growing, however long episodes are."""
+DEFAULT_EPISODES: Final = 20
+"""Training episodes of the default selection."""
+DEFAULT_STEPS: Final = 50_000
+"""Steps at which the default selection stops growing, however long episodes are."""
 
 
 @dataclass(frozen=True)
 class Request:
-    """What was asked for; nothing of it means the default choice."""
+    """The steps to export; the default selection unless anything is given."""
 
     episodes: tuple[tuple[int, int | None], ...] = ()
-    """Ranges of training episodes, the second number not included; None is the end."""
+    """Ranges of training episodes, the second number excluded; None is the end."""
     evaluations: tuple[int, ...] = ()
-    """Evaluations, named by the training episodes before them."""
+    """Evaluations, by the number of training episodes before them."""
     every: int = 0
-    """Each so many training episodes; 0 for none."""
+    """Every Nth training episode; 0 for none."""
     everything: bool = False
-    spread: bool = False
-    """The default choice beside the rest."""
+    with_default: bool = False
+    """Whether the default selection is added to the rest."""
 
     @property
     def is_default(self) -> bool:
-        """Whether the default choice is exported: nothing was asked for, or it was."""
-        return self.spread or not (self.episodes or self.evaluations or self.every or self.everything)
+        """Whether the default selection is part of it."""
+        return self.with_default or not (self.episodes or self.evaluations or self.every or self.everything)
 
 
 @dataclass(frozen=True, eq=False)
 class Episodes:
-    """Where each episode of a phase lies; the last may be one that never ended."""
+    """The steps of each episode of a phase; the last episode may not have ended."""
 
-    phase: str
     first_step: NDArray[np.int64]
     """[E + 1]: number of the first step within the phase; the last entry is the number of steps."""
     ended: int
 
     @property
     def count(self) -> int:
-        """Episodes that have steps."""
+        """The number of episodes with steps."""
         return len(self.first_step) - 1
+
+    def spans(self, numbers: NDArray[np.int64]) -> list[Span]:
+        """Return the spans of these episodes, which ascend; neighbours form one span."""
+        groups = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
+        first = self.first_step
+        return [Span(int(first[g[0]]), int(first[g[-1] + 1]), int(g[0])) for g in groups if len(g)]
 
 
 @dataclass(frozen=True)
 class Span:
-    """Steps `start` up to `stop` of a phase, of whole episodes that follow each other."""
+    """Steps `start` up to `stop` of a phase, of successive whole episodes."""
 
     start: int
     stop: int
     episode: int
-    """The first of them."""
+    """The first of these episodes."""
 
 
 @dataclass
 class Selection:
-    """The chosen steps, and what to say about the choice."""
+    """The selected steps, and the messages for the user about them."""
 
     train: list[Span] = field(default_factory=list)
     evaluations: list[tuple[Evaluation, Span]] = field(default_factory=list)
-    chosen: list[str] = field(default_factory=list)
+    exported: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
     @property
     def steps(self) -> int:
-        """How many steps are chosen."""
-        spans = [*self.train, *(span for _, span in self.evaluations)]
-        return sum(span.stop - span.start for span in spans)
+        """The number of selected steps."""
+        return _count([*self.train, *(span for _, span in self.evaluations)])
+
+
+@dataclass(frozen=True)
+class Location:
+    """A point of the timeline, and a request that includes its episode."""
+
+    time: int
+    request: Request
 
 
 def select(recording: Recording, request: Request) -> Selection:
-    """Return the steps that a request means.
+    """Return the steps of a request.
 
     Raises:
-        RecordingError: an episode or evaluation does not exist, or steps are asked for and not recorded.
+        RecordingError: an episode or evaluation does not exist, or steps are requested and not recorded.
     """
-    if not recording.is_job:
-        return _select_loop(recording, request)
     selection = Selection(warnings=shortcomings(recording))
+    if not recording.is_job:
+        return _select_loop(recording, request, selection)
     if recording.mdp.scene is None or recording.mdp.scene_cells is None:
         selection.warnings.append("The environment has no scene: state and action are shown as series.")
     if not recording.has_steps:
@@ -102,16 +119,19 @@ def select(recording: Recording, request: Request) -> Selection:
         )
         return selection
     train, evals = episodes_of(recording, "train"), episodes_of(recording, "eval")
-    evaluations = evaluations_with_steps(recording, train, evals)
+    available = _evaluations_with_steps(recording, train, evals)
     numbers = _training_episodes(recording, request, train)
-    selection.train = spans_of(train, numbers)
-    wanted = _evaluations(recording, request, evaluations)
+    selection.train = train.spans(numbers)
+    where = str(recording.path)
+    chosen = {evaluation_after(available, after, where) for after in request.evaluations}
+    chosen |= set(available if request.everything else available[-1:] if request.is_default else ())
+    evaluations = sorted(chosen, key=lambda one: one.after)
     selection.evaluations = [
-        (one, span) for one in wanted for span in spans_of(evals, np.arange(one.start, one.stop))
+        (one, span) for one in evaluations for span in evals.spans(np.arange(one.start, one.stop))
     ]
-    _tell(selection, request, train, numbers, evaluations, wanted)
-    unknown = _steps_without_values(recording, selection.train)
-    if unknown:
+    _describe_training(selection, request, train, numbers)
+    _describe_evaluations(selection, available, evaluations)
+    if unknown := _steps_without_values(recording, selection.train):
         selection.warnings.append(
             f"{unknown:,} of these training steps are exported without Q-values: steps before them were "
             "lost, and the Q-tables are unknown until the next snapshot."
@@ -119,18 +139,84 @@ def select(recording: Recording, request: Request) -> Selection:
     return selection
 
 
-def chosen_spans(recording: Recording, request: Request) -> list[Span]:
-    """Return the training steps that a request means.
+def locate(run: Run, request: Request, step: tuple[int, ...] | None) -> Location:
+    """Return where a step is on the timeline.
+
+    Args:
+        run: the run.
+        request: what is exported anyway.
+        step: (episode, t) of training, (training episodes, trial, t) of an evaluation, or None for the first
+            step of the last evaluation exported, or else of the last training episode.
 
     Raises:
-        RecordingError: an episode does not exist.
+        RecordingError: there is no such step, or none at all.
     """
-    train = episodes_of(recording, "train")
-    return spans_of(train, _training_episodes(recording, request, train))
+    with open_recording(run.recording) as recording:
+        if step is None:
+            return Location(_default_time(recording, request), request)
+        require_steps(recording, "look at")
+        phase = "train" if len(step) == 2 else "eval"
+        episodes, t = episodes_of(recording, phase), step[-1]
+        if phase == "train":
+            number, more = step[0], Request(episodes=((step[0], step[0] + 1),))
+            if number >= episodes.count:
+                raise RecordingError(
+                    f"{recording.path}: found no training episode {number}; there are {episodes.count:,}, "
+                    "from 0."
+                )
+        else:
+            evaluations = evaluations_of(recording)
+            if recording.is_job:
+                evaluations = _evaluations_with_steps(recording, episodes_of(recording, "train"), episodes)
+            where = str(recording.path)
+            number = evaluation_after(evaluations, step[0], where).trial(step[1], where)
+            more = Request(evaluations=(step[0],) if recording.is_job else ())  # a loop's are always exported
+        first, stop = episodes.first_step[number : number + 2].tolist()
+        if first + t >= stop:
+            raise RecordingError(
+                f"{recording.path}: found no t = {t} there; the episode has {stop - first} steps, from 0."
+            )
+        time = _time(recording, phase, first + t)
+    if request.everything:
+        return Location(time, request)
+    added = dataclasses.replace(
+        request,
+        episodes=request.episodes + more.episodes,
+        evaluations=request.evaluations + more.evaluations,
+        with_default=request.is_default,
+    )
+    return Location(time, added)
+
+
+def locate_divergence(runs: Sequence[Run]) -> tuple[tuple[int, ...] | None, str]:
+    """Return the step at which two runs diverge, as `locate` takes it, and a sentence about it.
+
+    That is the first step of training that differs, or else the first evaluation's. None if they do not
+    diverge, or if they cannot be compared.
+    """
+    with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
+        if not (a.is_job and b.is_job):
+            return None, "`dualtaxi diff` shows where two loops diverge."
+        if not can_compare_steps(a, b):
+            return (
+                None,
+                "Where they diverge is unknown: states or actions differ, or steps were not recorded.",
+            )
+        divergence = training_divergence(a, b)
+        if divergence is None or None in (divergence.a_step, divergence.b_step):
+            suffix = ", as far as the shorter goes" if divergence is not None else ""
+            divergence = next(evaluation_divergences(a, b), None)
+            if divergence is None:
+                return None, f"They never diverge: every step is the same{suffix}."
+    step = (divergence.episode, divergence.t)
+    return step if divergence.after is None else (
+        divergence.after,
+        *step,
+    ), f"They diverge {where_in_words(divergence)}."
 
 
 def episodes_of(recording: Recording, phase: str) -> Episodes:
-    """Return where the episodes of a phase lie, one that never ended among them."""
+    """Return the episodes of a phase that have steps."""
     steps, episodes = schema.PHASES[phase]
     total = recording.count(steps)
     first = np.full(recording.count(episodes) + 1, -1, np.int64)
@@ -140,28 +226,47 @@ def episodes_of(recording: Recording, phase: str) -> Episodes:
         number, stop = counted["episode"].astype(np.int64), counted["last_step"].astype(np.int64) + 1
         first[number] = stop - counted["length"]
         first[number + 1] = stop
-    first = np.maximum.accumulate(first)  # steps of episodes that were lost in a repair count as the first's
+    # Steps of episodes that were lost in a repair count as those of the first episode after them.
+    first = np.maximum.accumulate(first)
     first = first[first <= total]
-    ended = len(first) - 1
-    return Episodes(phase, np.append(first, total) if total > first[-1] else first, ended)
+    return Episodes(np.append(first, total) if total > first[-1] else first, len(first) - 1)
 
 
-def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episodes) -> list[Evaluation]:
-    """Return the evaluations that have steps, one that was cut off among them."""
-    if not evals.count:
-        return []
-    trials = int(recording.config["evaluation"]["trials"])
-    found = []
+def _evaluations_with_steps(recording: Recording, train: Episodes, evals: Episodes) -> list[Evaluation]:
+    """Return the evaluations that have steps, including an incomplete one."""
+    evaluations = []
+    trials = int(recording.config["evaluation"]["trials"]) if evals.count else 1
     for start in range(0, evals.count, trials):
         stop = min(start + trials, evals.count)
         bounds = int(evals.first_step[start]), int(evals.first_step[stop])
         block = next(recording.blocks(schema.EVAL_STEP, *bounds), None)
-        if block is None:  # all of its steps were lost in a repair
-            continue
-        trained = int(block["log_time"][0]) // schema.STEP_NANOSECONDS - (int(block["step"][0]) + 1)
-        after = int(np.searchsorted(train.first_step[1 : train.ended + 1], trained, side="right"))
-        found.append(Evaluation(after, trained, start, stop))
-    return found
+        if block is not None:  # otherwise all of its steps were lost in a repair
+            trained = int(block["log_time"][0]) // schema.STEP_NANOSECONDS - (int(block["step"][0]) + 1)
+            after = int(np.searchsorted(train.first_step[1 : train.ended + 1], trained, side="right"))
+            evaluations.append(Evaluation(after, trained, start, stop))
+    return evaluations
+
+
+def _training_episodes(recording: Recording, request: Request, train: Episodes) -> NDArray[np.int64]:
+    """Return the numbers of the training episodes of a request, ascending."""
+    if request.everything:
+        return np.arange(train.count)
+    ranges = whole_ranges(request.episodes, train.count, "train", str(recording.path))
+    numbers = [np.empty(0, np.int64), *(np.arange(start, stop) for start, stop in ranges)]
+    if request.every:
+        numbers.append(np.arange(0, train.count, request.every))
+    if request.is_default and train.count:
+        numbers.append(_default_episodes(np.diff(train.first_step)))
+    return np.unique(np.concatenate(numbers))
+
+
+def _default_episodes(lengths: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return episodes evenly spread from the first to the last, as many as the limits allow."""
+    for count in range(min(DEFAULT_EPISODES, len(lengths)), 1, -1):
+        numbers = np.unique(np.linspace(0, len(lengths) - 1, count).round().astype(np.int64))
+        if int(lengths[numbers].sum()) <= DEFAULT_STEPS:
+            return numbers
+    return np.unique([0, len(lengths) - 1]).astype(np.int64)
 
 
 def _steps_without_values(recording: Recording, spans: Sequence[Span]) -> int:
@@ -178,122 +283,87 @@ def _steps_without_values(recording: Recording, spans: Sequence[Span]) -> int:
     return unknown
 
 
-def spans_of(episodes: Episodes, numbers: NDArray[np.int64]) -> list[Span]:
-    """Return the spans of these episodes, ascending; neighbours are one span."""
-    if not len(numbers):
-        return []
-    breaks = np.flatnonzero(np.diff(numbers) != 1) + 1
-    runs = np.split(numbers, breaks)
-    first = episodes.first_step
-    return [Span(int(first[run[0]]), int(first[run[-1] + 1]), int(run[0])) for run in runs]
-
-
-def _training_episodes(recording: Recording, request: Request, train: Episodes) -> NDArray[np.int64]:
-    """Return the numbers of the training episodes that are meant, ascending."""
-    if request.everything:
-        return np.arange(train.count)
-    numbers = [_spread(train)] if request.is_default else []
-    if request.every:
-        numbers.append(np.arange(0, train.count, request.every))
-    ranges = whole_ranges(request.episodes, train.count, "train", str(recording.path))
-    numbers += [np.arange(start, stop) for start, stop in ranges]
-    return np.unique(np.concatenate(numbers)) if numbers else np.empty(0, np.int64)
-
-
-def _spread(train: Episodes) -> NDArray[np.int64]:
-    """Return episodes evenly spread from the first to the last, no more than are worth it."""
-    if not train.count:
-        return np.empty(0, np.int64)
-    lengths = np.diff(train.first_step)
-    for count in range(min(SPREAD, train.count), 1, -1):
-        numbers = np.unique(np.linspace(0, train.count - 1, count).round().astype(np.int64))
-        if int(lengths[numbers].sum()) <= SPREAD_STEPS:
-            return numbers
-    return np.unique([0, train.count - 1]).astype(np.int64)
-
-
-def _evaluations(
-    recording: Recording, request: Request, evaluations: Sequence[Evaluation]
-) -> list[Evaluation]:
-    """Return the evaluations that are meant."""
-    if request.everything:
-        return list(evaluations)
-    where = str(recording.path)
-    asked = [evaluation_after(evaluations, after, where) for after in request.evaluations]
-    if request.is_default:
-        asked += evaluations[-1:]
-    return sorted(set(asked), key=lambda one: one.after)
-
-
-def _tell(
-    selection: Selection,
-    request: Request,
-    train: Episodes,
-    numbers: NDArray[np.int64],
-    evaluations: Sequence[Evaluation],
-    wanted: Sequence[Evaluation],
+def _describe_training(
+    selection: Selection, request: Request, train: Episodes, numbers: NDArray[np.int64]
 ) -> None:
-    """Say what is exported, what is not, and what would include it."""
-    spread = (
-        f", evenly spread from {numbers[0]} to {numbers[-1]:,}" if request.is_default and len(numbers) else ""
-    )
-    selection.chosen.append(
-        f"the {_steps(selection.train)} steps of {len(numbers):,} of {train.count:,} training episodes"
+    is_spread = request.is_default and len(numbers)
+    spread = f", evenly spread from {numbers[0]} to {numbers[-1]:,}" if is_spread else ""
+    selection.exported.append(
+        f"the {_count(selection.train):,} steps of {len(numbers):,} of {train.count:,} training episodes"
         + spread
-    )
-    spans = [span for _, span in selection.evaluations]
-    named = (
-        f" (after {', '.join(f'{one.after:,}' for one in wanted)} episodes)" if 0 < len(wanted) <= 4 else ""
-    )
-    selection.chosen.append(
-        f"the {_steps(spans)} steps of {len(wanted):,} of {len(evaluations):,} evaluations{named}"
     )
     if len(numbers) < train.count:
         selection.left_out.append(
             f"the steps of {train.count - len(numbers):,} training episodes "
             "(--episodes START:STOP or --every N includes them; --all: everything)"
         )
-    if len(wanted) < len(evaluations):
-        rest = [one.after for one in evaluations if one not in wanted]
+
+
+def _describe_evaluations(
+    selection: Selection, available: Sequence[Evaluation], evaluations: Sequence[Evaluation]
+) -> None:
+    steps = _count([span for _, span in selection.evaluations])
+    named = f" (after {', '.join(f'{one.after:,}' for one in evaluations)} episodes)"
+    selection.exported.append(
+        f"the {steps:,} steps of {len(evaluations):,} of {len(available):,} evaluations"
+        + (named if 0 < len(evaluations) <= 4 else "")
+    )
+    if rest := [one.after for one in available if one not in evaluations]:
         selection.left_out.append(
-            f"the trials of {len(rest):,} evaluations "
-            f"(--evaluations {rest[-1]} includes the one after {rest[-1]:,} episodes; --all: everything)"
+            f"the trials of {len(rest):,} evaluations (--evaluations {rest[-1]} includes the one "
+            f"after {rest[-1]:,} episodes; --all: everything)"
         )
 
 
-def _steps(spans: Sequence[Any]) -> str:
-    return f"{sum(span.stop - span.start for span in spans):,}"
-
-
-def _select_loop(recording: Recording, request: Request) -> Selection:
-    """Return the steps of a loop that a request means: all, if there are not too many.
+def _select_loop(recording: Recording, request: Request, selection: Selection) -> Selection:
+    """Return the steps of a loop in a request: all of them unless there are too many.
 
     Raises:
-        RecordingError: an episode does not exist, or an evaluation is asked for, of which a loop has none.
+        RecordingError: an episode does not exist, or an evaluation is requested, of which a loop has none.
     """
     if request.evaluations:
         raise RecordingError(
             f"{recording.path}: a loop has no numbered evaluations; --all exports all steps."
         )
-    selection = Selection(warnings=shortcomings(recording))
     if recording.kind == "variable":
         selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
-    total = recording.count(schema.TRAIN_STEP)
-    if recording.environments > 1 or recording.kind == "variable" or total <= SPREAD_STEPS:
-        stop = total if request.everything else min(total, SPREAD_STEPS)
+    total, tested = recording.count(schema.TRAIN_STEP), recording.count(schema.EVAL_STEP)
+    if recording.environments > 1 or recording.kind == "variable" or total <= DEFAULT_STEPS:
+        stop = total if request.everything else min(total, DEFAULT_STEPS)
         selection.train = [Span(0, stop, 0)] if stop else []
     else:
-        selection.train = chosen_spans(recording, request)
-    tested = recording.count(schema.EVAL_STEP)
-    first = 0 if request.everything else max(0, tested - SPREAD_STEPS)
+        train = episodes_of(recording, "train")
+        selection.train = train.spans(_training_episodes(recording, request, train))
+    first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
     if tested:
         selection.evaluations = [(Evaluation(0, 0, 0, 0), Span(first, tested, 0))]
-    shown = sum(span.stop - span.start for span in selection.train)
+    shown = _count(selection.train)
     evaluated = f", {tested - first:,} of {tested:,} of evaluation" if tested else ""
-    whose = f"of {several} environments the first, in " if (several := recording.environments) > 1 else ""
-    selection.chosen.append(f"{whose}{shown:,} of {total:,} training steps{evaluated}")
+    environment = (
+        f"of {recording.environments} environments the first, in " if recording.environments > 1 else ""
+    )
+    selection.exported.append(f"{environment}{shown:,} of {total:,} training steps{evaluated}")
     if shown < total or first:
         selection.left_out.append(
-            f"{total - shown + first:,} steps (--episodes START:STOP chooses; --all: everything)"
+            f"{total - shown + first:,} steps (--episodes START:STOP selects; --all: everything)"
         )
     return selection
+
+
+def _default_time(recording: Recording, request: Request) -> int:
+    selection = select(recording, request)
+    spans = {"eval": [span for _, span in selection.evaluations], "train": selection.train}
+    for phase, of_phase in spans.items():
+        if of_phase and recording.kind != "variable":
+            return _time(recording, phase, of_phase[-1].start)
+    return 0
+
+
+def _time(recording: Recording, phase: str, step: int) -> int:
+    """Return the time of a step of a phase."""
+    record: Any = next(recording.blocks(schema.PHASES[phase][0], step, step + 1))[0]
+    return int(record["log_time"]) // schema.STEP_NANOSECONDS
+
+
+def _count(spans: Sequence[Span]) -> int:
+    return sum(span.stop - span.start for span in spans)

@@ -1,91 +1,263 @@
-"""The steps of one phase, in all their views.
+"""The steps of one phase: rewards, the grid, and a log of events.
 
-A frame is one step: the state it was taken in, the values that the learners saw there, and the move that
-was made from there. Rows are sent some thousands at a time.
+A frame is one step: the state it was taken in and the move that was made from there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
+from runner.analysis.outcomes import events_of
+from runner.drawing import palette
 from runner.environments.mdp import Mdp
-from runner.environments.naming import spoken
-from runner.export.rerun.classes import Vocabulary
-from runner.export.rerun.columns import Batch, Sender, scalars
-from runner.export.rerun.events import EventWriter
-from runner.export.rerun.grid import GridWriter
-from runner.export.rerun.lines import phase_colours, series_lines
-from runner.export.rerun.maps import MapWriter
-from runner.export.rerun.scene import Marks, Scene
-from runner.export.rerun.values import ValueWriter
+from runner.environments.naming import events_in_words, spoken, states_in_words
+from runner.export.rerun.columns import Batch, Sender, instances, place, rgba, scalars, strips, texts
+from runner.export.rerun.labels import Labels
+from runner.export.rerun.metrics import phase_colours, series_lines
+from runner.export.rerun.scene import Scene
+
+TRAIL_STEPS: Final = 5
+TITLE_Y: Final = -0.62
+STATUS_Y: Final = 0.35
+"""From the grid to `t` and the rewards below it."""
+STATUS_LINE: Final = 0.3
+MOVER_LABEL_Y: Final = -0.5
+"""From a mover to the top of its label: above what is drawn."""
+PASSENGER_LABEL_Y: Final = 0.12
 
 
 class StepWriter(Sender):
-    """Sends the steps of one phase of a run."""
+    """Sends the steps of one phase of a tabular run.
+
+    Args:
+        stream: the stream.
+        root: entity path of the run.
+        phase: `train` or `eval`.
+        mdp: the environment.
+        scene: its scene; None to send states and actions as series instead of a grid.
+        labels: those of the run.
+        learners: the names of the learners whose rewards are sent; empty for none.
+    """
 
     def __init__(
         self,
         stream: rr.RecordingStream,
-        path: str,
+        root: str,
         phase: str,
         mdp: Mdp,
         scene: Scene | None,
-        marks: Marks | None,
-        words: Vocabulary,
-        learners: tuple[str, ...],
+        labels: Labels,
+        learners: Sequence[str] = (),
     ) -> None:
-        super().__init__(stream, path)
+        super().__init__(stream, f"{root}/{phase}")
         self._phase = phase
-        self._learners = learners
-        self._values_shown = False
-        self._values = ValueWriter(stream, path, mdp, words, len(learners))
-        self._events = EventWriter(stream, path, phase, mdp)
-        self._grid = GridWriter(stream, path, scene, marks, words) if scene and marks else None
-        pictures = scene.placements if scene else None
-        self._maps = MapWriter(stream, path, scene, pictures, words, learners) if scene and pictures else None
-
-    def dress(self) -> None:
-        """Log what never changes."""
-        names = [f"reward {spoken(learner)}" for learner in self._learners]
-        self.static("reward", series_lines(names, phase_colours(self._phase, len(names))))
-        if not self._grid:
-            for k, name in enumerate(("state", "action")):
-                colours = phase_colours(self._phase, 2)[k : k + 1]
-                self.static(name, series_lines([f"{name} ({self._phase})"], colours))
-        self._values.dress()
-        if self._grid:
-            self._grid.dress()
-        if self._maps:
-            self._maps.dress()
+        self._mdp = mdp
+        self._sends_rewards = bool(learners)
+        self._events = _EventLog(mdp, phase)
+        self._grid = _Grid(stream, self.path, phase, scene, labels) if scene else None
+        self.covered: list[tuple[int, int]] = []
+        """The stretches of time whose steps were sent: the first, and the one after the last."""
+        if learners:
+            names = [f"reward {spoken(learner)}" for learner in learners]
+            self.send_static("reward", series_lines(names, phase_colours(phase, len(names))))
+        if not scene:
+            for name, colour in zip(("state", "action"), phase_colours(phase, 2), strict=True):
+                self.send_static(name, series_lines([f"{name} ({phase})"], [colour]))
 
     def write(self, batch: Batch) -> None:
         """Send a batch of steps."""
-        records, times = batch.records, batch.times()
-        self.send("reward", times, scalars(records["rewards"]))
-        self._events.write(batch)
+        records = batch.records
+        if self._sends_rewards:
+            self.send("reward", batch.times, scalars(records["rewards"]))
+        events = events_of(self._mdp, records)
+        rows, columns = self._events.columns(batch, events)
+        if len(rows):
+            self.send("events", batch.times_at(rows), columns)
         if self._grid:
-            self._grid.write(batch, self._phase)
+            self._grid.write(batch, events)
         else:
             for name in ("state", "action"):
-                self.send(name, times, scalars(records[name].astype(np.float64)[:, None]))
-        self._write_values(batch)
+                self.send(name, batch.times, scalars(records[name].astype(np.float64)[:, None]))
+        breaks = np.flatnonzero(np.diff(batch.time) != 1) + 1
+        for stretch in np.split(batch.time, breaks):
+            start, stop = int(stretch[0]), int(stretch[-1]) + 1
+            if self.covered and self.covered[-1][1] == start:
+                start = self.covered.pop()[0]
+            self.covered.append((start, stop))
 
-    def _write_values(self, batch: Batch) -> None:
-        """Send Q-values and maps; where they are unknown, clear what is shown of earlier steps."""
-        if batch.values is not None:
-            self._values.write(batch)
-            if self._maps:
-                self._maps.write(batch)
-        elif self._values_shown:
-            for part in ("q", "map"):
-                self.clear(part, [int(batch.time[0])])
-        self._values_shown = batch.values is not None
+    def clear_gaps(self, parts: Sequence[str], last: int) -> None:
+        """Clear parts after each stretch of steps that ends before the time `last`."""
+        if ends := [stop for _, stop in self.covered if stop <= last]:
+            for part in parts:
+                self.clear(part, ends)
 
-    def end(self, times: Iterable[int]) -> None:
-        """Clear all views from these times on, until the next step that is exported."""
-        moments = list(times)
-        for part in ("grid", "q", "map"):
-            self.clear(part, moments)
+
+class _Grid(Sender):
+    """The grid: movers, passengers, goals, trails and moves.
+
+    The movers, passengers and texts of a step are points of one entity, with their arrows and trails, because
+    a row costs more than its content.
+    """
+
+    def __init__(
+        self, stream: rr.RecordingStream, path: str, phase: str, scene: Scene, labels: Labels
+    ) -> None:
+        super().__init__(stream, path)
+        self._phase = phase
+        self._scene = scene
+        self._labels = labels
+        self._label_points = self._place_labels()
+        self._before = np.empty(0, np.int64)
+        """The last states of the batch before, as many as a trail may show."""
+        shapes = [shape for _, shape in scene.shapes]
+        self._half_sizes = np.array([shape.half_size for shape in shapes], np.float32).reshape(-1, 2)
+        colours = [palette.agent(i) for i in range(len(scene.movers))]
+        self.send_static(
+            "grid/things",
+            rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=50.0),
+            rr.Boxes2D.from_fields(
+                radii=[shape.radius for shape in shapes],
+                colors=[rgba(shape.colour) for shape in shapes],
+                draw_order=40.0,
+            ),
+            rr.Arrows2D.from_fields(colors=[rgba(c) for c in colours], radii=0.035, draw_order=45.0),
+            rr.LineStrips2D.from_fields(colors=[rgba(c, 120) for c in colours], radii=0.05, draw_order=30.0),
+        )
+        text = rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[rgba(palette.MIDTONE)])
+        self.send_static("grid/title", text)
+        goal = rr.Boxes2D.from_fields(colors=[rgba(palette.GOAL)], radii=0.04, show_labels=True)
+        self.send_static("grid/goal", goal)
+
+    def write(self, batch: Batch, events: NDArray[np.uint32]) -> None:
+        """Send the grid of each step of a batch."""
+        scene, records, labels = self._scene, batch.records, self._labels
+        state, movers = records["state"].astype(np.int64), len(scene.movers)
+        vectors = scene.arrows(
+            state, records["action"].astype(np.int64), records["next_state"].astype(np.int64)
+        )
+        waiting = np.arange(len(scene.passengers)) + labels.waiting
+        numbers = [
+            labels.of_movers(scene.is_carrying[state], events),
+            np.where(scene.is_carried[state], labels.riding, waiting).astype(np.uint16),
+            labels.of_t(records["t"])[:, None],
+            labels.of_rewards(records["rewards"]),
+        ]
+        columns = [
+            *instances(
+                rr.Points2D, positions=self._label_points[state], class_ids=np.concatenate(numbers, axis=1)
+            ),
+            *instances(rr.Boxes2D, centers=scene.shape_centres[state]),
+            *instances(rr.Arrows2D, vectors=vectors, origins=scene.points[state, :movers]),
+            *strips(self._trails(state, records["t"])),
+        ]
+        self.send("grid/things", batch.times, columns)
+        self._send_sizes(batch)
+        rows = np.flatnonzero(records["t"] == 0)
+        if len(rows):
+            self._begin_episodes(batch, rows)
+
+    def _place_labels(self) -> NDArray[np.float32]:
+        """Return the points of all texts in each state, [S, texts, 2]: `t` and the rewards below the grid."""
+        scene, rewards = self._scene, len(self._labels.rewards)
+        offsets = [[0.0, MOVER_LABEL_Y]] * len(scene.movers) + [[0.0, PASSENGER_LABEL_Y]] * len(
+            scene.passengers
+        )
+        points = scene.points + np.array(offsets, np.float32).reshape(-1, 2)
+        x = np.array([0.25] + [0.65] * rewards) * scene.columns
+        y = scene.rows + STATUS_Y + STATUS_LINE * np.array([0, *range(rewards)])
+        status = np.stack((x, y), axis=1).astype(np.float32)
+        return np.concatenate((points, np.broadcast_to(status, (len(points), *status.shape))), axis=1)
+
+    def _trails(self, state: NDArray[np.int64], t: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the way of each mover in the last steps of the episode, [n, movers, TRAIL_STEPS + 1, 2]."""
+        states, before = np.concatenate((self._before, state)), len(self._before)
+        self._before = states[-TRAIL_STEPS:]
+        # A point as one number of eight bytes: fewer and larger values to copy.
+        points = np.ascontiguousarray(self._scene.points[states, : len(self._scene.movers)]).view(np.int64)
+        here = np.arange(before, len(states))
+        steps = np.minimum(t, here)
+        lines = np.empty((len(here), points.shape[1], TRAIL_STEPS + 1, 1), np.int64)
+        for back in range(TRAIL_STEPS + 1):
+            lines[:, :, TRAIL_STEPS - back] = points[here - np.minimum(back, steps)]
+        return lines.view(np.float32)
+
+    def _send_sizes(self, batch: Batch) -> None:
+        """Send the sizes of boxes wherever the grid may have been cleared; static ones would stay visible."""
+        begins = batch.records["t"] == 0
+        begins[0] = True
+        begins[1:] |= np.diff(batch.time) != 1
+        rows = np.flatnonzero(begins)
+        sizes = np.broadcast_to(self._half_sizes, (len(rows), *self._half_sizes.shape))
+        self.send("grid/things", batch.times_at(rows), instances(rr.Boxes2D, half_sizes=sizes))
+
+    def _begin_episodes(self, batch: Batch, rows: NDArray[np.int64]) -> None:
+        """Send what changes with the episode: its title and the goals."""
+        scene, times, n = self._scene, batch.times_at(rows), len(rows)
+        numbers = zip(batch.episode[rows].tolist(), batch.number(rows).tolist(), strict=True)
+        is_training = self._phase == "train"
+        titles = [
+            f"TRAINING, episode {trained:,}"
+            if is_training
+            else f"EVALUATION after {trained:,} episodes, trial {trial:,}"
+            for trained, trial in numbers
+        ]
+        points = place(n, scene.columns / 2, TITLE_Y)
+        self.send("grid/title", times, instances(rr.Points2D, positions=points, labels=texts(titles)))
+        if not scene.goals:
+            return
+        names = np.array([scene.label(goal) for goal in scene.goals])
+        columns = instances(
+            rr.Boxes2D,
+            centers=scene.goal_points[batch.records["state"][rows]],
+            half_sizes=np.full((n, len(names), 2), 0.44, np.float32),
+            labels=np.broadcast_to(names, (n, len(names))),
+        )
+        self.send("grid/goal", times, columns)
+
+
+class _EventLog:
+    """The text log: beginnings and ends of episodes, pickups, collisions; not the many illegal actions."""
+
+    def __init__(self, mdp: Mdp, phase: str) -> None:
+        self._mdp = mdp
+        self._kind = "episode" if phase == "train" else "trial"
+        self._states = states_in_words(mdp)
+        self._mask = np.uint32(
+            sum(1 << bit for bit, name in enumerate(mdp.event_names) if ".illegal" not in name)
+        )
+        self._known: dict[tuple[int, int], tuple[str, str]] = {}
+        """Text and level by events and ending."""
+
+    def columns(self, batch: Batch, events: NDArray[np.uint32]) -> tuple[NDArray[np.int64], list[Any]]:
+        """Return the rows of a batch that something happens in, ascending, and their texts."""
+        records = batch.records
+        masks = events & self._mask
+        endings = np.where(records["terminated"], 1, np.where(records["truncated"], 2, 0))
+        begins, happens = np.flatnonzero(records["t"] == 0), np.flatnonzero((masks != 0) | (endings != 0))
+        beginnings = zip(batch.number(begins).tolist(), records["state"][begins].tolist(), strict=True)
+        entries = [
+            (f"{self._kind} {number:,} begins: {self._states[state]}", "INFO") for number, state in beginnings
+        ]
+        happenings = zip(
+            *(part[happens].tolist() for part in (masks, endings, records["t"] + 1)), strict=True
+        )
+        entries += [self._entry(*happening) for happening in happenings]
+        rows = np.concatenate((begins, happens))
+        order = np.argsort(rows, kind="stable")
+        lines = [[entries[i][part] for i in order] for part in (0, 1)]
+        return rows[order], instances(rr.TextLog, text=texts(lines[0]), level=texts(lines[1]))
+
+    def _entry(self, mask: int, ending: int, length: int) -> tuple[str, str]:
+        """Return text and level for a mask of events and an ending (0: none, 1: terminal, 2: time-out)."""
+        if (mask, ending) not in self._known:
+            text = events_in_words(self._mdp, mask)
+            is_bad = "collision" in text and not mask & self._mdp.success_mask
+            end = ("", "episode over", "time-out")[ending]
+            self._known[mask, ending] = ", ".join(filter(None, (text, end))), "WARN" if is_bad else "INFO"
+        text, level = self._known[mask, ending]
+        return (f"{text} after {length} steps" if ending else text), level

@@ -1,37 +1,57 @@
-"""Exporting runs to one `.rrd` file."""
+"""Exporting runs to one `.rrd` file, or into the user's cache."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+import dataclasses
+import hashlib
+import itertools
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, TypeVar
 
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from runner.drawing import palette
 from runner.errors import RecordingError
-from runner.export.rerun.ahead import ahead
-from runner.export.rerun.classes import Vocabulary, vocabulary_of
-from runner.export.rerun.columns import Batch, Sender, StepValues, ink, instances, new_stream, place, texts
-from runner.export.rerun.layout import Shown, blueprint, draw_background, loop_blueprint
-from runner.export.rerun.metrics import TRAINING_MEANS, MetricWriter, known_metrics, send_metrics
-from runner.export.rerun.scene import TRAIL_STEPS, Marks, Scene, marks_of, scene_of
+from runner.export.rerun.columns import (
+    Batch,
+    Sender,
+    StepValues,
+    instances,
+    new_stream,
+    place,
+    rgba,
+    texts,
+)
+from runner.export.rerun.labels import Labels
+from runner.export.rerun.layout import RunView, blueprint, loop_blueprint
+from runner.export.rerun.loops import BATCH, LoopExporter
+from runner.export.rerun.metrics import MetricWriter
+from runner.export.rerun.q_values import MapWriter, StepValueReader, TableWriter
+from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import Request, Selection, Span, select
-from runner.export.rerun.step_values import StepValueReader
 from runner.export.rerun.steps import StepWriter
 from runner.recording import schema
-from runner.recording.reader import Recording
+from runner.recording.reader import Recording, open_recording
 from runner.replay.checks import check_steps
-from runner.util.files import replacing, storage_errors
+from runner.runs.run import Run
+from runner.util import files
+from runner.util.files import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR, storage_errors
+from runner.util.version import __version__
 
-BATCH: Final = 8_192
-"""Rows sent at a time: larger columns are dropped by the web viewer."""
-BATCHES_WAITING: Final = 8
-"""Batches that may wait to be written: they are made faster than they are compressed, and would pile up."""
+MAX_QUEUED: Final = 8
+"""Batches that may wait to be compressed, which takes longer than making them."""
+MAX_CACHED: Final = 20
+"""Exports in the cache; those that were not used for longest are removed."""
+T = TypeVar("T")
+Piece = tuple[NDArray[np.void], StepValues | None, NDArray[np.int64]]
+"""Steps, their Q-values if known, and the training episode of each."""
 
 
 @dataclass(frozen=True)
@@ -41,153 +61,209 @@ class Source:
     recording: Recording
     title: str
     root: str = ""
-    """Entity path that everything of the run is under; empty for the root."""
+    """Entity path of everything of the run; empty for the root."""
     tint: str | None = None
-    """Colour of its metrics, where runs are compared."""
+    """Base colour of its metrics, where runs are compared."""
 
 
 def export(sources: Sequence[Source], request: Request, path: Path) -> list[Selection]:
-    """Write runs to an `.rrd` file; return what was chosen of each.
+    """Write runs to an `.rrd` file; return the selection of each.
 
     Raises:
-        RecordingError: a recording cannot be read, or has not what is asked for.
+        RecordingError: a recording cannot be read, or does not have what is requested.
         StorageError: the file cannot be written.
     """
     selections = [select(source.recording, request) for source in sources]
+    are_jobs = [source.recording.is_job for source in sources]
+    if len(set(are_jobs)) > 1:
+        where = sources[are_jobs.index(True)].recording.path
+        raise RecordingError(
+            f"{where}: was trained here, the other was recorded from a loop; view them separately."
+        )
     stream = new_stream("-".join(source.recording.run_id for source in sources))
-    if any(not source.recording.is_job for source in sources):
-        return _export_loops(stream, sources, selections, path)
-    exporters = [
-        RunExporter(stream, source, selection) for source, selection in zip(sources, selections, strict=True)
-    ]
-    shown = blueprint([exporter.shown for exporter in exporters])
-    with _saved(stream, sources, path, shown):
-        for exporter in exporters:
-            exporter.export()
+    with _saved(stream, path):
+        stream.send_recording_name(" and ".join(source.title for source in sources))
+        if are_jobs[0]:
+            runs = [RunExporter(stream, *pair) for pair in zip(sources, selections, strict=True)]
+            entities = {entity for run in runs for entity in run.send_metrics()}
+            stream.send_blueprint(blueprint([run.view for run in runs], entities), make_active=False)
+            for run in runs:
+                run.send_steps()
+        else:
+            loops = [
+                LoopExporter(stream, source.recording, selection, source.root)
+                for source, selection in zip(sources, selections, strict=True)
+            ]
+            for loop in loops:
+                loop.export()
+            views = [loop.blueprint(source.title) for loop, source in zip(loops, sources, strict=True)]
+            stream.send_blueprint(loop_blueprint(views))
     return selections
 
 
-def _export_loops(
-    stream: rr.RecordingStream, sources: Sequence[Source], selections: list[Selection], path: Path
-) -> list[Selection]:
-    """Write somebody's own loops to an `.rrd` file."""
-    from runner.export.rerun.loops import LoopExporter
+def cached_export(runs: Sequence[Run], request: Request) -> tuple[Path, list[Selection]]:
+    """Return the export of these runs in the user's cache, made now if missing, and the selection of each.
 
-    for source in sources:
-        if source.recording.is_job:
-            raise RecordingError(
-                f"{source.recording.path}: was trained here, the other was recorded from a loop; "
-                "look at them one by one."
-            )
-    exporters = [
-        LoopExporter(stream, source.recording, selection, source.root)
-        for source, selection in zip(sources, selections, strict=True)
-    ]
-    with _saved(stream, sources, path):
-        for exporter in exporters:
-            exporter.export()
-        views = [
-            exporter.blueprint(source.title) for exporter, source in zip(exporters, sources, strict=True)
+    Raises:
+        RecordingError: a recording cannot be read, or does not have what is requested.
+        StorageError: the cache cannot be written.
+    """
+    folder = files.cache_folder() / EXPORTS
+    path = folder / f"{RUN_SEPARATOR.join(run.run_id for run in runs)}-{_cache_key(runs, request)}.rrd"
+    with contextlib.ExitStack() as stack:
+        recordings = [stack.enter_context(open_recording(run.recording)) for run in runs]
+        if path.exists():
+            path.touch()
+            return path, [select(recording, request) for recording in recordings]
+        sources = [
+            Source(recording, f"{run.title} ({run.run_id})")
+            for run, recording in zip(runs, recordings, strict=True)
         ]
-        stream.send_blueprint(loop_blueprint(views))
-    return selections
+        if len(runs) > 1:
+            colours = itertools.cycle(palette.COMPARED)
+            sources = [
+                dataclasses.replace(source, root=f"/{run.run_id}", tint=next(colours))
+                for source, run in zip(sources, runs, strict=True)
+            ]
+        with storage_errors(folder, f"set {CACHE_VARIABLE} to another folder"):
+            folder.mkdir(parents=True, exist_ok=True)
+            cached = sorted(folder.glob("*.rrd"), key=lambda file: file.stat().st_mtime, reverse=True)
+            for old in cached[MAX_CACHED - 1 :]:
+                old.unlink(missing_ok=True)
+        return path, export(sources, request, path)
+
+
+def _cache_key(runs: Sequence[Run], request: Request) -> str:
+    """Return a hash of the recordings as they are now, the request, and the code."""
+    parts = [__version__, repr(request)]
+    for run in runs:
+        stat = run.recording.stat()
+        parts += [str(run.recording.absolute()), str(stat.st_size), str(stat.st_mtime_ns)]
+    parts += [str(file.stat().st_mtime_ns) for file in sorted(Path(__file__).parent.glob("*.py"))]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
 @contextlib.contextmanager
-def _saved(
-    stream: rr.RecordingStream, sources: Sequence[Source], path: Path, shown: rrb.Blueprint | None = None
-) -> Iterator[None]:
-    """Save what is sent to a stream as a file, which is there whole or not at all."""
-    with storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as fresh:
-            fresh.touch()  # where no file can be written, Rerun would not raise an OSError
-            stream.save(fresh, default_blueprint=shown)
-            stream.send_recording_name(" and ".join(source.title for source in sources))
+def _saved(stream: rr.RecordingStream, path: Path) -> Iterator[None]:
+    """Save everything sent to a stream as a file, which replaces another only when it is complete."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with storage_errors(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            temporary.touch()  # where no file can be created, Rerun would not raise an OSError
+            stream.save(temporary)
             yield
             stream.flush()
             stream.disconnect()
+            temporary.replace(path)
+    finally:
+        if os.path.lexists(temporary):
+            temporary.unlink()
 
 
 class RunExporter:
-    """Sends one run to a stream."""
+    """Sends one run to a stream: its metrics, then its steps."""
 
     def __init__(self, stream: rr.RecordingStream, source: Source, selection: Selection) -> None:
+        recording = source.recording
         self._stream = stream
-        self._recording = source.recording
+        self._recording = recording
         self._selection = selection
         self._source = source
-        self._sent = 0
-        self._learners = source.recording.agents
-        self._scene: Scene | None = scene_of(source.recording.mdp)
-        self._marks: Marks | None = marks_of(self._scene) if self._scene else None
-        steps = [source.recording.count(topic) for topic in (schema.TRAIN_STEP, schema.EVAL_STEP)]
-        self.shown = Shown(
+        self._batches_sent = 0
+        steps = sum(recording.count(topic) for topic in (schema.TRAIN_STEP, schema.EVAL_STEP))
+        reports = [*recording.metrics("train")[-1:], *recording.metrics("eval")[-1:]]
+        last = max([steps, *(row["log_time"] // schema.STEP_NANOSECONDS for row in reports)])
+        self._has_steps = bool(selection.steps)
+        scene = scene_of(recording.mdp)
+        self.view = RunView(
             source.root,
             source.title,
-            source.recording.mdp,
-            self._scene,
-            self._learners,
-            bool(selection.steps),
-            max(sum(steps), _last_report(source.recording)),
-            frozenset(_metric_paths(source.recording)),
+            recording.mdp,
+            scene,
+            recording.agents,
+            self._has_steps,
+            self._has_steps,
+            last,
         )
 
-    def export(self) -> None:
-        """Send everything that is chosen."""
-        source = self._source
+    def send_metrics(self) -> set[str]:
+        """Send all metrics; return their entities."""
+        recording, source = self._recording, self._source
+        label = recording.run_id if source.tint else ""
         writer = MetricWriter(
-            self._stream,
-            source.root,
-            self._learners,
-            source.recording.mdp.event_names,
-            source.tint,
-            source.recording.run_id if source.tint else "",
+            self._stream, source.root, recording.agents, recording.mdp.event_names, source.tint, label
         )
-        send_metrics(writer, self._recording)
-        if not self._selection.steps:
+        writer.send_recorded(recording)
+        return {f"{source.root}/{path}" for path in writer.paths}
+
+    def send_steps(self) -> None:
+        """Send the selected steps."""
+        if not self._has_steps:
             return
-        words = self._vocabulary()
-        self._stream.log(f"{source.root}/", rr.AnnotationContext(words.classes.context()), static=True)
-        draw_background(self._stream, self.shown)
-        values = StepValueReader(self._recording, self._scene.placements if self._scene else None)
-        covered = {phase: self._send_phase(phase, words, values) for phase in ("train", "eval")}
-        self._send_notice(sorted(covered["train"] + covered["eval"]))
+        view = self.view
+        low = high = 0.0
+        for snapshot in self._recording.snapshots():
+            low, high = min(low, float(snapshot.values.min())), max(high, float(snapshot.values.max()))
+        labels = Labels(view.mdp, view.scene, view.learners, (low, high))
+        labels.log(self._stream, view.root)
+        view.draw_background(self._stream)
+        reader = StepValueReader(self._recording, view.scene.placements if view.scene else None)
+        covered = [
+            stretch
+            for phase, pieces in (("train", self._training(reader)), ("eval", self._evaluations(reader)))
+            for stretch in self._send_phase(phase, pieces, labels)
+        ]
+        self._send_notice(sorted(covered))
 
-    def _send_phase(self, phase: str, words: Vocabulary, values: StepValueReader) -> list[tuple[int, int]]:
+    def _send_phase(self, phase: str, pieces: Iterator[Piece], labels: Labels) -> list[tuple[int, int]]:
         """Send the steps of a phase; return the stretches of time that they cover."""
-        pieces = self._training(values) if phase == "train" else self._evaluating(values)
-        path = f"{self._source.root}/{phase}"
-        mdp, covered = self._recording.mdp, list[tuple[int, int]]()
-        writer = StepWriter(self._stream, path, phase, mdp, self._scene, self._marks, words, self._learners)
-        plan = self._recording.config.get("evaluation") if phase == "eval" else None
-        trials = int(plan["trials"]) if plan else 0
-        for batch in ahead(_batches(pieces, trials)):
-            if not covered:
-                writer.dress()
+        view, stream = self.view, self._stream
+        evaluation = self._recording.config.get("evaluation") if phase == "eval" else None
+        trials = int(evaluation["trials"]) if evaluation else 0
+        writer: StepWriter | None = None
+        are_values_shown = False
+        for batch in _prefetched(_batches(pieces, trials)):
+            if writer is None:
+                writer = StepWriter(stream, view.root, phase, view.mdp, view.scene, labels, view.learners)
+                table = TableWriter(stream, writer.path, view.mdp, labels, len(view.learners))
+                maps = [
+                    MapWriter(
+                        stream, writer.path, view.scene, view.scene.placements, labels, view.learners, i
+                    )
+                    for i in range(len(view.learners))
+                    if view.scene and view.scene.placements
+                ]
             writer.write(batch)
-            self._sent += 1
-            if self._sent % BATCHES_WAITING == 0:
-                self._stream.flush()
-            _cover(covered, batch.time)
-        ends = [stop for _, stop in covered if stop <= self.shown.last]  # the run's last step stays in view
-        if ends:
-            writer.end(ends)
-        return covered
+            if batch.values is not None:
+                table.write(batch, batch.values)
+                for one in maps:
+                    one.write(batch, batch.values)
+            elif are_values_shown:
+                for part in ("q", "map"):
+                    writer.clear(part, [int(batch.time[0])])
+            are_values_shown = batch.values is not None
+            self._batches_sent += 1
+            if self._batches_sent % MAX_QUEUED == 0:
+                stream.flush()
+        if writer is None:
+            return []
+        writer.clear_gaps(("grid", "q", "map"), view.last)  # the run's last step stays in view
+        return writer.covered
 
-    def _training(self, values: StepValueReader) -> Iterator[Piece]:
+    def _training(self, reader: StepValueReader) -> Iterator[Piece]:
         for span in self._selection.train:
-            for block in self._steps("train", span):
-                for part in values.split(block):
-                    yield part, values.training(part), part["episode"].astype(np.int64)
+            for block in self._blocks("train", span):
+                for part in reader.split(block):
+                    yield part, reader.training(part), part["episode"].astype(np.int64)
 
-    def _evaluating(self, values: StepValueReader) -> Iterator[Piece]:
+    def _evaluations(self, reader: StepValueReader) -> Iterator[Piece]:
         for evaluation, span in self._selection.evaluations:
-            for block in self._steps("eval", span):
+            for block in self._blocks("eval", span):
                 after = np.full(len(block), evaluation.after, np.int64)
-                yield block, values.evaluating(block, evaluation.train_step), after
+                yield block, reader.evaluation(block, evaluation.train_step), after
 
-    def _steps(self, phase: str, span: Span) -> Iterator[NDArray[np.void]]:
+    def _blocks(self, phase: str, span: Span) -> Iterator[NDArray[np.void]]:
         """Yield the steps of a span, at most a batch at a time, after checking them."""
         recording, topic = self._recording, schema.PHASES[phase][0]
         for block in recording.blocks(topic, span.start, span.stop):
@@ -196,105 +272,52 @@ class RunExporter:
                 check_steps(part, recording.mdp, str(recording.path), schema.PHASE_NAMES[phase])
                 yield part
 
-    def _vocabulary(self) -> Vocabulary:
-        """Return the labels of the run; numbers as fine as its tables ask for."""
-        low = high = 0.0
-        for snapshot in self._recording.snapshots():
-            low, high = min(low, float(snapshot.values.min())), max(high, float(snapshot.values.max()))
-        return vocabulary_of(self._recording.mdp, self._scene, self._marks, self._learners, (low, high))
-
     def _send_notice(self, covered: list[tuple[int, int]]) -> None:
-        """Say in the grid, wherever no steps were exported, that there are none."""
-        if self._scene is None:
+        """Send a notice to the grid for the times of which no steps were exported."""
+        scene, last = self.view.scene, self.view.last
+        starts, stops = [0, *(stop for _, stop in covered)], [*(start for start, _ in covered), last + 1]
+        gaps = [(start, stop) for start, stop in zip(starts, stops, strict=True) if max(start, 1) < stop]
+        if scene is None or not gaps:
             return
-        starts = [0, *(stop for _, stop in covered)]
-        stops = [*(start for start, _ in covered), self.shown.last + 1]
-        gaps = [
-            (start, stop) for start, stop in zip(starts, stops, strict=True) if start + (start == 0) < stop
-        ]
-        if not gaps:
-            return
-        n, path = len(gaps), f"{self._source.root}/notice"
+        n, sender = len(gaps), Sender(self._stream, f"{self._source.root}/notice")
+        colours = [rgba(palette.MIDTONE)]
+        sender.send_static("text", rr.Points2D.from_fields(radii=0.0, colors=colours))
         columns = instances(
             rr.Points2D,
-            n,
-            positions=place(n, self._scene.columns / 2, self._scene.rows / 2),
+            positions=place(n, scene.columns / 2, scene.rows / 2),
             labels=texts(["no steps exported here: see --episodes, --evaluations and --all"] * n),
-            radii=np.zeros((n, 1), np.float32),
-            colors=ink(n),
         )
-        sender = Sender(self._stream, path)
         sender.send("text", [rr.TimeColumn("step", sequence=[start for start, _ in gaps])], columns)
-        sender.clear("text", [stop for _, stop in gaps if stop <= self.shown.last])
+        sender.clear("text", [stop for _, stop in gaps if stop <= last])
 
 
-Piece = tuple[NDArray[np.void], StepValues | None, NDArray[np.int64]]
-"""Steps, their Q-values if they are known, and the training episode of each."""
+def _prefetched(items: Iterable[T]) -> Iterator[T]:
+    """Yield the items; while one is in use, a thread makes the next."""
+    iterator = iter(items)
+    with ThreadPoolExecutor(1, "prefetch") as executor:
+        following = executor.submit(next, iterator, None)
+        while (item := following.result()) is not None:
+            following = executor.submit(next, iterator, None)
+            yield item
 
 
-def _batches(pieces: Iterator[Piece], trials: int) -> Iterator[Batch]:
-    """Yield the pieces put together to batches that are worth sending."""
+def _batches(pieces: Iterable[Piece], trials: int) -> Iterator[Batch]:
+    """Yield the pieces, combined to batches that are worth sending."""
     waiting: list[Piece] = []
-    before: NDArray[np.void] | None = None
     for piece in pieces:
-        full = sum(len(one[0]) for one in waiting) + len(piece[0]) > BATCH
-        if waiting and (full or (waiting[-1][1] is None) != (piece[1] is None)):
-            batch = _together(waiting, before, trials)
-            yield batch
-            before, waiting = batch.records[-TRAIL_STEPS:], []
+        is_full = sum(len(records) for records, _, _ in waiting) + len(piece[0]) > BATCH
+        if waiting and (is_full or (waiting[-1][1] is None) != (piece[1] is None)):
+            yield _combined(waiting, trials)
+            waiting = []
         waiting.append(piece)
     if waiting:
-        yield _together(waiting, before, trials)
+        yield _combined(waiting, trials)
 
 
-def _together(pieces: list[Piece], before: NDArray[np.void] | None, trials: int) -> Batch:
+def _combined(pieces: list[Piece], trials: int) -> Batch:
     records = np.concatenate([piece[0] for piece in pieces]) if len(pieces) > 1 else pieces[0][0]
-    values = _joined([piece[1] for piece in pieces if piece[1] is not None])
     episode = np.concatenate([piece[2] for piece in pieces])
     time = records["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
-    return Batch(records, values, episode, records[:0] if before is None else before, time, trials)
-
-
-def _joined(parts: list[StepValues]) -> StepValues | None:
-    """Return the values of successive pieces as one; None if there are none."""
-    if len(parts) < 2:
-        return parts[0] if parts else None
-    starts = np.cumsum([0] + [len(part.values) for part in parts])
-    renewed = [part.renewed + start for part, start in zip(parts, starts[:-1], strict=True)]
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in ("values", "greedy", "value_maps", "greedy_maps")
-    }
-    return StepValues(renewed=np.concatenate(renewed), **joined)
-
-
-def _cover(covered: list[tuple[int, int]], time: NDArray[np.int64]) -> None:
-    """Add the times of a batch to the stretches (first, one past the last) that are covered."""
-    breaks = np.flatnonzero(np.diff(time) != 1) + 1
-    for run in np.split(time, breaks):
-        first, stop = int(run[0]), int(run[-1]) + 1
-        if covered and covered[-1][1] == first:
-            covered[-1] = (covered[-1][0], stop)
-        else:
-            covered.append((first, stop))
-
-
-def _last_report(recording: Recording) -> int:
-    rows = [*recording.metrics("train")[-1:], *recording.metrics("eval")[-1:]]
-    return max((row["log_time"] // schema.STEP_NANOSECONDS for row in rows), default=0)
-
-
-def _metric_paths(recording: Recording) -> Iterator[str]:
-    """Yield the metrics that a recording has."""
-    evaluations = recording.metrics("eval")
-    events = recording.mdp.event_names
-    reports = recording.metrics("train") or evaluations
-    yield from (f"eval/metrics/{metric.name}" for metric in known_metrics(evaluations))
-    if reports:
-        names = ("filled_percent", "epsilon", "step_size", "reward_percent")
-        yield from (f"train/metrics/{name}" for name in (*TRAINING_MEANS, *names))
-    for name in (f"{event}s" for event in events if "." not in event):
-        if reports:
-            yield f"train/metrics/{name}"
-        if evaluations:
-            yield f"eval/metrics/{name}"
+    parts = [piece[1] for piece in pieces if piece[1] is not None]
+    values = StepValues.concatenated(parts) if len(parts) > 1 else parts[0] if parts else None
+    return Batch(records, episode, time, values, trials)

@@ -12,8 +12,7 @@ from click.testing import CliRunner
 from runner.analysis.diff import diff
 from runner.cli import cli
 from runner.errors import MissingExtra, RecordingError
-from runner.export.rerun.positions import where_they_diverge, with_spot
-from runner.export.rerun.selection import Request, episodes_of, select
+from runner.export.rerun.selection import Request, episodes_of, locate, locate_divergence, select
 from runner.export.rerun.viewer import ViewerError, check_port, require_rerun
 from runner.recording import schema
 from runner.recording.reader import open_recording
@@ -39,7 +38,7 @@ class TestChoice:
         last = selection.train[-1]
         assert last.stop == rivals.count(schema.TRAIN_STEP)
         assert [one.after for one, _ in selection.evaluations] == [40]
-        assert "20 of 40 training episodes, evenly spread from 0 to 39" in selection.chosen[0]
+        assert "20 of 40 training episodes, evenly spread from 0 to 39" in selection.exported[0]
         assert any("--all" in left and "20 training episodes" in left for left in selection.left_out)
         assert any("--evaluations 20" in left for left in selection.left_out)
         assert not selection.warnings
@@ -68,18 +67,18 @@ class TestChoice:
         ):
             select(rivals, Request(evaluations=(7,)))
 
-    def test_the_spot_is_exported(self, pictured):
+    def test_the_step_to_view_is_exported(self, pictured):
         run = pictured("rivals")
-        spot = with_spot(run, Request(), (7, 2))
+        location = locate(run, Request(), (7, 2))
         with open_recording(run.recording) as recording:
             step = recording.episode_steps("train", 7)[2]
-            spans = select(recording, spot.request).train
-        assert spot.time == step["log_time"] // schema.STEP_NANOSECONDS
+            spans = select(recording, location.request).train
+        assert location.time == step["log_time"] // schema.STEP_NANOSECONDS
         assert any(span.start <= step["step"] < span.stop for span in spans)
         with pytest.raises(RecordingError, match="no t = 999"):
-            with_spot(run, Request(), (7, 999))
+            locate(run, Request(), (7, 999))
         with pytest.raises(RecordingError, match="no trial 6 "):
-            with_spot(run, Request(), (20, 6, 0))
+            locate(run, Request(), (20, 6, 0))
 
 
 def test_an_environment_without_a_scene_is_named(pictured):
@@ -175,27 +174,27 @@ class TestCommand:
 class TestTwoRuns:
     """Where two runs are looked at: the step at which they diverge."""
 
-    def test_the_spot_is_the_first_step_that_differs(self, pictured):
+    def test_they_diverge_at_the_first_step_that_differs(self, pictured):
         runs = [pictured("taxi"), pictured("taxi", discount=0.5)]
-        spot, told = where_they_diverge(runs)
+        step, message = locate_divergence(runs)
         with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
             divergence = diff(a, b).divergence
-            step = next(a.blocks(schema.TRAIN_STEP, divergence.step, divergence.step + 1))[0]
-        assert spot == (divergence.episode, divergence.t)
-        assert f"training step {divergence.step:,}" in told
-        place = with_spot(runs[0], Request(), spot)
-        assert place.time == step["log_time"] // schema.STEP_NANOSECONDS
-        assert place.request.episodes == ((divergence.episode, divergence.episode + 1),)
+            record = next(a.blocks(schema.TRAIN_STEP, divergence.step, divergence.step + 1))[0]
+        assert step == (divergence.episode, divergence.t)
+        assert f"training step {divergence.step:,}" in message
+        location = locate(runs[0], Request(), step)
+        assert location.time == record["log_time"] // schema.STEP_NANOSECONDS
+        assert location.request.episodes == ((divergence.episode, divergence.episode + 1),)
 
     def test_runs_that_never_diverge_and_runs_that_cannot_be_compared(self, pictured):
         run = pictured("taxi")
-        assert where_they_diverge([run, run]) == (None, "They never diverge: every step is the same.")
+        assert locate_divergence([run, run]) == (None, "They never diverge: every step is the same.")
         for other in (pictured("lake"), pictured("taxi", recording={"steps": "none"})):
-            spot, told = where_they_diverge([run, other])
-            assert spot is None
-            assert "is unknown" in told
+            step, message = locate_divergence([run, other])
+            assert step is None
+            assert "is unknown" in message
 
     def test_a_longer_run_is_the_same_as_far_as_the_shorter_goes(self, pictured):
         shorter = pictured("rivals", evaluation=None, episodes=20)
-        _, told = where_they_diverge([shorter, pictured("rivals", evaluation=None, episodes=30)])
-        assert told == "They never diverge: every step is the same, as far as the shorter goes."
+        _, message = locate_divergence([shorter, pictured("rivals", evaluation=None, episodes=30)])
+        assert message == "They never diverge: every step is the same, as far as the shorter goes."

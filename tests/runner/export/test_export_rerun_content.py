@@ -11,8 +11,9 @@ from rerun.chunk import RrdReader
 
 from runner.analysis.outcomes import events_of
 from runner.drawing.palette import COMPARED
+from runner.export.rerun.labels import Labels
 from runner.export.rerun.layout import PLOTS
-from runner.export.rerun.scene import marks_of, own_actions, scene_of
+from runner.export.rerun.scene import own_actions, scene_of
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import viewer_program
 from runner.export.rerun.writing import Source, export
@@ -116,7 +117,7 @@ class TestSteps:
         points = np.array(table["Arrows2D:origins"])
         for i, mover in enumerate(scene.movers):
             cells = mdp.scene_cells[steps["state"], mover]
-            for shape in np.flatnonzero(scene.shape_things == i):
+            for shape in [k for k, (owner, _) in enumerate(scene.shapes) if owner == i]:
                 inside = np.floor(boxes[:, shape]).astype(int)
                 assert np.array_equal(inside[:, 1] * scene.columns + inside[:, 0], cells)
             drawn = np.floor(points[:, i]).astype(int)
@@ -183,8 +184,8 @@ def test_the_marks_say_what_went_wrong(exported):
     scene = scene_of(mdp)
     if scene is None or "collision" not in mdp.event_names:
         return
-    marks, events = marks_of(scene), events_of(mdp, steps)
-    said = np.array(marks.labels)[marks.of(scene.carried[steps["state"]], events)]
+    labels, events = Labels(mdp, scene, exported.recording.agents), events_of(mdp, steps)
+    said = np.array(labels.texts)[labels.of_movers(scene.is_carrying[steps["state"]], events)]
     illegal = events >> mdp.event_names.index("taxi_2.illegal_pickup") & 1
     assert [("illegal pickup" in label) for label in said[:, 1]] == illegal.astype(bool).tolist()
     assert not any("illegal pickup" in label for label in said[illegal == 0, 1])

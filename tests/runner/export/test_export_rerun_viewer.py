@@ -22,10 +22,9 @@ from runner.cli import cli, progress
 from runner.errors import RunnerError, StorageError
 from runner.export.rerun import live as live_view
 from runner.export.rerun import viewer, writing
-from runner.export.rerun.cache import exported
 from runner.export.rerun.live import LiveView
-from runner.export.rerun.positions import with_spot
-from runner.export.rerun.selection import Request
+from runner.export.rerun.selection import Request, locate
+from runner.export.rerun.writing import cached_export
 from runner.recording import schema
 from runner.recording.reader import open_recording
 
@@ -52,9 +51,9 @@ def drawn(path, step):
 
 def test_every_view_of_the_default_blueprint_is_drawn_without_an_error(pictured):
     run = pictured("rivals")
-    spot = with_spot(run, Request(), (39, 3))
-    path, _ = exported([run], spot.request)
-    views = drawn(path, spot.time)
+    location = locate(run, Request(), (39, 3))
+    path, _ = cached_export([run], location.request)
+    views = drawn(path, location.time)
     maps = {f"taxi {i}: max Q, greedy moves" for i in (1, 2)}
     title = f"rivals, seed 1 ({run.run_id})"
     assert set(views) == PLOTS | maps | {TABLE, title, "Events", "Collisions an episode"}
@@ -64,18 +63,18 @@ def test_every_view_of_the_default_blueprint_is_drawn_without_an_error(pictured)
 
 def test_two_runs_are_side_by_side(pictured):
     runs = [pictured("rivals"), pictured("taxis")]
-    path, selections = exported(runs, Request())
+    path, selections = cached_export(runs, Request())
     assert len(selections) == 2
-    views = drawn(path, with_spot(runs[0], Request(), None).time)
+    views = drawn(path, locate(runs[0], Request(), None).time)
     assert {f"rivals, seed 1 ({runs[0].run_id})", f"taxis, seed 1 ({runs[1].run_id})"} <= set(views)
     assert all(not view.reports for view in views.values())
 
 
 def test_a_second_look_comes_from_the_cache(pictured):
     run = pictured("lake")
-    path, _ = exported([run], Request())
+    path, _ = cached_export([run], Request())
     made = path.stat().st_ino
-    again, _ = exported([run], Request())
+    again, _ = cached_export([run], Request())
     assert again == path
     assert again.stat().st_ino == made
 

@@ -204,7 +204,7 @@ def test_an_export_to_rerun_says_that_it_shows_the_first_environment(tmp_path):
         for _ in range(5):
             rec.step(rec.action_space.sample())
     with open_recording(rec.run.recording) as recording:
-        assert select(recording, Request()).chosen == [
+        assert select(recording, Request()).exported == [
             "of 3 environments the first, in 15 of 15 training steps"
         ]
 

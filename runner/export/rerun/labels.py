@@ -1,0 +1,176 @@
+"""The labels of a run by number: two bytes at each step instead of a string.
+
+Rerun looks up the text and colour of a class id in an annotation context, which is logged once. Everything
+written at a step is numbered here: marks of movers, the step, rewards, values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from runner.drawing import palette
+from runner.environments.mdp import Mdp
+from runner.environments.naming import action_names, numbered_actions, spoken
+from runner.export.rerun.scene import Scene
+
+MAX_REWARDS: Final = 2_000
+MAX_T: Final = 10_000
+MAX_LEVELS: Final = 4_000
+BAD_SIGN: Final = "✗"
+GOOD_SIGN: Final = "✓"
+
+
+class Labels:
+    """Texts and colours, numbered, and the numbers of what is shown at each step.
+
+    Args:
+        mdp: the environment.
+        scene: its scene; None if it has none.
+        learners: their names.
+        value_range: the lowest and the highest value of the tables.
+    """
+
+    def __init__(
+        self,
+        mdp: Mdp,
+        scene: Scene | None,
+        learners: Sequence[str],
+        value_range: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        self.texts: list[str] = []
+        self._colours: list[str] = []
+        if scene:
+            self._add_movers(scene)
+        passengers = [scene.label(thing) for thing in scene.passengers] if scene else []
+        self.waiting = self._add(passengers, palette.PASSENGER)
+        """The first passenger's label."""
+        self.riding = self._add([""], palette.PASSENGER)
+        """A passenger that is carried: the label of its carrier says so."""
+        self._longest = min(mdp.step_limit or MAX_T, MAX_T)
+        self._t = self._add([*(f"t = {k}" for k in range(self._longest)), f"t ≥ {self._longest}"])
+        self._add_rewards(mdp.rewards_of(len(learners)), learners)
+        self.unmarked = self._add([""])
+        self.greedy = self._add(["●"])
+        """The mark of the greedy action."""
+        self.exploited = self._add(["greedy"], palette.GOOD)
+        """The mark of the chosen action if it was not explored."""
+        self.explored = self._add(["explored"], palette.BAD)
+        self.stops: list[NDArray[np.int64]] = []
+        """For each agent, [own actions]: the letter of an action such as a pickup; -1 for a move."""
+        if scene:
+            self._add_stops(scene)
+        self._add_levels(*value_range)
+
+    def log(self, stream: rr.RecordingStream, root: str) -> None:
+        """Log texts and colours for everything below an entity path."""
+        classes = [
+            (number, text, palette.rgb(colour))
+            for number, (text, colour) in enumerate(zip(self.texts, self._colours, strict=True))
+        ]
+        stream.log(f"{root}/", rr.AnnotationContext(classes), static=True)
+
+    def of_movers(self, is_carrying: NDArray[np.int64], events: NDArray[np.uint32]) -> NDArray[np.uint16]:
+        """Return the label of each mover in each step, [n, movers]: its name, and what happened to it."""
+        movers = np.arange(len(self._movers))[None, :]
+        return self._movers[movers, is_carrying, np.searchsorted(self._masks, events)[:, None]]
+
+    def of_t(self, t: NDArray[Any]) -> NDArray[np.uint16]:
+        """Return the label of each `t`."""
+        return np.asarray(self._t + np.minimum(t, self._longest), np.uint16)
+
+    def of_rewards(self, rewards: NDArray[np.float64]) -> NDArray[np.uint16]:
+        """Return the label of each learner's reward, [n, labelled learners]."""
+        numbers = [
+            first + np.searchsorted(labelled, rewards[:, i]).clip(max=len(labelled) - 1)
+            for i, (first, labelled) in enumerate(self.rewards)
+        ]
+        return (
+            np.stack(numbers, axis=1).astype(np.uint16) if numbers else np.empty((len(rewards), 0), np.uint16)
+        )
+
+    def of_values(self, values: NDArray[np.float64]) -> NDArray[np.uint16]:
+        """Return the label of each value, rounded; that of the end beyond the labelled range."""
+        level = np.rint(np.nan_to_num(values) / self._unit) - self._lowest
+        return np.asarray(self._levels + level.clip(0, self._level_count - 1), np.uint16)
+
+    def _add(self, texts: Sequence[str], colour: str = palette.MIDTONE) -> int:
+        """Add texts; return the number of the first."""
+        first = len(self.texts)
+        self.texts += texts
+        self._colours += [colour] * len(texts)
+        return first
+
+    def _add_movers(self, scene: Scene) -> None:
+        """Number each mover's label by whether it carries someone, and by the events of a step."""
+        mdp = scene.mdp
+        self._masks = np.unique(np.append(mdp.events, np.uint32(0)))
+        self._movers = np.zeros((len(scene.movers), 2, len(self._masks)), np.uint16)
+        for i, (mover, agent) in enumerate(zip(scene.movers, scene.mover_agents, strict=True)):
+            for carries in (0, 1):
+                for k, mask in enumerate(self._masks.tolist()):
+                    events = _event_labels(mdp, mask, agent)
+                    name = scene.label(mover) + (" + passenger" if carries else "")
+                    is_bad = any(event.startswith(BAD_SIGN) for event in events)
+                    text = f"{name}: {', '.join(events)}" if events else name
+                    self._movers[i, carries, k] = self._add(
+                        [text], palette.BAD if is_bad else palette.agent(i)
+                    )
+
+    def _add_rewards(self, rewards: NDArray[np.float64], learners: Sequence[str]) -> None:
+        self.rewards: list[tuple[int, NDArray[np.float64]]] = []
+        """For each learner its first label, and the rewards it can get, ascending."""
+        for i, learner in enumerate(learners):
+            distinct = np.unique(rewards[..., i])
+            if len(distinct) <= MAX_REWARDS:
+                prefix = f"reward of {spoken(learner)}" if len(learners) > 1 else "reward"
+                colour = palette.agent(i) if len(learners) > 1 else palette.MIDTONE
+                self.rewards.append(
+                    (self._add([f"{prefix} {_signed(r)}" for r in distinct], colour), distinct)
+                )
+
+    def _add_stops(self, scene: Scene) -> None:
+        is_named = action_names(scene.mdp) is not None
+        for agent, names in enumerate(numbered_actions(scene.mdp)):
+            numbers = np.full(len(names), -1)
+            for own, action in enumerate(scene.description["actions"] if is_named else ()):
+                if not any(action.get("move") or ()):
+                    numbers[own] = self._add([names[own][0].upper()], palette.agent(agent))
+            self.stops.append(numbers)
+
+    def _add_levels(self, low: float, high: float) -> None:
+        """Number values to three digits of the greatest one, with a margin on both sides."""
+        low, high = min(low, 0.0), max(high, 0.0)
+        self._unit = 10.0 ** (math.floor(math.log10(max(-low, high, 1e-9))) - 2)
+        while (high - low) / self._unit > MAX_LEVELS:
+            self._unit *= 10
+        margin = (high - low) / 2 + self._unit
+        self._lowest, highest = (
+            math.floor((low - margin) / self._unit),
+            math.ceil((high + margin) / self._unit),
+        )
+        digits = max(0, -round(math.log10(self._unit)))
+        texts = [_signed(round(k * self._unit, digits), digits) for k in range(self._lowest, highest + 1)]
+        texts[0], texts[-1] = f"≤ {texts[0]}", f"≥ {texts[-1]}"
+        self._levels, self._level_count = self._add(texts), len(texts)
+
+
+def _event_labels(mdp: Mdp, mask: int, agent: str) -> list[str]:
+    """Return the events of a mask that concern one agent, or all of them, each with a sign."""
+    labels = []
+    for bit, name in enumerate(mdp.event_names):
+        owner, _, event = name.rpartition(".")
+        if mask >> bit & 1 and owner in ("", agent):
+            is_bad = owner == "" or (name not in mdp.success_events and event != "pickup")
+            labels.append(f"{BAD_SIGN if is_bad else GOOD_SIGN} {spoken(event)}")
+    return labels
+
+
+def _signed(value: float, digits: int | None = None) -> str:
+    text = f"{value:g}" if digits is None else f"{value:.{digits}f}"
+    return text.replace("-", "−")

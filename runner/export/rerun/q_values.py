@@ -1,0 +1,382 @@
+"""Q-values at a step: read by replaying the tables, and sent as a table of values and as maps.
+
+The tables are replayed from the recorded steps, so everything shown is exact for its step. Where a repair
+lost steps, the values after them are unknown up to the next snapshot, and are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numba
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from runner.drawing import palette
+from runner.environments.mdp import Mdp
+from runner.environments.naming import numbered_actions, spoken
+from runner.export.rerun.columns import (
+    Batch,
+    Sender,
+    StepValues,
+    images,
+    instances,
+    lists,
+    pixel_centres,
+    place,
+    rgba,
+    scalars,
+    strips,
+    texts,
+)
+from runner.export.rerun.labels import Labels
+from runner.export.rerun.layout import (
+    BAR_LEFT,
+    BAR_LENGTH,
+    CHOSEN_X,
+    GREEDY_X,
+    LABEL_RISE,
+    MAP_LABEL_Y,
+    NUMBER_X,
+    bar_rows,
+)
+from runner.export.rerun.metrics import series_lines
+from runner.export.rerun.scene import Placements, Scene, own_actions
+from runner.recording.reader import Recording
+from runner.recording.schema import STEP_NANOSECONDS
+from runner.replay.tables import StateProbe, TableReplay, known_steps
+
+_BAR_FRACTION: Final = 64
+"""The length of a bar is rounded to this fraction of a row's height: invisible, and smaller in the file."""
+_LETTER_RISE: Final = 0.6
+"""From a cell's centre up to the point of its letter, which is written below that point."""
+_AGENT_OFFSET: Final = 0.21
+"""From the centre of a pixel to the arrow of either of two agents."""
+_ARROW_SCALE: Final = 1.2
+
+
+class StepValueReader:
+    """Reads the Q-values at the steps of a recorded run.
+
+    Args:
+        recording: the run.
+        placements: the states of each map; None for no maps.
+    """
+
+    def __init__(self, recording: Recording, placements: Placements | None) -> None:
+        self._recording = recording
+        self._mdp: Mdp = recording.mdp
+        self._learners = len(recording.agents)
+        self._own_actions = own_actions(self._mdp)
+        self._context = np.zeros(self._mdp.states, np.int64)
+        self._states = np.empty((1, 0), np.int32)
+        if placements is not None:
+            self._context, self._states = placements.context, placements.states
+        self._known = known_steps(recording)
+        self._replay: TableReplay | None = None
+        self._last = (0, -1)
+        """Time and context of the step before."""
+
+    def split(self, block: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
+        """Yield a block of training steps in parts whose values are either all known or all unknown."""
+        first = int(block["step"][0])
+        edges = [edge for start, last in self._known for edge in (start, last + 1)]
+        yield from np.split(block, [edge - first for edge in edges if 0 < edge - first < len(block)])
+
+    def training(self, block: NDArray[np.void]) -> StepValues | None:
+        """Return the values before the update of each step of a part; None if they are unknown.
+
+        Raises:
+            RecordingError: the environment cannot have such steps.
+        """
+        replay = self._replay_at(int(block["step"][0]))
+        if replay is None:
+            return None
+        rows, probe = replay.empty_rows(len(block)), self._probe(block)
+        replay.apply(block, rows, probe)
+        return self._step_values(rows, probe)
+
+    def evaluation(self, block: NDArray[np.void], train_step: int) -> StepValues | None:
+        """Return the values at a block of evaluation steps, made after `train_step` training steps."""
+        replay = self._replay_at(train_step)
+        if replay is None:
+            return None
+        probe = self._probe(block)
+        replay.read(probe)
+        return self._step_values(replay.values_in(block["state"]), probe)
+
+    def _replay_at(self, step: int) -> TableReplay | None:
+        """Return the replay at a training step; None if the tables there are unknown."""
+        if not any(first <= step <= last for first, last in self._known):
+            return None
+        if self._replay is None:
+            self._replay = TableReplay(self._recording, step)
+        elif self._replay.step != step:
+            self._replay.seek(step)
+        return self._replay
+
+    def _probe(self, block: NDArray[np.void]) -> StateProbe:
+        """Return a probe of the map before each step at which an episode begins or the context changes."""
+        context = self._context[block["state"]]
+        changes = block["t"] == 0
+        changes[1:] |= context[1:] != context[:-1]
+        before = (int(block["log_time"][0]) - STEP_NANOSECONDS, int(context[0]))
+        changes[0] |= before != self._last
+        self._last = (int(block["log_time"][-1]), int(context[-1]))
+        rows = np.flatnonzero(changes)
+        shape = len(rows), self._learners, self._states.shape[1]
+        states = self._states[context[rows]]
+        return StateProbe(rows, states, np.empty(shape, np.float32), np.empty(shape, np.int32))
+
+    def _step_values(self, rows: NDArray[np.float64], probe: StateProbe) -> StepValues:
+        """Return the values by agent of rows by learner."""
+        counts = self._mdp.action_counts
+        if rows.shape[1] == len(counts):
+            own = [rows[:, i, :count] for i, count in enumerate(counts)]
+            values, greedy = np.concatenate(own, axis=1), np.stack([q.argmax(axis=1) for q in own], axis=1)
+        else:
+            values = np.empty((len(rows), sum(counts)))
+            greedy = np.empty((len(rows), len(counts)), np.int64)
+            first = np.cumsum((0, *counts[:-1]))
+            _split_joint(rows[:, 0], self._own_actions, first, values, greedy)
+        return StepValues(values, greedy, probe.before, probe.value, probe.greedy)
+
+
+class TableWriter(Sender):
+    """Sends the table of values of one phase; its numbers as text are rounded, its scalars exact."""
+
+    def __init__(
+        self, stream: rr.RecordingStream, path: str, mdp: Mdp, labels: Labels, learners: int
+    ) -> None:
+        super().__init__(stream, path)
+        self._labels = labels
+        self._own = own_actions(mdp)
+        self._y = np.concatenate(bar_rows(mdp))
+        agents, counts = len(mdp.agents), mdp.action_counts
+        self._bounds = np.cumsum((0, *counts))
+        """The first value of each agent, and the number of values."""
+        self._explored_bit = np.arange(agents) if learners == agents else np.zeros(agents, np.int64)
+        height = self._y - LABEL_RISE
+        columns = [
+            np.stack((np.full_like(height, x), height), axis=1) for x in (NUMBER_X, GREEDY_X, CHOSEN_X)
+        ]
+        self._points = np.concatenate(columns).astype(np.float32)
+        """Of the number of each action, of its mark as the greedy one, and as the chosen one."""
+        colours = [rgba(palette.agent(i)) for i, count in enumerate(counts) for _ in range(count)]
+        names = zip(mdp.agents, numbered_actions(mdp), strict=True)
+        series = [f"{spoken(agent)} {name}" for agent, actions in names for name in actions]
+        self.send_static(
+            "q",
+            rr.LineStrips2D.from_fields(colors=colours, radii=0.22),
+            rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=40.0),
+            series_lines(series),
+        )
+
+    def write(self, batch: Batch, values: StepValues) -> None:
+        """Send the values of each step of a batch: as they were before its update."""
+        q, labels = values.values, self._labels
+        n, count = q.shape
+        classes = np.full((n, 3 * count), labels.unmarked, np.uint16)
+        classes[:, :count] = labels.of_values(q)
+        row, first = np.arange(n)[:, None], self._bounds[:-1]
+        classes[row, count + first + values.greedy] = labels.greedy
+        own = self._own[batch.records["action"]]
+        explored = (batch.records["explored"][:, None] >> self._explored_bit & 1).astype(bool)
+        classes[row, 2 * count + first + own] = np.where(explored, labels.explored, labels.exploited)
+        bars = np.empty((n, count, 2, 2), np.float32)
+        bars[:, :, 0, 0] = BAR_LEFT
+        bars[..., 1] = self._y[:, None]
+        _fill_bar_ends(q, self._bounds, BAR_LEFT, BAR_LENGTH, _BAR_FRACTION, bars[:, :, 1, 0])
+        columns = [*scalars(q), *instances(rr.Points2D, class_ids=classes), *strips(bars)]
+        self.send("q", batch.times, columns)
+        rows = values.map_rows  # the points never change, but are cleared with the rest
+        points = np.broadcast_to(self._points, (len(rows), *self._points.shape))
+        self.send("q", batch.times_at(rows), instances(rr.Points2D, positions=points))
+
+
+class MapWriter(Sender):
+    """Sends a learner's map in one phase: the greatest value and the greedy moves of every placement."""
+
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        path: str,
+        scene: Scene,
+        placements: Placements,
+        labels: Labels,
+        learners: tuple[str, ...],
+        learner: int,
+    ) -> None:
+        super().__init__(stream, f"{path}/map")
+        mdp = scene.mdp
+        self._learner = learner
+        self._part = learners[learner]
+        self._placements = placements
+        is_joint = len(learners) != len(mdp.agents)
+        agents = list(range(len(mdp.agents))) if is_joint else [learner]
+        movers = [
+            scene.mover_agents.index(mdp.agents[agent]) if mdp.agents[agent] in scene.mover_agents else 0
+            for agent in agents
+        ]
+        self._order = placements.order(movers[0])
+        self._pixel = np.argsort(self._order)[placements.pixel]
+        """[S]: the pixel of each state."""
+        self._centres = pixel_centres(placements.height, placements.width)
+        x = (np.arange(len(agents)) - (len(agents) - 1) / 2) * 2 * _AGENT_OFFSET
+        offsets = np.stack((x, np.zeros(len(agents))), axis=1).astype(np.float32)
+        origins = self._centres[None] + offsets[:, None]
+        self._letter_points = origins - np.array([0.0, _LETTER_RISE], np.float32)
+        self._set_moves(scene, labels, agents, movers, is_joint)
+        colours = [rgba(palette.agent(agent)) for agent in agents for _ in self._centres]
+        text = rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[rgba(palette.MIDTONE)])
+        pixels = rr.components.ImageFormat(
+            width=placements.width,
+            height=placements.height,
+            channel_datatype=rr.ChannelDatatype.F32,
+            color_model=rr.ColorModel.L,
+        )
+        arrows = rr.Arrows2D.from_fields(
+            origins=origins.reshape(-1, 2), colors=colours, radii=0.06, draw_order=40.0
+        )
+        here = rr.Boxes2D.from_fields(colors=[rgba(palette.BAD)], radii=0.1, draw_order=50.0)
+        letters = rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0)
+        self.send_static(
+            self._part,
+            rr.DepthImage.from_fields(format=pixels, colormap=rr.components.Colormap.Viridis),
+        )
+        self.send_static(f"{self._part}/moves", arrows)
+        self.send_static(f"{self._part}/here", here)
+        self.send_static(f"{self._part}/stops", letters)
+        self.send_static(f"{self._part}/label", text)
+
+    def _set_moves(
+        self, scene: Scene, labels: Labels, agents: list[int], movers: list[int], is_joint: bool
+    ) -> None:
+        """Set the arrow, [agents, actions, 2], and the letter, [agents, actions], of each action."""
+        own = own_actions(scene.mdp)
+        arrows, letters = [], []
+        for agent, mover in zip(agents, movers, strict=True):
+            count = scene.mdp.action_counts[agent]
+            first = [int(np.argmax(own[:, agent] == action)) for action in range(count)]
+            actions = own[:, agent] if is_joint else np.arange(count)
+            arrows.append((scene.moves[first, mover] * np.float32(_ARROW_SCALE))[actions])
+            letters.append(labels.stops[agent][actions])
+        self._arrows, self._letters = np.stack(arrows), np.stack(letters)
+
+    def write(self, batch: Batch, values: StepValues) -> None:
+        """Send where each step of a batch is in the map, and the maps that there are."""
+        here = self._centres[self._pixel[batch.records["state"]]][:, None]
+        self.send(f"{self._part}/here", batch.times, instances(rr.Boxes2D, centers=here))
+        rows = values.map_rows
+        if not len(rows):
+            return
+        times, n, pixels = batch.times_at(rows), len(rows), len(self._centres)
+        greedy = values.greedy_maps[:, self._learner][:, self._order]
+        vectors = np.empty((n, len(self._arrows), pixels, 2), np.float32)
+        counts = np.empty(n, np.int64)
+        points = np.empty((n * vectors[0, ..., 0].size, 2), np.float32)
+        classes = np.empty(len(points), np.uint16)
+        total = _fill_moves(
+            greedy, self._arrows, self._letters, self._letter_points, vectors, counts, points, classes
+        )
+        letters = lists(rr.Points2D, counts, positions=points[:total], class_ids=classes[:total])
+        contexts = self._placements.context[batch.records["state"][rows]].tolist()
+        labels = [
+            f"as of step {time:,}\n{self._placements.names[context]}"
+            for time, context in zip(batch.time[rows].tolist(), contexts, strict=True)
+        ]
+        points = place(n, self._placements.width / 2, MAP_LABEL_Y)
+        sizes = np.full((n, 1, 2), 0.5, np.float32)
+        self.send(self._part, times, images(values.value_maps[:, self._learner][:, self._order]))
+        self.send(f"{self._part}/here", times, instances(rr.Boxes2D, half_sizes=sizes))
+        self.send(f"{self._part}/moves", times, instances(rr.Arrows2D, vectors=vectors.reshape(n, -1, 2)))
+        self.send(f"{self._part}/stops", times, letters)
+        self.send(
+            f"{self._part}/label", times, instances(rr.Points2D, positions=points, labels=texts(labels))
+        )
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
+def _split_joint(rows: Any, own: Any, first: Any, best: Any, greedy: Any) -> None:
+    """Split the values of joint actions by agent: its best over the actions of the others, its greedy action.
+
+    Args:
+        rows: [n, J], values of the joint actions.
+        own: [J, agents], each agent's part of a joint action.
+        first: [agents], where the values of each agent begin in `best`.
+        best: [n, sum of the action counts], filled.
+        greedy: [n, agents], filled; ties go to the lowest joint action.
+    """
+    for k in range(len(rows)):
+        for at in range(best.shape[1]):
+            best[k, at] = -np.inf
+        highest = 0
+        for joint in range(rows.shape[1]):
+            value = rows[k, joint]
+            if value > rows[k, highest]:
+                highest = joint
+            for agent in range(own.shape[1]):
+                at = first[agent] + own[joint, agent]
+                best[k, at] = max(best[k, at], value)
+        for agent in range(own.shape[1]):
+            greedy[k, agent] = own[highest, agent]
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
+def _fill_bar_ends(values: Any, bounds: Any, left: float, length: float, fraction: int, ends: Any) -> None:
+    """Fill in where the bar of each value ends: from an agent's lowest value in a step to its highest.
+
+    Args:
+        values: [n, values].
+        bounds: [agents + 1], the first value of each agent, and the number of values.
+        left: where bars begin.
+        length: of the longest bar.
+        fraction: parts of a unit to which lengths are rounded up.
+        ends: [n, values], filled.
+    """
+    for k in range(len(values)):
+        for agent in range(len(bounds) - 1):
+            low, high = np.inf, -np.inf
+            for i in range(bounds[agent], bounds[agent + 1]):
+                low, high = min(low, values[k, i]), max(high, values[k, i])
+            scale = length * fraction / (high - low) if high > low else 0.0
+            for i in range(bounds[agent], bounds[agent + 1]):
+                ends[k, i] = left + np.ceil((values[k, i] - low) * scale) / fraction
+
+
+@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
+def _fill_moves(
+    greedy: Any, arrows: Any, letters: Any, points: Any, vectors: Any, counts: Any, places: Any, classes: Any
+) -> int:
+    """Fill in the arrows of greedy actions, and the letters of those that are no moves.
+
+    Args:
+        greedy: [k, pixels], greedy actions; -1 for no state.
+        arrows: [agents, actions, 2], the arrow of each action.
+        letters: [agents, actions], its letter; -1 for none.
+        points: [agents, pixels, 2], where a letter is written.
+        vectors: [k, agents, pixels, 2], filled with arrows; zero for no state.
+        counts: [k], filled with the number of letters.
+        places: [letters, 2], filled with their points, one map after another.
+        classes: [letters], filled with the letters.
+
+    Returns:
+        The number of letters in all maps.
+    """
+    total = 0
+    for k in range(len(greedy)):
+        before = total
+        for agent in range(len(arrows)):
+            for pixel in range(greedy.shape[1]):
+                action = greedy[k, pixel]
+                vectors[k, agent, pixel, 0] = arrows[agent, action, 0] if action >= 0 else 0.0
+                vectors[k, agent, pixel, 1] = arrows[agent, action, 1] if action >= 0 else 0.0
+                if action >= 0 and letters[agent, action] >= 0:
+                    places[total, 0] = points[agent, pixel, 0]
+                    places[total, 1] = points[agent, pixel, 1]
+                    classes[total] = letters[agent, action]
+                    total += 1
+        counts[k] = total - before
+    return total
