@@ -21,8 +21,8 @@ from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_o
 from runner.archive.pages import largest_page
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
-from runner.recording.index import UNPACKED_A_BYTE
-from runner.recording.metadata import check_run, environment_of, environment_said, json_object, kind_of
+from runner.recording.metadata import check_run, environment_description, environment_of, json_object, kind_of
+from runner.recording.records import UNPACKED_A_BYTE
 from runner.recording.schema import Topic
 from runner.util.files import open_regular
 
@@ -125,7 +125,7 @@ class Archive:
 
     @cached_property
     def _environment(self) -> dict[str, Any]:
-        return environment_said(self.attachment(layout.ENVIRONMENT), str(self.folder))
+        return environment_description(self.attachment(layout.ENVIRONMENT), str(self.folder))
 
     @cached_property
     def mdp(self) -> Mdp:

@@ -19,7 +19,7 @@ from runner.archive.restoring import check
 from runner.archive.store import Store, no_archive, split_place, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
-from runner.recording.integrity import checked_survey, may_be_cut
+from runner.recording.integrity import may_be_cut, survey
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
 from runner.runs.locking import locked
@@ -140,7 +140,7 @@ def _sound(run: Run) -> Iterator[Recording]:
     try:
         with open_recording(run.recording) as recording:
             if not recording.finished:
-                contents = checked_survey(run.recording)
+                contents = survey(run.recording)
                 if not may_be_cut(run.recording, contents):
                     raise RecordingError(f"{run.recording}: {contents.reason}: it is damaged.")
             yield recording

@@ -16,9 +16,8 @@ from runner.execution.initial_tables import address
 from runner.execution.session import Report, Session, Stop, describe, recorder_for, run_job
 from runner.execution.verify import initial_tables
 from runner.learning.learner import Learner
-from runner.recording.metadata_writing import write_result
+from runner.recording.metadata import write_result
 from runner.recording.reader import open_recording
-from runner.recording.scan import survey
 from runner.recording.writer import RecordingFile
 from runner.replay.tables import last_step, tables_at
 from runner.runs import run as runs
@@ -139,8 +138,9 @@ def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict
     with open_recording(run.recording) as recording:
         learner = Learner(job.config, mdp, job.seed, initial_tables(recording))
         expected, made_by = recording.result["content_digest"], recording.provenance
-        names = [entry.name for entry in survey(run.recording).metadata]
-        resumed = {name: recording.metadata(name) for name in names if name.startswith("resume/")}
+        resumed = {
+            name: recording.metadata(name) for name in recording.metadata_names if name.startswith("resume/")
+        }
     with RecordingFile(fresh) as file:
         describe(file, job, run, learner, made_by)
         for name, entries in resumed.items():

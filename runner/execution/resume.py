@@ -36,12 +36,12 @@ from runner.execution.session import (
 from runner.execution.verify import differing_environment, differing_provenance, initial_tables
 from runner.learning.learner import Held, Learner
 from runner.recording import schema
-from runner.recording.integrity import checked_survey, may_be_cut
+from runner.recording.integrity import may_be_cut, survey
 from runner.recording.liveness import owner
 from runner.recording.metadata import NEEDED
 from runner.recording.reader import Recording, open_recording
+from runner.recording.records import Contents
 from runner.recording.reference import Past
-from runner.recording.scan import Contents
 from runner.recording.writer import RecordingFile, storage_error
 from runner.runs.locking import locked
 from runner.runs.provenance import provenance
@@ -161,10 +161,10 @@ def _place(run: Run, described: bool) -> tuple[Path, Contents]:
     anew = run.recording.with_suffix(_ANEW)
     if not run.recording.is_file():
         return run.recording, Contents()
-    contents = checked_survey(run.recording)
+    contents = survey(run.recording)
     if may_be_cut(run.recording, contents) and (described or not contents.chunks):
         return run.recording, contents
-    contents = checked_survey(anew) if anew.is_file() else Contents()
+    contents = survey(anew) if anew.is_file() else Contents()
     return anew, contents if may_be_cut(anew, contents) else Contents()
 
 

@@ -23,10 +23,10 @@ from runner.learning.learner import Learner
 from runner.planning import Yardstick
 from runner.recording import schema
 from runner.recording.messages import QTable, encode, encode_log, encode_q_table
-from runner.recording.metadata_writing import (
+from runner.recording.metadata import (
     Attachments,
     environment_attachments,
-    run_facts,
+    run_metadata,
     write_description,
     write_result,
 )
@@ -360,7 +360,9 @@ def describe(
         StorageError: the disk is full or failing.
     """
     events = len(learner.mdp.event_names)
-    facts = run_facts(run.run_id, run.name, job.seed, job.identity, run.created_text, learner.agents, events)
+    facts = run_metadata(
+        run.run_id, run.name, job.seed, job.identity, run.created_text, learner.agents, events
+    )
     config, environment = job.config.to_mapping(), _environment(learner.mdp)
     write_description(file, facts, config, made_by or provenance(), environment)
 

@@ -33,10 +33,10 @@ from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.consistency import Findings, Inconsistent, check_phase
 from runner.recording.digest import ContentHash
-from runner.recording.integrity import check_integrity, checked_survey, may_be_cut
+from runner.recording.integrity import check_integrity, may_be_cut, survey
 from runner.recording.reader import Recording, open_recording
+from runner.recording.records import Report as BytesReport
 from runner.recording.reference import Past
-from runner.recording.scan import Report as BytesReport
 from runner.replay.tables import initially_held
 from runner.runs.provenance import provenance
 from runner.util.files import open_regular
@@ -142,7 +142,7 @@ def _holds_nothing_yet(path: Path) -> bool:
             stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
             if stream.tell() and stream.read() == MCAP0_MAGIC:
                 return False  # it was closed: a damaged length may look like a cut
-        contents = checked_survey(path)
+        contents = survey(path)
         return not contents.chunks and may_be_cut(path, contents)
     except (RecordingError, OSError):
         return False

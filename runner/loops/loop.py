@@ -25,11 +25,11 @@ from runner.loops.values import lone_number, warn_user
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.messages import encode, encode_image, encode_log, scalar_encoder
-from runner.recording.metadata import sizes_of
-from runner.recording.metadata_writing import (
+from runner.recording.metadata import (
     Attachments,
     environment_attachments,
-    run_facts,
+    run_metadata,
+    sizes_of,
     write_description,
     write_result,
 )
@@ -186,7 +186,7 @@ class Loop(Generic[R]):
         left_out = ("name", "seeds", "recording")
         identity = {key: value for key, value in self._config.items() if key not in left_out}
         job = json.dumps(identity | {"seed": self.plan.seed}, sort_keys=True)
-        return run_facts(
+        return run_metadata(
             run.run_id,
             str(run.facts["name"]),
             self.plan.seed,

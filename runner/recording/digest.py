@@ -1,9 +1,9 @@
-"""The content digest: by it two runs are equal or not.
+"""The content digest, by which two runs are equal or not.
 
-Per topic, BLAKE3 over its message records in order, each in canonical form: the MCAP message record with
+For each topic, BLAKE3 over its message records in order, each in canonical form: the MCAP message record with
 the topic's own channel id, sequence 0, and publish time equal to log time. Then BLAKE3 over the sorted
-topics that have messages: length of the name (u32), name, hash. It depends neither on where chunks were
-closed, nor on compression, index, provenance or `/log`.
+topics that have messages: length of the name (u32), name, hash. It does not depend on where chunks were
+closed, on compression, index, provenance or `/log`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class ContentHash:
 
 
 def combine(topics: Mapping[str, str]) -> str:
-    """Return the content digest made of the topics' hashes."""
+    """Return the content digest for the hashes of the topics."""
     whole = blake3(_PREFIX)
     for name in sorted(topics):
         encoded = name.encode()

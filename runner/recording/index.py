@@ -1,7 +1,7 @@
-"""Where things stand in a recording: read from its summary, or found by walking its records.
+"""The index of a recording: read from its summary, or found by walking its records.
 
-A file declares sizes and offsets; none is believed before it is compared with the file's own size. What
-is kept of a file is bounded whatever it says: 34 bytes a chunk, and few names.
+A file declares sizes and offsets; each is compared with the file's own size before it is used. What is kept
+in memory is bounded whatever the file declares: 34 bytes a chunk, and few names.
 """
 
 from __future__ import annotations
@@ -32,37 +32,25 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES
+from runner.recording.records import IN_DATA, MAX_NAME_BYTES, MAX_NAMED, record_heads, refuse_exhausting
 from runner.recording.schema import ALL_TOPICS, PROFILE, TOPIC_OF
 
 K = TypeVar("K")
 T = TypeVar("T")
 
 MAX_CHUNKS: Final = 1 << 21
-"""The most chunks that a recording is read with: a step chunk holds 256 steps or more."""
-MAX_NAMED: Final = 4096
-"""The most attachments, and the most metadata records; a resume adds one."""
+"""The most chunks that a recording is read with: a chunk of steps holds 256 or more."""
 MAX_RECORD_BYTES: Final = 1 << 16
 """The largest record of a summary, schema or channel; the recorder's are below 4 KiB."""
-UNPACKED_A_BYTE: Final = 1000
-"""How much more than the file its chunks may declare to hold; beyond that they are made to exhaust."""
-_UNPACKED_ANYWAY: Final = 1 << 30
-MAX_NAME_BYTES: Final = 256
 _PIECE: Final = 1 << 20
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
 _OFFSET_ENTRY: Final = struct.Struct("<HQ")
-IN_DATA: Final = frozenset(
-    {
-        *(Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK),
-        *(Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT),
-    }
-)
-"""What the data section has: behind anything else nothing can be believed."""
 _FOOTER_BYTES: Final = 9 + 20
 _TAIL_BYTES: Final = _FOOTER_BYTES + len(MCAP0_MAGIC)
 
 
 class ChunkEntry(NamedTuple):
-    """A chunk: where it stands, and what it says of itself."""
+    """The place of a chunk, and what it declares."""
 
     offset: int
     length: int
@@ -71,7 +59,7 @@ class ChunkEntry(NamedTuple):
     start_time: int
     end_time: int
     channel: int
-    """Whose messages it holds, by its message index; 0 if it has none."""
+    """The channel of its messages, by its message index; 0 if it has none."""
 
 
 _ENTRY: Final = struct.Struct("<QIIQQH")
@@ -93,10 +81,10 @@ class ChunkTable:
         return ChunkEntry(*_ENTRY.unpack_from(self._packed, k * _ENTRY.size))
 
     def append(self, entry: ChunkEntry, path: str) -> None:
-        """Add a chunk behind the last one.
+        """Add a chunk after the last one.
 
         Raises:
-            RecordingError: it says what no chunk of ours does.
+            RecordingError: it declares what no chunk of ours does.
         """
         where = f"{path}: the chunk at {entry.offset}"
         if entry.length > MAX_CHUNK_BYTES or entry.uncompressed_size > MAX_CHUNK_BYTES:
@@ -110,11 +98,11 @@ class ChunkTable:
             raise RecordingError(f"{path}: has more than {MAX_CHUNKS:,} chunks; too many to be ours.")
         self._packed += _ENTRY.pack(*entry)
 
-    def name_last(self, channel: int, path: str) -> None:
-        """Say whose messages the last chunk holds.
+    def set_channel(self, channel: int, path: str) -> None:
+        """Set the channel of the last chunk's messages.
 
         Raises:
-            RecordingError: it was said before, or is no channel of ours.
+            RecordingError: it was set before, or is no channel of ours.
         """
         last = self[len(self) - 1]
         if last.channel or channel not in TOPIC_OF:
@@ -126,13 +114,13 @@ class ChunkTable:
 
     @property
     def columns(self) -> NDArray[Any]:
-        """All of them as a structured array with the fields of `ChunkEntry`: a view."""
+        """All chunks as a structured array with the fields of `ChunkEntry`: a view."""
         return np.frombuffer(self._packed, _ENTRY_COLUMNS)
 
 
 @dataclass
 class Index:
-    """The places of a recording's parts."""
+    """The places of a recording's records."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: set[int] = field(default_factory=set)
@@ -141,10 +129,10 @@ class Index:
     """Name to (offset, length) of the record."""
     metadata: dict[str, tuple[int, int]] = field(default_factory=dict)
     message_counts: dict[int, int] = field(default_factory=dict)
-    """Messages by channel, as the summary states them; empty without one."""
+    """Messages by channel, as the summary counts them; empty without one."""
     finished: bool = False
     end: int = 0
-    """Offset behind the last whole record of the data section."""
+    """Offset after the last whole record of the data section."""
 
 
 def read_index(stream: BinaryIO, path: str) -> Index:
@@ -162,16 +150,6 @@ def read_index(stream: BinaryIO, path: str) -> Index:
     unpacked = int(index.chunks.columns["uncompressed_size"].sum(dtype=np.uint64)) if index.chunks else 0
     refuse_exhausting(size, unpacked, path)
     return index
-
-
-def refuse_exhausting(size: int, unpacked: int, path: str) -> None:
-    """Refuse a file whose chunks declare to hold far more than any recording of its size does.
-
-    Raises:
-        RecordingError: it is one.
-    """
-    if unpacked > size * UNPACKED_A_BYTE + _UNPACKED_ANYWAY:
-        raise RecordingError(f"{path}: {size:,} bytes declare to hold {unpacked:,}; made to exhaust memory.")
 
 
 def checksum(stream: BinaryIO, start: int, end: int) -> int:
@@ -233,7 +211,7 @@ def _note_summary(index: Index, path: str, opcode: int, offset: int, body: bytes
         _within(path, "chunk", chunk.offset, chunk.length, data_end)
         index.chunks.append(chunk._replace(channel=0), path)
         if chunk.channel:
-            index.chunks.name_last(chunk.channel, path)
+            index.chunks.set_channel(chunk.channel, path)
     elif opcode == Opcode.SCHEMA:
         _note_schema(index, path, offset, body)
     elif opcode == Opcode.CHANNEL:
@@ -253,29 +231,24 @@ def _note_summary(index: Index, path: str, opcode: int, offset: int, body: bytes
 
 def _from_records(stream: BinaryIO, path: str, size: int) -> Index:
     """Return the index of an unfinished file, up to the last whole record."""
-    index = Index()
-    offset = len(MCAP0_MAGIC)
-    while offset + 9 <= size:
-        stream.seek(offset)
-        opcode, length = RECORD_HEAD.unpack(stream.read(9))
-        torn = offset + 9 + length > size
-        if torn or opcode not in IN_DATA or (opcode == Opcode.MESSAGE_INDEX and not index.chunks):
+    index = Index(end=len(MCAP0_MAGIC))
+    for opcode, offset, length in record_heads(stream, size):
+        if opcode not in IN_DATA or (opcode == Opcode.MESSAGE_INDEX and not index.chunks):
             break
         _note(index, stream, path, opcode, offset, length)
-        offset += 9 + length
-    index.end = offset
+        index.end = offset + RECORD_HEAD.size + length
     return index
 
 
 def _note(index: Index, stream: BinaryIO, path: str, opcode: int, offset: int, length: int) -> None:
-    """Take one record of the data section into the index; the stream stands behind its head."""
+    """Take one record of the data section into the index; the stream is at its body."""
     if opcode == Opcode.CHUNK:
         head = stream.read(min(length, CHUNK_HEAD.size)).ljust(CHUNK_HEAD.size, b"\0")
         start, end, unpacked, _, _ = CHUNK_HEAD.unpack(head)
         index.chunks.append(ChunkEntry(offset, 9 + length, unpacked, start, end, 0), path)
     elif opcode == Opcode.MESSAGE_INDEX:
         (channel,) = struct.unpack("<H", stream.read(min(length, 2)).ljust(2, b"\0"))
-        index.chunks.name_last(channel, path)
+        index.chunks.set_channel(channel, path)
     elif opcode == Opcode.METADATA:
         name = _name(stream.read(min(length, 4 + MAX_NAME_BYTES)), 0, path, offset)
         _put(index.metadata, name, (offset, 9 + length), path, "metadata")
@@ -351,7 +324,7 @@ def _parse(kind: type[T], body: bytes, path: str, offset: int) -> T:
 
 
 def _name(body: bytes, at: int, path: str, offset: int) -> str:
-    """Return the name that stands, with its length before it, at `at` in a record's body."""
+    """Return the text at `at` in a record's body, which its length precedes."""
     try:
         (length,) = struct.unpack_from("<I", body, at)
         name = body[at + 4 : at + 4 + length]
@@ -363,7 +336,7 @@ def _name(body: bytes, at: int, path: str, offset: int) -> str:
 
 
 def _put(known: dict[K, T], key: K, value: T, path: str, what: str) -> None:
-    """Add what may stand in a file once."""
+    """Add what a file may have once."""
     if key in known:
         raise RecordingError(f"{path}: has {what} {key!r} twice.")
     if len(known) == (len(ALL_TOPICS) if what == "channel" else MAX_NAMED):

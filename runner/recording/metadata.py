@@ -1,39 +1,87 @@
-"""What a recording says of its run and environment, checked: anyone may have written the file."""
+"""The description of a run and its environment in a recording: written, and read back with checks.
+
+Anyone may have written a file that is read.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from io import BytesIO
 from typing import Any, Final
 
+import numpy as np
+import zstandard
 from numpy.typing import NDArray
 
 from runner.environments.mdp import MAX_AGENTS, MAX_ARRAYS_BYTES, MAX_EVENTS, Mdp, from_parts
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.arrays import unpack_array
 from runner.recording.blocks import Sizes, block_counts
 from runner.recording.index import Index
+from runner.recording.records import MAX_METADATA_BYTES
 from runner.recording.run_file import MAX_DEPTH, is_too_deep
-from runner.recording.scan import MAX_METADATA_BYTES
 from runner.recording.schema import Topic
 from runner.recording.spaces import dtype_of, leaves_of
-from runner.util.values import without_surrogates
+from runner.recording.writer import RecordingFile, storage_error
+from runner.util.values import is_whole, without_surrogates
 
-_FACTS: Final = {
+NEEDED: Final = frozenset({"run", "config", "provenance"})
+"""The metadata records without which a recording's messages cannot be interpreted."""
+_RUN: Final = {
     **dict.fromkeys(("run_id", "name", "job", "created", "agents")),
     "seed": 2**64 - 1,
     "learners": MAX_AGENTS,
     "events": MAX_EVENTS,
 }
-"""What every recording says of its run; of a number, the largest it can be."""
+"""The entries that every metadata record `run` has; of a number, the largest possible."""
+_MAX_WINDOW: Final = 1 << 27
+_HEAD_BYTES: Final = 1024
+_HEAD: Final = re.compile(
+    rb"\{'descr': '([<|][biuf][1248])', 'fortran_order': (False|True), "
+    rb"'shape': \(((?:\d{1,10}, ?){0,7}(?:\d{1,10})?)\), \} *\n"
+)
 
-NEEDED: Final = frozenset({"run", "config", "provenance"})
-"""The metadata records without which nothing is known of a recording's messages."""
+Attachments = Mapping[str, tuple[str, bytes]]
+"""Name -> media type and content."""
 
 
-def check_facts(run: Mapping[str, str], index: Index, path: str) -> None:
-    """Refuse a file that is of another version, or does not say what every recording says.
+# --- the run ------------------------------------------------------------------------------------------
+
+
+def run_metadata(
+    run_id: str, name: str, seed: int | None, job: str, created: str, agents: Sequence[str], events: int
+) -> dict[str, str]:
+    """Return the entries of the metadata record `run` that every recording has.
+
+    Args:
+        run_id: its id.
+        name: its first name.
+        seed: its job's seed; None for a loop without one.
+        job: the identity of its job.
+        created: when it began, in ISO format.
+        agents: the learners: one reward each.
+        events: number of event counters of an episode.
+    """
+    return {
+        "format_version": str(schema.FORMAT_VERSION),
+        "run_id": run_id,
+        "name": name,
+        "seed": str(seed or 0),
+        "job": job,
+        "created": created,
+        "agents": json.dumps(agents),
+        "learners": str(len(agents)),
+        "events": str(events),
+        **({"seeded": "false"} if seed is None else {}),
+    }
+
+
+def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
+    """Refuse a file that is of another version, or has other channels than its kind of recording.
 
     Raises:
         RecordingError: it is one.
@@ -49,10 +97,10 @@ def check_facts(run: Mapping[str, str], index: Index, path: str) -> None:
 
 
 def check_run(run: Mapping[str, str], path: str) -> None:
-    """Refuse what is not said of a run of our version.
+    """Refuse a metadata record `run` of another version, or whose entries make no sense.
 
     Raises:
-        RecordingError: something is missing, or makes no sense.
+        RecordingError: an entry is missing, or makes no sense.
     """
     version = run.get("format_version", "?")
     if version != str(schema.FORMAT_VERSION):
@@ -60,33 +108,32 @@ def check_run(run: Mapping[str, str], path: str) -> None:
             f"{path}: found a recording of version {version}, expected {schema.FORMAT_VERSION}: "
             "it takes another version of dualtaxi to read it."
         )
-    for name, most in _FACTS.items():
-        said = run.get(name, "")
-        if not said or (most and not (said.isdecimal() and len(said) <= 20 and int(said) <= most)):
-            raise _senseless(name, said, path)
-    if not _are_names(run["agents"], int(run["learners"])):
-        raise _senseless("agents", run["agents"], path)
+
+    def require(name: str, is_valid: bool) -> None:
+        if not is_valid:
+            raise RecordingError(f"{path}: is damaged: its run has {name} {run.get(name, '')[:200]!r}.")
+
+    for name, limit in _RUN.items():
+        require(name, bool(run.get(name)) and (not limit or _is_count(run[name], limit)))
+    require("agents", _are_names(run["agents"], int(run["learners"])))
     if kind_of(run) not in schema.KINDS:
         raise RecordingError(
             f"{path}: found a recording of the kind {run['kind']!r}, expected {', '.join(schema.KINDS)}."
         )
     environments = run.get("environments", "1")
-    if not (environments.isdecimal() and len(environments) <= 7 and int(environments) > 0):
-        raise _senseless("environments", environments, path)
+    require("environments", _is_count(environments, 10**7 - 1) and int(environments) > 0)
 
 
-def _senseless(name: str, said: str, path: str) -> RecordingError:
-    return RecordingError(f"{path}: is damaged: of its run it says that {name} is {said[:200]!r}.")
+def _is_count(text: str, limit: int) -> bool:
+    return text.isdecimal() and len(text) <= 20 and int(text) <= limit
 
 
-def _are_names(agents: str, learners: int) -> bool:
-    """Return whether a text lists a name for each learner."""
+def _are_names(text: str, count: int) -> bool:
     try:
-        names = json.loads(agents)
+        names = json.loads(text)
     except (ValueError, RecursionError):
         return False
-    known = isinstance(names, list) and all(isinstance(name, str | int) for name in names)
-    return known and len(names) == learners
+    return isinstance(names, list) and len(names) == count and all(isinstance(n, str | int) for n in names)
 
 
 def kind_of(run: Mapping[str, str]) -> str:
@@ -107,7 +154,7 @@ def spaces_of(run: Mapping[str, str], path: str) -> dict[str, Any]:
 
 
 def sizes_of(run: Mapping[str, str], path: str) -> dict[Topic, Sizes]:
-    """Return what `record_dtype` must know of each fixed-width topic of a recording.
+    """Return the sizes of each fixed-width topic of a recording, as `record_dtype` takes them.
 
     Raises:
         RecordingError: its spaces are not described.
@@ -137,54 +184,80 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, Any]:
     try:
         if text is None or len(text) > MAX_METADATA_BYTES:
             raise ValueError("none, or too long")
-        found = dict(without_surrogates(json.loads(text), text))
-        if is_too_deep(found):
+        value = dict(without_surrogates(json.loads(text), text))
+        if is_too_deep(value):
             raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
-        return found
+        return value
     except (TypeError, ValueError, RecursionError) as error:
         raise RecordingError(f"{what} holds no JSON object ({error}).") from error
 
 
-def holes(repair: Mapping[str, Any], path: str) -> dict[str, list[list[int]]]:
-    """Return what a repair says was lost: topic to [first, behind the last] numbers, in order.
+def lost_ranges(repair: Mapping[str, Any], path: str) -> dict[str, list[list[int]]]:
+    """Return the messages that a repair could not save: by topic, ranges (first, stop) of their numbers.
 
     Raises:
-        RecordingError: it does not say it so.
+        RecordingError: its metadata record does not say it so.
     """
+
+    def are_ranges(value: Any) -> bool:
+        if not isinstance(value, list) or not all(isinstance(one, list) and len(one) == 2 for one in value):
+            return False
+        numbers = [number for one in value for number in one]
+        return all(is_whole(number, 0, 2**62 - 1) for number in numbers) and numbers == sorted(numbers)
+
     lost = repair.get("lost")
-    if not isinstance(lost, dict) or not all(map(_are_holes, lost.values())):
+    if not isinstance(lost, dict) or not all(map(are_ranges, lost.values())):
         raise RecordingError(f"{path}: the metadata 'repair' does not say what was lost.")
     return lost
 
 
-def _are_holes(found: Any) -> bool:
-    if not isinstance(found, list) or not all(isinstance(hole, list) and len(hole) == 2 for hole in found):
-        return False
-    numbers = [number for hole in found for number in hole]
-    whole = all(type(number) is int and 0 <= number < 2**62 for number in numbers)
-    return whole and numbers == sorted(numbers)
+# --- the environment ----------------------------------------------------------------------------------
 
 
-def environment_said(text: bytes, path: str) -> dict[str, Any]:
-    """Return what `environment.json` says.
+def environment_attachments(
+    description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+) -> Attachments:
+    """Return the attachments that describe an environment: its description, and its arrays if it has any."""
+    text = _indented(json.dumps({**description, "arrays": sorted(arrays)}, sort_keys=True))
+    return {"environment.json": ("application/json", text.encode())} | {
+        f"environment/{name}.npy.zst": ("application/zstd", _pack_array(arrays[name]))
+        for name in sorted(arrays)
+    }
+
+
+@lru_cache(32)
+def _indented(text: str) -> str:
+    """Return JSON with one value a line; cached, because a process often records one environment again."""
+    return json.dumps(json.loads(text), indent=1, sort_keys=True)
+
+
+def _pack_array(array: NDArray[Any]) -> bytes:
+    """Return an array as a `.npy` file, compressed with zstd."""
+    buffer = BytesIO()
+    np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    return zstandard.ZstdCompressor(level=9).compress(buffer.getvalue())
+
+
+def environment_description(text: bytes, path: str) -> dict[str, Any]:
+    """Return the description in `environment.json`.
 
     Raises:
         RecordingError: it does not name the environment's arrays and events.
     """
-    said = json_object(text, f"{path}: environment.json")
+    description = json_object(text, f"{path}: environment.json")
     for key in ("arrays", "event_names", "success_events"):
-        names = said.get(key)
+        names = description.get(key)
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise RecordingError(f"{path}: environment.json does not name the environment's {key}.")
-    return said
+    return description
 
 
 def environment_of(description: Mapping[str, Any], attachment: Callable[[str], bytes], path: str) -> Mdp:
     """Return the environment that a recording describes.
 
     Args:
-        description: what `environment_said` found.
-        attachment: gives an attachment by its name.
+        description: as `environment_description` returns it.
+        attachment: returns an attachment by its name.
         path: of the recording, for errors.
 
     Raises:
@@ -199,6 +272,84 @@ def environment_of(description: Mapping[str, Any], attachment: Callable[[str], b
     arrays: dict[str, NDArray[Any]] = {}
     for name in description["arrays"]:
         data = attachment(f"environment/{name}.npy.zst")
-        room = MAX_ARRAYS_BYTES - sum(array.nbytes for array in arrays.values())
-        arrays[name] = unpack_array(data, room, f"{path}: environment/{name}")
+        budget = MAX_ARRAYS_BYTES - sum(array.nbytes for array in arrays.values())
+        arrays[name] = _unpack_array(data, budget, f"{path}: environment/{name}")
     return from_parts(description, arrays)
+
+
+def _unpack_array(data: bytes, max_bytes: int, where: str) -> NDArray[Any]:
+    """Return the array in a compressed `.npy` file; never unpickles or takes more memory than it declares.
+
+    Raises:
+        RecordingError: it holds no array, or one of more than `max_bytes`.
+    """
+    try:
+        with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
+            return _read_array(stream, max_bytes, where)
+    except (zstandard.ZstdError, ValueError, TypeError) as error:
+        raise RecordingError(f"{where}: holds no array ({error}).") from error
+
+
+def _read_array(stream: Any, max_bytes: int, where: str) -> NDArray[Any]:
+    """Return the array in a `.npy` file of version 1.0, whose head is text in a fixed form."""
+    beginning = stream.read(10)
+    length = int.from_bytes(beginning[8:], "little")
+    head = _HEAD.fullmatch(stream.read(min(length, _HEAD_BYTES)))
+    if beginning[:8] != b"\x93NUMPY\x01\x00" or head is None:
+        raise RecordingError(f"{where}: found no `.npy` file of numbers, version 1.0.")
+    dtype, shape = np.dtype(head[1].decode()), tuple(int(n) for n in head[3].split(b",") if n.strip())
+    size = math.prod(shape) * dtype.itemsize
+    if size > max_bytes:
+        raise RecordingError(
+            f"{where}: found an array of {size:,} bytes, expected {max_bytes:,} at most: the arrays of an "
+            f"environment may take {MAX_ARRAYS_BYTES:,}."
+        )
+    flat = np.empty(math.prod(shape), dtype)
+    into, filled = flat.view(np.uint8).data, 0
+    while filled < size and (more := stream.readinto(into[filled:])):
+        filled += more
+    if filled != size or stream.read(1):
+        raise RecordingError(f"{where}: found an array of another size than the {size} bytes it declares.")
+    return flat.reshape(shape, order="F" if head[2] == b"True" else "C")
+
+
+# --- the file -----------------------------------------------------------------------------------------
+
+
+def write_description(
+    file: RecordingFile,
+    run: Mapping[str, str],
+    config: Mapping[str, Any],
+    provenance: Mapping[str, str],
+    environment: Attachments,
+) -> None:
+    """Write what makes a recording self-contained.
+
+    Raises:
+        StorageError: the disk is full or failing.
+    """
+    try:
+        file.add_metadata("run", run)
+        file.add_metadata("config", _json_entry(config))
+        file.add_metadata("provenance", provenance)
+        for name, (media_type, data) in environment.items():
+            file.add_attachment(name, media_type, data)
+    except OSError as error:
+        file.cut_back()
+        raise storage_error(file, error) from error
+
+
+def write_result(file: RecordingFile, status: str, result: Mapping[str, Any]) -> None:
+    """Write how the run ended, the index and the summary; all of it, or nothing.
+
+    Raises:
+        StorageError: the disk is full or failing.
+    """
+    try:
+        file.finish("result", _json_entry({"status": status, **result}))
+    except OSError as error:
+        raise storage_error(file, error) from error
+
+
+def _json_entry(value: Mapping[str, Any]) -> dict[str, str]:
+    return {"json": json.dumps(value, sort_keys=True)}

@@ -35,17 +35,17 @@ from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
 from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
 from runner.recording.metadata import (
-    check_facts,
+    check_file,
+    environment_description,
     environment_of,
-    environment_said,
-    holes,
     json_object,
     kind_of,
+    lost_ranges,
     sizes_of,
     spaces_of,
 )
+from runner.recording.records import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
 from runner.recording.run_file import Summary, parse_summary, run_title
-from runner.recording.scan import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
 from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
 from runner.recording.topic_chunks import TopicChunks, chunks_by_topic
@@ -83,7 +83,7 @@ class Recording:
         self._store = RecordStore(self._stream, str(path))
         try:
             self._index = read_index(self._stream, str(path))
-            check_facts(self.run, self._index, str(path))
+            check_file(self.run, self._index, str(path))
         except OSError as error:
             self.close()
             raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
@@ -161,7 +161,7 @@ class Recording:
         """Messages that a repair could not save: topic to [first, behind the last] numbers; mostly none."""
         if "repair" not in self._index.metadata:
             return {}
-        return holes(self._json("repair"), str(self.path))
+        return lost_ranges(self._json("repair"), str(self.path))
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -297,7 +297,7 @@ class Recording:
     @cached_property
     def environment(self) -> dict[str, Any]:
         """What is said of the environment beside its arrays: agents, events, scene; not to be changed."""
-        return environment_said(self.attachment("environment.json"), str(self.path))
+        return environment_description(self.attachment("environment.json"), str(self.path))
 
     @property
     def tabular(self) -> bool:

@@ -1,42 +1,34 @@
-"""A recording written anew with other metadata: every message byte for byte, its content digest the same."""
+"""Copies of recordings with other metadata; content digests and comparison of whole recordings."""
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Final
 
-import numpy as np
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import Chunk, message_index
 from runner.recording.digest import ContentHash, combine
-from runner.recording.integrity import check_integrity, places
+from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
-from runner.recording.run_file import Summary
-from runner.recording.scan import (
+from runner.recording.records import (
     UNREADABLE,
-    Part,
+    ReadChunk,
     asks_for_indexes,
     attachment_of,
+    copied_chunk,
     metadata_of,
     read_chunk,
     walk,
 )
-from runner.recording.schema import KINDS, STEP, TOPIC_OF, TOPICS, Topic
+from runner.recording.run_file import Summary
+from runner.recording.schema import STEP, TOPIC_OF, TOPICS, Topic
 from runner.recording.writer import RecordingFile
 from runner.util.files import open_regular
 
-Times = NDArray[np.uint64]
 Change = Callable[[str, dict[str, str]], dict[str, str] | None]
 """Takes the name and entries of a metadata record; returns its new entries, or None to leave it out."""
-
-_CHUNK_TIMES: Final = struct.Struct("<QQ")
 
 
 def rewrite(
@@ -45,7 +37,7 @@ def rewrite(
     """Write a recording into a new file with its metadata changed.
 
     Of a recording that was cut off, everything up to its last whole chunk is written; the new file has
-    an index and a summary, and no result either.
+    an index and a summary, but no result either.
 
     Args:
         path: the recording.
@@ -59,7 +51,7 @@ def rewrite(
     """
     indexed, result = True, None
     with open_recording(path) as recording:
-        topics = KINDS[recording.kind]
+        topics = recording.topics
     with RecordingFile(fresh, topics) as file:
         for opcode, offset, body in _whole_records(path):
             if opcode == Opcode.METADATA:
@@ -74,59 +66,37 @@ def rewrite(
             elif opcode == Opcode.ATTACHMENT:
                 file.add_attachment(*attachment_of(body, offset))
             elif opcode == Opcode.CHUNK:
-                part, records = read_chunk(body, offset)
-                _, times, offsets = places(records, f"{path}: chunk at {offset}")
-                file.add_chunk(TOPIC_OF[part.channel], copied_chunk(part, body, times, offsets, indexed))
+                chunk = read_chunk(body, offset)
+                file.add_chunk(TOPIC_OF[chunk.part.channel], copied_chunk(chunk, body, indexed))
         for name, added in (more or {}).items():
             file.add_metadata(name, added)
         file.finish("" if result is None else "result", result)
 
 
-def copied_chunk(part: Part, body: bytes, times: Times, offsets: Times, indexed: bool) -> Chunk:
-    """Return a chunk to be written as it was read, with its times and index made anew.
-
-    Args:
-        part: what is known of it.
-        body: the chunk record behind its head.
-        times: log times of its messages, in nanoseconds.
-        offsets: where its messages begin.
-        indexed: whether a message index shall follow it.
-    """
-    start, end = int(times[0]), int(times[-1])
-    body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
-    return Chunk(
-        record=RECORD_HEAD.pack(Opcode.CHUNK, len(body)) + body,
-        index=message_index(part.channel, times, offsets) if indexed else b"",
-        compression=part.index.compression,
-        compressed_size=part.index.compressed_size,
-        uncompressed_size=part.index.uncompressed_size,
-        start_time=start,
-        end_time=end,
-        messages=part.messages,
-    )
-
-
 def content_of(path: Path) -> str:
-    """Return the content digest of a recording, after every checksum and every message were looked at.
+    """Return the content digest of a recording, after checking every checksum and every message.
 
-    It is the one that the recording states, if it states one; of a run that was killed, that of its whole
-    chunks.
+    If the recording states a digest, it must be the same; of a killed run, it is that of the whole chunks.
 
     Raises:
         RecordingError: it is damaged, or states another digest than its messages have.
     """
     seen = ContentHash()
-    for topic, records, _ in _messages(path):
-        seen.update(topic, records)
+    for topic, chunk in _chunks(path):
+        seen.update(topic, chunk.records)
     with open_recording(path) as recording:
         result = recording.result
-    return seen.content() if result.content_digest is None else _stated(result, seen.topics(), path)
+    if result.content_digest is not None and not _is_stated(result, seen.topics()):
+        raise RecordingError(
+            f"{path}: found messages of other content than the digest it states; it was altered."
+        )
+    return result.content_digest or seen.content()
 
 
 def continues(path: Path, earlier: Path) -> bool:
-    """Return whether a recording holds all that another of the same job does, and goes on from there.
+    """Return whether a recording begins with all messages of another one of the same job.
 
-    Of every topic that the digest covers, the other's messages are the first ones, byte for byte.
+    Only topics that the digest covers are compared, byte for byte.
 
     Raises:
         RecordingError: one of them is damaged.
@@ -136,24 +106,30 @@ def continues(path: Path, earlier: Path) -> bool:
             return False
     counts: Counter[Topic] = Counter()
     expected, seen = ContentHash(), ContentHash()
-    for topic, records, offsets in _messages(earlier):
-        expected.update(topic, records)
-        counts[topic] += len(offsets)
-    for topic, records, offsets in _messages(path):
-        shared = min(counts[topic], len(offsets))
+    for topic, chunk in _chunks(earlier):
+        expected.update(topic, chunk.records)
+        counts[topic] += len(chunk.offsets)
+    for topic, chunk in _chunks(path):
+        shared = min(counts[topic], len(chunk.offsets))
         counts[topic] -= shared
-        end = len(records) if shared == len(offsets) else int(offsets[shared])
-        seen.update(topic, memoryview(records)[:end])
+        end = len(chunk.records) if shared == len(chunk.offsets) else int(chunk.offsets[shared])
+        seen.update(topic, memoryview(chunk.records)[:end])
     return seen.topics() == expected.topics()
 
 
-def _messages(path: Path) -> Iterator[tuple[Topic, bytes, Times]]:
-    """Yield of each chunk its topic, its message records, and where in them the messages begin."""
+def _is_stated(result: Summary, seen: dict[str, str]) -> bool:
+    """Return whether a result states these digests; those of steps that are not recorded are not compared."""
+    if not result.steps_recorded:
+        steps = {topic.name for topic in TOPICS if topic.message is STEP}
+        seen = seen | {name: digest for name, digest in result.topic_digests.items() if name in steps}
+    return dict(result.topic_digests) == seen and combine(seen) == result.content_digest
+
+
+def _chunks(path: Path) -> Iterator[tuple[Topic, ReadChunk]]:
     for opcode, offset, body in _whole_records(path):
         if opcode == Opcode.CHUNK:
-            part, records = read_chunk(body, offset)
-            _, _, offsets = places(records, f"{path}: chunk at {offset}")
-            yield TOPIC_OF[part.channel], records, offsets
+            chunk = read_chunk(body, offset)
+            yield TOPIC_OF[chunk.part.channel], chunk
 
 
 def _whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
@@ -169,21 +145,7 @@ def _whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:
     try:
         with open_regular(path) as stream:
             for opcode, offset, body in walk(stream, path.stat().st_size):
-                if opcode == Opcode.DATA_END:
-                    return
-                yield opcode, offset, body
+                if opcode != Opcode.DATA_END:
+                    yield opcode, offset, body
     except UNREADABLE as error:
         raise RecordingError(f"{path}: a record of it cannot be read; `dualtaxi repair` mends it.") from error
-
-
-def _stated(result: Summary, seen: dict[str, str], path: Path) -> str:
-    """Return the digest that a result states, if it is that of the messages."""
-    stated = dict(result.topic_digests)
-    if not result.steps_recorded:
-        steps = {topic.name for topic in TOPICS if topic.message is STEP}
-        seen = seen | {name: digest for name, digest in stated.items() if name in steps}
-    if stated != seen or combine(seen) != result.content_digest:
-        raise RecordingError(
-            f"{path}: found messages of other content than the digest it states; it was altered."
-        )
-    return combine(seen)

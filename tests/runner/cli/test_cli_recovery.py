@@ -15,9 +15,9 @@ from mcap.writer import Writer
 
 from runner.cli import cli
 from runner.recording import schema
+from runner.recording.integrity import survey
 from runner.recording.liveness import owner
 from runner.recording.reader import open_recording
-from runner.recording.scan import survey
 from runner.replay.tables import tables_at
 from runner.runs.run import Run, list_runs
 from tests.runner.altering import altered

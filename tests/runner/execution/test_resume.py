@@ -18,9 +18,9 @@ from runner.execution import verify
 from runner.execution.rerecord import evaluate
 from runner.execution.resume import resume
 from runner.execution.session import run_job
+from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
-from runner.recording.scan import survey
 from runner.recording.schema import TRAIN_STEP
 from runner.recording.writer import RecordingFile
 from runner.runs import run as runs

@@ -17,11 +17,11 @@ from runner.execution.session import run_job
 from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.chunks import encode_chunk
-from runner.recording.integrity import places
+from runner.recording.integrity import survey
 from runner.recording.messages import decode, encode
 from runner.recording.reader import open_recording
+from runner.recording.records import read_chunk
 from runner.recording.repair import repair
-from runner.recording.scan import read_chunk, survey
 from runner.recording.writer import RecordingFile
 from runner.runs.run import create_run
 from runner.util.packing import Packing
@@ -343,8 +343,7 @@ def described_as(source, target, change):
             file.add_attachment(name, media_type, data)
         for entry in survey(source).chunks:
             body = source.read_bytes()[entry.index.chunk_start_offset + 9 :][: entry.index.chunk_length - 9]
-            _, records = read_chunk(body, entry.index.chunk_start_offset)
-            _, times, offsets = places(records, "")
+            _, records, times, offsets = read_chunk(body, entry.index.chunk_start_offset)
             topic = schema.TOPIC_OF[entry.channel]
             file.add_chunk(topic, encode_chunk(topic, records, times, offsets, Packing()))
         file.finish("result", recording.metadata("result"))

@@ -18,7 +18,7 @@ from runner.errors import RecordingError, RunnerError
 from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
-from runner.recording.metadata import environment_said
+from runner.recording.metadata import environment_description
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.rewriting import rewrite
@@ -329,7 +329,7 @@ def test_a_description_that_makes_no_sense_is_refused(entries, lake, tmp_path):
 def test_learners_without_names_are_refused(agents, lake, tmp_path):
     path = tmp_path / "nameless.mcap"
     rewrite(lake.recording, path, lambda name, said: said | ({"agents": agents} if name == "run" else {}))
-    with pytest.raises(RecordingError, match="of its run it says that agents is"):
+    with pytest.raises(RecordingError, match="its run has agents"):
         everything(path)
 
 
@@ -338,7 +338,7 @@ def test_learners_without_names_are_refused(agents, lake, tmp_path):
 def test_an_environment_that_names_nothing_is_refused(key, names):
     said = {"arrays": [], "event_names": [], "success_events": []} | {key: names}
     with pytest.raises(RecordingError, match=f"here: environment.json does not name the environment's {key}"):
-        environment_said(json.dumps(said).encode(), "here")
+        environment_description(json.dumps(said).encode(), "here")
 
 
 def _text(text: str) -> bytes:

@@ -127,7 +127,7 @@ def test_no_room_even_to_describe_the_run(size, tmp_path):
     run, error = run_on_small_disk(tmp_path, size, LAKE)
     assert error.exit_code == 1
     assert run.status == ("failed" if size > 1_500 else "running")
-    assert [path.name for path in run.folder.iterdir() if path.suffix == ".tmp"] == []
+    assert [path.name for path in run.folder.iterdir() if path.name.startswith(".")] == []
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root may mount a disk")

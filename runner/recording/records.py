@@ -1,0 +1,268 @@
+"""The records of a recording's data section, parsed within bounds: anyone may have written the file."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import BinaryIO, Final, NamedTuple
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, ChunkIndex, Metadata, MetadataIndex
+from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.blocks import HEADER, HEADER_BYTES, MESSAGE_HEAD, RECORD_HEAD
+from runner.recording.chunks import (
+    CHUNK_HEAD,
+    MAX_CHUNK_BYTES,
+    Chunk,
+    chunk_head,
+    message_index,
+    unpack_chunk,
+)
+
+MAX_METADATA_BYTES: Final = 4 << 20
+"""The largest metadata record that is read, config and provenance among them."""
+MAX_NAMED: Final = 4096
+"""The most attachments, and the most metadata records; a resume adds one."""
+MAX_NAME_BYTES: Final = 256
+UNPACKED_A_BYTE: Final = 1000
+"""How many bytes a byte of the file may declare to hold; files with more are made to exhaust memory."""
+_UNPACKED_ANYWAY: Final = 1 << 30
+UNREADABLE: Final = (struct.error, ValueError, KeyError, McapError)
+"""What parsing damaged records raises."""
+IN_DATA: Final = frozenset(
+    {
+        *(Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK),
+        *(Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT),
+    }
+)
+"""The kinds of records in the data section; after any other, nothing can be relied on."""
+_CHUNK_TIMES: Final = struct.Struct("<QQ")
+
+Times = NDArray[np.uint64]
+Report = Callable[[int, int], None]
+"""Called with the bytes that were read, and the size of the file."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A good chunk: its index entry, channel and number of messages."""
+
+    index: ChunkIndex
+    channel: int
+    messages: int
+
+
+class ReadChunk(NamedTuple):
+    """A good chunk and what it holds."""
+
+    part: Part
+    records: bytes
+    """The message records."""
+    times: Times
+    """Log times of the messages, in nanoseconds."""
+    offsets: Times
+    """Where each message begins in `records`."""
+
+
+@dataclass
+class Contents:
+    """The good records of a recording, up to `end`."""
+
+    end: int = 0
+    """Offset after the last good record that a resumed recording keeps."""
+    size: int = 0
+    """Bytes of the file."""
+    reason: str = ""
+    """Why the survey stopped before the end of the data section; empty if it did not."""
+    chunks: list[Part] = field(default_factory=list)
+    attachments: list[AttachmentIndex] = field(default_factory=list)
+    metadata: list[MetadataIndex] = field(default_factory=list)
+    channels: list[int] = field(default_factory=list)
+
+    @property
+    def topics(self) -> list[schema.Topic]:
+        """The topics of its channels."""
+        return [topic for topic in schema.ALL_TOPICS if topic.channel in self.channels]
+
+
+def record_heads(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
+    """Yield (opcode, offset, body length) of the whole records of a file; the stream is at the body."""
+    offset = len(MCAP0_MAGIC)
+    while offset + RECORD_HEAD.size <= size:
+        stream.seek(offset)
+        opcode, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
+        if offset + RECORD_HEAD.size + length > size:
+            return
+        yield opcode, offset, length
+        offset += RECORD_HEAD.size + length
+
+
+def walk(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:
+    """Yield (opcode, offset, body) of the whole records of the data section and its end.
+
+    Ends early at a record that is cut off or makes no sense.
+    """
+    for opcode, offset, length in record_heads(stream, size):
+        if length > MAX_CHUNK_BYTES or not 1 <= opcode <= Opcode.DATA_END:
+            return
+        yield opcode, offset, stream.read(length)
+        if opcode == Opcode.DATA_END:
+            return
+
+
+def declared_bytes(stream: BinaryIO, size: int, path: str) -> int:
+    """Return how many bytes the chunks of a file declare to hold, up to a record that makes no sense."""
+    declared = 0
+    for opcode, _, length in record_heads(stream, size):
+        if length > MAX_CHUNK_BYTES or opcode not in IN_DATA:
+            break
+        if opcode == Opcode.CHUNK:
+            try:
+                body = stream.read(min(length, CHUNK_HEAD.size + 16))
+                declared += chunk_head(body, length, path).uncompressed_size
+            except RecordingError:
+                break
+    return declared
+
+
+def refuse_exhausting(size: int, unpacked: int, path: str) -> None:
+    """Refuse a file whose chunks declare to hold far more than those of any recording of its size.
+
+    Raises:
+        RecordingError: they do.
+    """
+    if unpacked > size * UNPACKED_A_BYTE + _UNPACKED_ANYWAY:
+        raise RecordingError(f"{path}: {size:,} bytes declare to hold {unpacked:,}; made to exhaust memory.")
+
+
+def read_chunk(body: bytes, offset: int) -> ReadChunk:
+    """Return the chunk in a record, after comparing its checksum and looking at each of its messages.
+
+    Raises:
+        RecordingError: it is damaged, or holds messages of no topic, of several, or that no recorder writes.
+    """
+    where = f"chunk at {offset}"
+    head, records = unpack_chunk(body, where)
+    channel, times, offsets = _places(records, where)
+    index = ChunkIndex(
+        chunk_length=RECORD_HEAD.size + len(body),
+        chunk_start_offset=offset,
+        compression=head.compression,
+        compressed_size=len(body) - head.data_at,
+        message_end_time=head.end_time,
+        message_index_length=0,
+        message_index_offsets={},
+        message_start_time=head.start_time,
+        uncompressed_size=head.uncompressed_size,
+    )
+    return ReadChunk(Part(index, channel, len(times)), records, times, offsets)
+
+
+def _places(records: bytes, where: str) -> tuple[int, Times, Times]:
+    """Return channel, times and offsets of a chunk's messages."""
+    if len(records) < HEADER_BYTES:
+        raise RecordingError(f"{where}: holds no whole message")
+    _, length, channel, *_ = MESSAGE_HEAD.unpack_from(records)
+    if channel not in schema.TOPIC_OF:
+        raise RecordingError(f"{where}: holds no messages of ours")
+    size = RECORD_HEAD.size + length
+    if schema.TOPIC_OF[channel] in schema.ALL_BLOCK_TOPICS:
+        if size < HEADER_BYTES or len(records) % size:
+            raise RecordingError(f"{where}: its messages differ in size")
+        block = np.frombuffer(records, np.dtype([*HEADER, ("data", "u1", (size - HEADER_BYTES,))]))
+        offsets = np.arange(len(block), dtype=np.uint64) * np.uint64(size)
+    else:
+        starts, at = [], 0
+        while at + HEADER_BYTES <= len(records):
+            starts.append(at)
+            at += RECORD_HEAD.size + max(RECORD_HEAD.unpack_from(records, at)[1], HEADER_BYTES - 9)
+        if at != len(records):
+            raise RecordingError(f"{where}: its messages do not fill it")
+        heads = b"".join(records[start : start + HEADER_BYTES] for start in starts)
+        block = np.frombuffer(heads, np.dtype(HEADER))
+        offsets = np.array(starts, dtype=np.uint64)
+    lengths = np.diff(offsets, append=np.uint64(len(records))) - np.uint64(RECORD_HEAD.size)
+    as_written = (
+        (block["opcode"] == Opcode.MESSAGE)
+        & (block["record_length"] == lengths)
+        & (block["channel_id"] == channel)
+        & (block["sequence"] == 0)
+        & (block["publish_time"] == block["log_time"])
+    )
+    if not as_written.all():
+        at = int(offsets[np.argmin(as_written)])
+        raise RecordingError(f"{where}: found a message at {at} that no recorder writes")
+    return channel, block["log_time"], offsets
+
+
+def copied_chunk(chunk: ReadChunk, body: bytes, indexed: bool) -> Chunk:
+    """Return a chunk to be written as it was read, with its times and its message index made again.
+
+    Args:
+        chunk: the chunk.
+        body: its record after the head.
+        indexed: whether a message index follows it.
+    """
+    part, start, end = chunk.part, int(chunk.times[0]), int(chunk.times[-1])
+    body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
+    return Chunk(
+        record=RECORD_HEAD.pack(Opcode.CHUNK, len(body)) + body,
+        index=message_index(part.channel, chunk.times, chunk.offsets) if indexed else b"",
+        compression=part.index.compression,
+        compressed_size=part.index.compressed_size,
+        uncompressed_size=part.index.uncompressed_size,
+        start_time=start,
+        end_time=end,
+        messages=part.messages,
+    )
+
+
+def attachment_of(body: bytes, offset: int) -> tuple[str, str, bytes]:
+    """Return the name, media type and data of an attachment record.
+
+    Raises:
+        RecordingError: its checksum does not match, or it has times, which no recorder writes.
+    """
+    stream = ReadDataStream(BytesIO(body))
+    times = stream.read8(), stream.read8()
+    name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
+    size = stream.read8()
+    data = body[stream.count : -4]
+    if len(data) != size or times != (0, 0) or zlib.crc32(body[:-4]) != int.from_bytes(body[-4:], "little"):
+        raise RecordingError(f"attachment at {offset}: its content does not match its checksum")
+    return name, media_type, data
+
+
+def metadata_of(body: bytes) -> tuple[str, dict[str, str]]:
+    """Return the name and entries of a metadata record.
+
+    Raises:
+        RecordingError: it is larger than any of ours.
+    """
+    if len(body) > MAX_METADATA_BYTES:
+        raise RecordingError(f"metadata of {len(body):,} bytes, expected {MAX_METADATA_BYTES:,} at most")
+    record = Metadata.read(ReadDataStream(BytesIO(body)))
+    return record.name, dict(record.metadata)
+
+
+def asks_for_indexes(config: dict[str, str]) -> bool:
+    """Return whether a recording's configuration asks for message indexes.
+
+    Raises:
+        RecordingError: the entries do not say.
+    """
+    try:
+        return bool(json.loads(config["json"])["recording"]["index"] == "message")
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise RecordingError("the configuration does not say what it was recorded with") from error
