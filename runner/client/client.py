@@ -1,41 +1,79 @@
-"""A client of the service: pushes runs, and pulls them, whatever the connection does meanwhile.
+"""A client of the service: submits jobs, pushes and pulls runs, and continues when a connection breaks.
 
     from runner.client.client import Client
 
     with Client("http://localhost:8000") as client:
         client.push(runner.find_run("@latest", Path("recordings")))
 
-What was sent before a connection broke is not sent again; the same run pushed twice is there once.
+Bytes that were sent before a connection broke are not sent again; the same run pushed twice is stored once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from runner.client.backoff import ServerError, ServerUnavailable
-from runner.client.connection import READ_BYTES, Connection, Report
+from runner.client.connection import READ_BYTES, Connection, Report, ServerError, ServerUnavailable
 from runner.client.jobs import JobEvent, RemoteJob, watch
 from runner.client.pull import pull
-from runner.client.upload_source import UploadSource, UploadStatus
 from runner.errors import RunnerError
 from runner.runs.run import Run
 from runner.util.files import hash_of
 
 if TYPE_CHECKING:
-    import httpx2
-
     from runner.runs.importing import Imported
 
 PIECE: Final = 32 << 20
-"""The bytes of one request at most; a proxy in front of the server must accept them."""
+"""Maximum number of bytes of a request; a proxy in front of the server must accept them."""
 _WAIT_SECONDS: Final = 20
 
 
+@dataclass(frozen=True)
+class UploadSource:
+    """A file to upload, and what its sender knows of the run in it."""
+
+    path: Path
+    name: str = ""
+    run_id: str = ""
+    content_digest: str | None = None
+    run: Mapping[str, Any] = field(default_factory=dict)
+    labels: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of_run(cls, run: Run) -> UploadSource:
+        """Return a run that is over, to be uploaded.
+
+        Raises:
+            RunnerError: it is running, or in an archive only.
+        """
+        if run.status not in ("finished", "interrupted", "failed"):
+            raise RunnerError(f"run {run.run_id} is {run.status}; only one that is over and here can be pushed.")
+        known = (run.recording, run.name, run.run_id, run.summary.content_digest)
+        if run.stands_alone:  # an exported recording carries its own record of the run
+            return cls(*known)
+        details = {"name": run.file.name, "status": run.status, "proof": run.file.proof}
+        details |= {"seconds": run.summary.seconds, "error": run.summary.error}
+        labels = {"name": run.labels.name, "tags": list(run.labels.tags), "note": run.labels.note}
+        return cls(*known, {key: value for key, value in details.items() if value is not None}, labels)
+
+
+@dataclass(frozen=True)
+class UploadStatus:
+    """The state of an upload on the server."""
+
+    id: str
+    state: str
+    offset: int
+    run_id: str = ""
+    already: bool = False
+    problem: str = ""
+
+
 class Client(Connection):
-    """A connection to a server, with everything that can be asked of it."""
+    """A connection to a server, with everything that can be requested of it."""
 
     # --- jobs -----------------------------------------------------------------------------------------
 
@@ -43,223 +81,158 @@ class Client(Connection):
         """Submit the text of a configuration or a sweep; `source` is the file's name, for messages.
 
         Raises:
-            ServerError: it was refused, each mistake with its line; or the server is away.
+            ServerError: it was refused, each mistake with its line; or the server is unavailable.
         """
-        return RemoteJob.of(
-            self.ask("POST", "/jobs", params={"source": source}, content=text.encode()).json()
-        )
+        options = {"params": {"source": source}, "content": text.encode()}
+        return RemoteJob.from_json(self.request_object("POST", "/jobs", **options))
 
     def job(self, number: int) -> RemoteJob:
-        """Return how a job stands; errors as of `ask`."""
-        return RemoteJob.of(self.ask("GET", f"/jobs/{number}").json())
+        """Return a job; errors as for `request`."""
+        return RemoteJob.from_json(self.request_object("GET", f"/jobs/{number}"))
 
     def jobs(self, limit: int = 50, offset: int = 0) -> list[RemoteJob]:
-        """Return jobs, the newest first; errors as of `ask`."""
-        told = self.ask("GET", "/jobs", params={"limit": limit, "offset": offset}).json()
-        return [RemoteJob.of(job) for job in told["jobs"]]
+        """Return jobs, the newest first; errors as for `request`."""
+        page = self.request_object("GET", "/jobs", params={"limit": limit, "offset": offset})
+        return [RemoteJob.from_json(job) for job in page["jobs"]]
 
     def watch(self, number: int) -> Iterator[JobEvent]:
-        """Yield what happens to a job until it is over, as `jobs.watch` does; it says what is raised."""
+        """Yield the events of a job until it is over; see `runner.client.jobs.watch`."""
         return watch(self, number)
 
     def cancel(self, number: int) -> RemoteJob:
-        """Have a job not be done, or stopped; what it has recorded is kept. Errors as of `ask`."""
-        return RemoteJob.of(self.ask("POST", f"/jobs/{number}/cancel").json())
+        """Cancel a job; what it has recorded stays. Errors as for `request`."""
+        return RemoteJob.from_json(self.request_object("POST", f"/jobs/{number}/cancel"))
 
     def resume(self, number: int, accept_changes: bool = False) -> RemoteJob:
-        """Have a job that failed or was cancelled go on; errors as of `ask`."""
-        params = {"accept_changes": accept_changes}
-        return RemoteJob.of(self.ask("POST", f"/jobs/{number}/resume", params=params).json())
+        """Resume a failed or cancelled job; errors as for `request`."""
+        options = {"params": {"accept_changes": accept_changes}}
+        return RemoteJob.from_json(self.request_object("POST", f"/jobs/{number}/resume", **options))
 
-    # --- pushing --------------------------------------------------------------------------------------
+    # --- runs -----------------------------------------------------------------------------------------
+
+    def pull(self, name: str, recordings: Path, report: Report = lambda *_: None) -> Imported:
+        """Download a run into a recordings folder; see `runner.client.pull.pull`."""
+        return pull(self, name, recordings, report)
 
     def push(
-        self, source: UploadSource | Run, report: Report = lambda *_: None, begun: UploadStatus | None = None
+        self,
+        source: UploadSource | Run,
+        report: Report = lambda *_: None,
+        begun: UploadStatus | None = None,
     ) -> UploadStatus:
-        """Send a run, and return what became of it when the server has verified and stored it.
+        """Upload a run, and return the result when the server has verified and stored it.
 
         Args:
-            source: a run that is over, or a file with what is said of it.
-            report: told the progress.
-            begun: the upload that has its beginning already.
+            source: a run that is over, or a file and what is known of its run.
+            report: called with the progress.
+            begun: an upload that has its first bytes already.
 
         Raises:
             ServerError: it was refused, with the reason.
-            ServerUnavailable: the server did not answer in time; it keeps what it has received.
+            ServerUnavailable: the server did not respond in time; it keeps what it has received.
             RunnerError: the run cannot be sent.
         """
         if isinstance(source, Run):
-            source = UploadSource.of(source)
-        size, digest = _size_and_digest(source.path)
-        sent = _Delivery(self, source, size, digest, report, begun).done()
-        if sent.state == "refused" and begun is not None:  # the file has become another since it began
-            sent = _Delivery(self, source, size, digest, report, None).done()
-        if sent.state == "refused":
-            raise ServerError(f"{self.url}: refused the run {source.run_id}: {sent.problem}")
-        return sent
+            source = UploadSource.of_run(source)
+        try:
+            size, digest = hash_of(source.path)
+        except OSError as error:
+            raise RunnerError(f"{source.path}: cannot be read ({error.strerror}).") from error
+        upload = self._deliver(source, size, digest, report, begun)
+        if upload.state == "refused" and begun is not None:  # the file has changed since it began
+            upload = self._deliver(source, size, digest, report, None)
+        if upload.state == "refused":
+            raise ServerError(f"{self.url}: refused the run {source.run_id}: {upload.problem}")
+        return upload
 
-    def begin(self, **announced: Any) -> UploadStatus:
-        """Begin an upload, or find the one of the same bytes.
-
-        Raises:
-            ServerError: the server refuses, or is away.
-        """
-        told = {key: value for key, value in announced.items() if value not in (None, "")}
-        return _sent(self.ask("POST", "/uploads", json=told))
-
-    def append(self, sent: UploadStatus, path: Path, end: int) -> UploadStatus:
-        """Send what an upload lacks of a file up to some place, in one request; not more than a piece.
-
-        Raises:
-            ServerError: the server refuses, or is away.
-        """
-        size = min(end - sent.offset, PIECE)
-        with path.open("rb") as stream:
-            stream.seek(sent.offset)
-            answer = self.ask(
-                "PATCH",
-                f"/uploads/{sent.id}",
-                content=_pieces(stream, size, path),
-                headers={"Upload-Offset": str(sent.offset), "Content-Length": str(size)},
-            )
-        return UploadStatus(sent.id, sent.state, int(answer.headers["Upload-Offset"]), sent.run_id)
-
-    def standing(self, sent: UploadStatus, wait: float = 0) -> UploadStatus:
-        """Return how an upload stands now, or when it is verified.
-
-        Raises:
-            ServerError: the server refuses, or is away.
-        """
-        return _sent(self.ask("GET", f"/uploads/{sent.id}", params={"wait": wait}))
-
-    def complete(self, sent: UploadStatus, source: UploadSource, size: int, digest: str) -> UploadStatus:
-        """Say that all is there.
-
-        Raises:
-            ServerError: the server refuses, or is away.
-        """
-        told = {"digest": digest, "size": size, "run": dict(source.run), "labels": dict(source.labels)}
-        return _sent(self.ask("POST", f"/uploads/{sent.id}/complete", json=told))
-
-    def give_up(self, sent: UploadStatus) -> None:
-        """Have an upload forgotten.
-
-        Raises:
-            ServerError: the server refuses, or is away.
-        """
-        self.ask("DELETE", f"/uploads/{sent.id}")
-
-    # --- pulling --------------------------------------------------------------------------------------
-
-    def pull(self, name: str, recordings: Path, report: Report = lambda *_: None) -> Imported:
-        """Bring a run into a folder of runs, as `pull.pull` does; it says what is raised."""
-        return pull(self, name, recordings, report)
-
-
-class _Delivery:
-    """A file on its way, step by step; a step that fails is taken again after a while."""
-
-    def __init__(
-        self,
-        client: Client,
-        source: UploadSource,
-        size: int,
-        digest: str,
-        report: Report,
-        begun: UploadStatus | None,
-    ) -> None:
-        self._client, self._parcel, self._report = client, source, report
-        self._size, self._digest = size, digest
-        self._sent = begun
-        self._is_stale = begun is not None
-
-    def done(self) -> UploadStatus:
-        """Return the upload when it is stored or refused.
-
-        Raises:
-            ServerError: the server refuses the request, or was away for longer than the patience.
-        """
-        furthest, patience = -1, self._client.patience()
-        while True:
+    def _deliver(
+        self, source: UploadSource, size: int, digest: str, report: Report, upload: UploadStatus | None
+    ) -> UploadStatus:
+        """Return the upload of a file when it is stored or refused; a step that fails is retried."""
+        is_stale, furthest, backoff = upload is not None, -1, self.backoff()
+        while upload is None or upload.state not in ("stored", "refused"):
             try:
-                sent = self._sent = self._step()
-                self._is_stale = False
+                if upload is None:
+                    known = {"name": source.name, "run_id": source.run_id}
+                    known["content_digest"] = source.content_digest or ""
+                    upload = self.begin_upload(digest=digest, size=size, **known)
+                elif is_stale:
+                    upload = self.upload_status(upload)
+                elif upload.state == "verifying":
+                    upload = self.upload_status(upload, _WAIT_SECONDS)
+                    if upload.state == "receiving" and upload.problem:
+                        raise ServerUnavailable(f"{self.url}: {upload.problem}")
+                elif upload.offset > size:  # the file became shorter, as one does whose disk was full
+                    self.delete_upload(upload)
+                    upload = None
+                    continue
+                elif upload.offset < size:
+                    upload = self.append_upload(upload, source.path, size)
+                else:
+                    upload = self.complete_upload(upload, source, size, digest)
+                is_stale = False
             except ServerError as error:
-                if not _may_pass(error):
+                lost = error.status == HTTPStatus.NOT_FOUND
+                if not (lost or isinstance(error, ServerUnavailable) or error.status == HTTPStatus.CONFLICT):
                     raise
-                patience.wait(error)
-                self._sent = None if error.status == HTTPStatus.NOT_FOUND else self._sent
-                self._is_stale = True
+                backoff.wait(error)
+                upload, is_stale = None if lost else upload, True
                 continue
-            if sent.state in ("stored", "refused"):
-                return sent
-            if sent.offset > furthest:
-                furthest = sent.offset
-                patience.moved()
-            self._report(sent.offset, self._size)
+            if upload.offset > furthest:
+                furthest = upload.offset
+                backoff.reset()
+            report(upload.offset, size)
+        return upload
 
-    def _step(self) -> UploadStatus:
-        client, sent, source = self._client, self._sent, self._parcel
-        if sent is None:
-            return self._begun()
-        if self._is_stale:
-            return client.standing(sent)
-        if sent.state == "verifying":
-            return self._verified(client.standing(sent, _WAIT_SECONDS))
-        if sent.offset > self._size:  # the file became shorter, as one does whose disk was full
-            client.give_up(sent)
-            return self._begun()
-        if sent.offset < self._size:
-            return client.append(sent, source.path, self._size)
-        return client.complete(sent, source, self._size, self._digest)
+    # --- the steps of an upload -------------------------------------------------------------------------
 
-    def _begun(self) -> UploadStatus:
-        source = self._parcel
-        known = {"name": source.name, "run_id": source.run_id, "content_digest": source.content_digest}
-        return self._client.begin(digest=self._digest, size=self._size, **known)
+    def begin_upload(self, **announced: Any) -> UploadStatus:
+        """Begin an upload, or find the one of the same bytes; errors as for `request`."""
+        known = {key: value for key, value in announced.items() if value not in (None, "")}
+        return self._upload("POST", "/uploads", json=known)
 
-    def _verified(self, sent: UploadStatus) -> UploadStatus:
-        """Return an upload unless it could not be verified for now."""
-        if sent.state == "receiving" and sent.problem:
-            raise ServerUnavailable(f"{self._client.url}: {sent.problem}")
-        return sent
+    def append_upload(self, upload: UploadStatus, path: Path, end: int) -> UploadStatus:
+        """Send what an upload lacks of a file up to an offset, at most `PIECE` bytes; errors as for `request`."""
+        size = min(end - upload.offset, PIECE)
+        headers = {"Upload-Offset": str(upload.offset), "Content-Length": str(size)}
+        content = _read_pieces(path, upload.offset, size)
+        return self._upload("PATCH", f"/uploads/{upload.id}", content=content, headers=headers)
+
+    def upload_status(self, upload: UploadStatus, wait: float = 0) -> UploadStatus:
+        """Return the state of an upload; wait for its verification at most so many seconds."""
+        return self._upload("GET", f"/uploads/{upload.id}", params={"wait": wait})
+
+    def complete_upload(
+        self, upload: UploadStatus, source: UploadSource, size: int, digest: str
+    ) -> UploadStatus:
+        """Complete an upload, so that it is verified; errors as for `request`."""
+        completion = {"digest": digest, "size": size, "run": dict(source.run), "labels": dict(source.labels)}
+        return self._upload("POST", f"/uploads/{upload.id}/complete", json=completion)
+
+    def delete_upload(self, upload: UploadStatus) -> None:
+        """Delete an upload; errors as for `request`."""
+        self.request("DELETE", f"/uploads/{upload.id}")
+
+    def _upload(self, method: str, path: str, **options: Any) -> UploadStatus:
+        response = self.request_object(method, path, **options)
+        try:
+            keys = ("id", "state", "offset", "run_id", "already", "problem")
+            return UploadStatus(*(response[key] for key in keys))
+        except KeyError as error:
+            raise self.unexpected_response() from error
 
 
-def _may_pass(error: ServerError) -> bool:
-    return isinstance(error, ServerUnavailable) or error.status in (HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
-
-
-def _size_and_digest(path: Path) -> tuple[int, str]:
-    try:
-        return hash_of(path)
-    except OSError as error:
-        raise RunnerError(f"{path}: cannot be read ({error.strerror}).") from error
-
-
-def _pieces(stream: BinaryIO, size: int, path: Path) -> Iterator[bytes]:
-    """Yield so many bytes.
+def _read_pieces(path: Path, offset: int, size: int) -> Iterator[bytes]:
+    """Yield `size` bytes of a file.
 
     Raises:
         RunnerError: there are fewer.
     """
-    while size:
-        piece = stream.read(min(READ_BYTES, size))
-        if not piece:
-            raise RunnerError(f"{path}: became shorter while it was sent; try again.")
-        size -= len(piece)
-        yield piece
-
-
-def _sent(answer: httpx2.Response) -> UploadStatus:
-    """Return what an answer says of an upload.
-
-    Raises:
-        ServerError: it says something else.
-    """
-    try:
-        told = answer.json()
-        return UploadStatus(*(told[key] for key in ("id", "state", "offset", "run_id", "already", "problem")))
-    except (ValueError, KeyError, TypeError) as error:
-        raise ServerError(
-            f"{answer.url}: found another answer than a dualtaxi server gives; is the address right?"
-        ) from error
+    with path.open("rb") as stream:
+        stream.seek(offset)
+        while size:
+            piece = stream.read(min(READ_BYTES, size))
+            if not piece:
+                raise RunnerError(f"{path}: became shorter while it was sent; try again.")
+            size -= len(piece)
+            yield piece

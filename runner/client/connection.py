@@ -1,14 +1,16 @@
-"""A connection to a server: requests, streams, and what its errors mean."""
+"""A connection to a server: its address and token, requests, its errors, and retries while it is unavailable."""
 
 from __future__ import annotations
 
 import contextlib
+import os
+import time
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import urlsplit
 
-from runner.client.address import checked_url
-from runner.client.backoff import Backoff, ServerError, ServerUnavailable
+from runner.errors import RunnerError
 from runner.util.extras import require
 
 if TYPE_CHECKING:
@@ -16,11 +18,73 @@ if TYPE_CHECKING:
 
 API: Final = "/api/v1"
 READ_BYTES: Final = 1 << 20
+TOKEN_VARIABLE: Final = "DUALTAXI_TOKEN"
+TOKEN_FILE_VARIABLE: Final = "DUALTAXI_TOKEN_FILE"
+_MAX_TOKEN_FILE: Final = 4096
+FIRST_PAUSE: Final = 0.2
+LONGEST_PAUSE: Final = 5.0
+LOGGED_PAUSE: Final = 1.0
+"""The reason for a pause of this length is logged."""
 _TEMPORARY: Final = (408, 429, 500, 502, 503, 504, 507)
-"""Status codes after which the same request may succeed a little later."""
+"""Status codes after which the same request may succeed later."""
+_NOT_THE_REQUEST: Final = (408, 425, 429)
+"""Status codes of refusals that say nothing against the request: too slow, too early, too many."""
 
 Report = Callable[[int, int], object]
 """Called with the bytes transferred so far, and the bytes in total."""
+
+
+class ServerError(RunnerError):
+    """A server refuses a request; the message contains its own.
+
+    Args:
+        message: what is wrong.
+        status: the response's status; 0 if there was none.
+        retry_seconds: the time after which the server asks to try again; 0 if it does not.
+    """
+
+    exit_code = 1
+
+    def __init__(self, message: str, status: int = 0, retry_seconds: float = 0.0) -> None:
+        super().__init__(message)
+        if 400 <= status < 500 and status not in _NOT_THE_REQUEST:
+            self.exit_code = RunnerError.exit_code  # the request was wrong, not the server
+        self.status, self.retry_seconds = status, retry_seconds
+
+
+class ServerUnavailable(ServerError):
+    """A server does not respond, or cannot do what was requested at present."""
+
+
+class Backoff:
+    """Waits ever longer while a server is unavailable, at least as long as the server asks, up to a limit.
+
+    Args:
+        timeout: how long the server may be unavailable, in seconds.
+        log: called with the reason for a longer pause.
+    """
+
+    def __init__(self, timeout: float, log: Callable[[str], object] = lambda _: None) -> None:
+        self._timeout, self._log = timeout, log
+        self.reset()
+
+    def reset(self) -> None:
+        """Start again: the server is available."""
+        self._end: float | None = None
+        self._pause, self._logged = FIRST_PAUSE, ""
+
+    def wait(self, error: ServerError) -> None:
+        """Pause after an error; raise it when the time is up."""
+        now = time.monotonic()
+        self._end = now + self._timeout if self._end is None else self._end
+        pause = max(self._pause, error.retry_seconds)
+        if now + pause > self._end:
+            raise error
+        if pause >= LOGGED_PAUSE and str(error) != self._logged:
+            self._logged = str(error)
+            self._log(f"{error} Trying again, for {self._end - now:.0f} s at most.")
+        time.sleep(pause)
+        self._pause = min(2 * self._pause, LONGEST_PAUSE)
 
 
 class Connection:
@@ -29,8 +93,8 @@ class Connection:
     Args:
         url: its address, such as `http://localhost:8000`.
         token: the access token; `find_token()` looks where one is usually kept.
-        patience: how many seconds to keep retrying while the server is unavailable.
-        tell: called with a message while it waits.
+        retry_timeout: how many seconds to keep retrying while the server is unavailable.
+        log: called with a message while it waits.
 
     Raises:
         RunnerError: the address is not one of a server.
@@ -41,11 +105,11 @@ class Connection:
         self,
         url: str,
         token: str | None = None,
-        patience: float = 60.0,
-        tell: Callable[[str], object] = lambda _: None,
+        retry_timeout: float = 60.0,
+        log: Callable[[str], object] = lambda _: None,
     ) -> None:
         self.url = checked_url(url)
-        self._patience, self._tell = patience, tell
+        self._retry_timeout, self._log = retry_timeout, log
         require("httpx2", extra="service", purpose="speaking to a server")
         import httpx2
 
@@ -68,69 +132,120 @@ class Connection:
     def __exit__(self, *raised: object) -> None:
         self.close()
 
-    def patience(self) -> Backoff:
-        """Return what waits while the server is away."""
-        return Backoff(self._patience, self._tell)
+    def backoff(self) -> Backoff:
+        """Return a new backoff with the limits of this connection."""
+        return Backoff(self._retry_timeout, self._log)
 
-    def ask(self, method: str, path: str, **request: Any) -> httpx2.Response:
-        """Return the answer to a request, which is no error.
+    def request(self, method: str, path: str, **options: Any) -> httpx2.Response:
+        """Return the response to a request; `options` are those of HTTPX.
 
         Raises:
-            ServerError: the server refuses, or is away.
+            ServerError: the server refuses it.
+            ServerUnavailable: the server does not respond.
         """
-        try:
-            answer = self._http.request(method, path, **request)
-        except self._errors as error:
-            raise ServerUnavailable(
-                f"{self.url}: does not answer ({error or type(error).__name__})."
-            ) from error
-        self._check(answer)
-        return answer
+        with self._transport_errors():
+            response = self._http.request(method, path, **options)
+            self._check(response)
+            return response
 
-    def _check(self, answer: httpx2.Response) -> None:
-        if answer.is_success:
-            return
-        kind = ServerUnavailable if answer.status_code in _TEMPORARY else ServerError
-        retry = answer.headers.get("retry-after", "")
-        seconds = float(retry) if retry.isdecimal() else 0.0
-        raise kind(f"{self.url}: {_message(answer)}", answer.status_code, seconds)
+    def request_object(self, method: str, path: str, **options: Any) -> dict[str, Any]:
+        """Return the JSON object that a server responds with; errors as for `request`."""
+        response = self.request(method, path, **options)
+        try:
+            return dict(response.json())
+        except (ValueError, TypeError) as error:
+            raise self.unexpected_response() from error
 
     @contextlib.contextmanager
     def stream(self, path: str, headers: Mapping[str, str]) -> Iterator[httpx2.Response]:
-        """Give an answer that is read as it comes; errors as of `ask`, also while it is read."""
-        try:
-            with self._http.stream("GET", path, headers=dict(headers)) as answer:
-                if not answer.is_success:
-                    answer.read()
-                self._check(answer)
-                yield answer
-        except self._errors as error:
-            raise ServerUnavailable(
-                f"{self.url}: does not answer ({error or type(error).__name__})."
-            ) from error
+        """Yield a response that is read as it arrives; errors as for `request`, also while it is read."""
+        with (
+            self._transport_errors(),
+            self._http.stream("GET", path, headers=dict(headers)) as response,
+        ):
+            if not response.is_success:
+                response.read()
+            self._check(response)
+            yield response
 
     def download(self, path: str, tag: str, offset: int, size: int) -> Iterator[bytes]:
-        """Yield what a file has behind an offset.
+        """Yield the bytes of a file from an offset on.
 
         Args:
-            path: where it is.
+            path: its path.
             tag: its ETag.
             offset: where to begin.
-            size: its bytes, all of them.
+            size: its number of bytes, all of them.
 
         Raises:
-            ServerError: it is another file by now, or the server is away.
+            ServerError: it has changed, or the server is unavailable.
         """
         headers = {"Range": f"bytes={offset}-", "If-Range": tag, "Accept-Encoding": "identity"}
-        with self.stream(path, headers) as answer:
-            begins = f"bytes {offset}-{size - 1}/{size}"
-            if answer.headers.get("content-range") != begins:
-                raise ServerError(f"{self.url}: the recording has become another meanwhile; pull it again.")
-            yield from answer.iter_raw(READ_BYTES)
+        with self.stream(path, headers) as response:
+            if response.headers.get("content-range") != f"bytes {offset}-{size - 1}/{size}":
+                raise ServerError(f"{self.url}: the recording has changed meanwhile; pull it again.")
+            yield from response.iter_raw(READ_BYTES)
+
+    def unexpected_response(self) -> ServerError:
+        """Return the error that a response is not that of this service."""
+        return ServerError(f"{self.url}: found an unexpected response; is it a dualtaxi server?")
+
+    @contextlib.contextmanager
+    def _transport_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except self._errors as error:
+            raise ServerUnavailable(f"{self.url}: does not answer ({error or type(error).__name__}).") from error
+
+    def _check(self, response: httpx2.Response) -> None:
+        if response.is_success:
+            return
+        message = f"answers {response.status_code} {response.reason_phrase}; is it a dualtaxi server?"
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            message = str(response.json()["error"]["message"])
+        kind = ServerUnavailable if response.status_code in _TEMPORARY else ServerError
+        retry = response.headers.get("retry-after", "")
+        seconds = float(retry) if retry.isdecimal() else 0.0
+        raise kind(f"{self.url}: {message}", response.status_code, seconds)
 
 
-def _message(answer: httpx2.Response) -> str:
-    """Return what a server says is wrong."""
-    with contextlib.suppress(ValueError, KeyError, TypeError):
-        return str(answer.json()["error"]["message"])
-    return f"answers {answer.status_code} {answer.reason_phrase}; is it a dualtaxi server?"
+def checked_url(url: str) -> str:
+    """Return the address of a server, without a slash at its end.
+
+    Raises:
+        RunnerError: it is none.
+    """
+    parts = urlsplit(url)
+    if parts.scheme not in ("http", "https") or not parts.hostname or parts.query or parts.fragment:
+        raise RunnerError(f"server: found {url!r}, expected an address such as http://localhost:8000.")
+    if parts.username is not None or parts.password is not None:
+        raise RunnerError(
+            f"server: found a name or password in the address of {parts.hostname}, expected none: pass a token "
+            f"by --token, ${TOKEN_VARIABLE} or a file named by ${TOKEN_FILE_VARIABLE}."
+        )
+    return url.rstrip("/")
+
+
+def find_token(token: str | None = None, file: Path | None = None) -> str | None:
+    """Return the given token, or that in a file; else that of the environment variables; None if none is set.
+
+    Raises:
+        RunnerError: it is no token, or its file cannot be read.
+    """
+    if token is None and file is None:
+        token, named = os.environ.get(TOKEN_VARIABLE), os.environ.get(TOKEN_FILE_VARIABLE)
+        file = Path(named) if named else None
+    source = "token"
+    if not token:
+        if file is None:
+            return None
+        source = os.fspath(file)
+        try:
+            with file.open(encoding="utf-8") as stream:
+                token = stream.read(_MAX_TOKEN_FILE)
+        except (OSError, ValueError) as error:
+            raise RunnerError(f"{file}: cannot be read, expected a file with a token.") from error
+    token = token.strip()
+    if not token or not token.isascii() or not token.isprintable() or " " in token:
+        raise RunnerError(f"{source}: found no token, expected one line of letters and digits.")
+    return token

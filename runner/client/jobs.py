@@ -1,4 +1,4 @@
-"""Jobs on a server, as its clients see them: how they stand, and what happens to them."""
+"""Jobs on a server, as its clients see them."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.client.backoff import FIRST_PAUSE, ServerUnavailable
+from runner.client.connection import FIRST_PAUSE, ServerUnavailable
 from runner.errors import RunnerError
 
 if TYPE_CHECKING:
     from runner.client.connection import Connection
 
 OVER: Final = ("finished", "failed", "cancelled")
-"""The states of a job in which nothing more happens unless somebody asks for it."""
+"""The states of a job in which nothing more happens unless a user resumes it."""
 
 
 @dataclass(frozen=True)
@@ -28,73 +28,73 @@ class RemoteJob:
     name: str
     state: str
     runs: int
-    """How many it makes."""
+    """Its number of runs."""
     error: str
     progress: dict[str, Any] | None
-    """How far it is, if it is running and its worker has said so."""
+    """Its progress, if it is running and its worker has reported any."""
     begun: dict[int, str]
-    """Seed to the id of its run; empty for a sweep, whose runs have the tag sweep=NAME."""
+    """The ids of started runs by seed; empty for a sweep, whose runs have the tag sweep=NAME."""
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing more happens unless somebody asks for it."""
+        """Whether nothing more happens unless a user resumes it."""
         return self.state in OVER
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> RemoteJob:
-        """Return the job that a server tells of.
+    def from_json(cls, response: Mapping[str, Any]) -> RemoteJob:
+        """Return the job in a response.
 
         Raises:
-            RunnerError: it tells something else.
+            RunnerError: there is none in it.
         """
-        known = ("number", "kind", "name", "state", "runs", "error", "progress")
+        keys = ("number", "kind", "name", "state", "runs", "error", "progress")
         try:
-            begun = {int(run["seed"]): str(run["run_id"]) for run in told["begun"]}
-            return cls(**{key: told[key] for key in known}, begun=begun)
+            begun = {int(run["seed"]): str(run["run_id"]) for run in response["begun"]}
+            return cls(**{key: response[key] for key in keys}, begun=begun)
         except (KeyError, TypeError, ValueError) as error:
-            raise RunnerError("found another answer than a dualtaxi server gives of a job.") from error
+            raise RunnerError("found an unexpected response, expected a job; is it a dualtaxi server?") from error
 
 
 @dataclass(frozen=True)
 class JobEvent:
-    """Something that happened to a job: its kind (`state`, `run`, `log`, `progress`), and more of it."""
+    """An event of a job: its kind (`state`, `run`, `log`, `progress`) and data."""
 
     kind: str
     data: dict[str, Any]
-    place: str = ""
-    """What to come back to; empty for progress."""
+    id: str = ""
+    """Where to continue from; empty for progress."""
 
 
 def watch(client: Connection, number: int) -> Iterator[JobEvent]:
-    """Yield what happens to a job until it is over, whatever the connection does meanwhile.
+    """Yield the events of a job until it is over; continue when a connection breaks.
 
     Args:
-        client: of the server.
-        number: which job.
+        client: a connection to the server.
+        number: the job's number.
 
     Raises:
         ServerError: there is no such job, or the server refuses.
-        ServerUnavailable: the server did not answer for too long.
+        ServerUnavailable: the server did not respond in time.
     """
-    place, patience = "", client.patience()
+    last, backoff = "", client.backoff()
     while True:
         try:
-            with client.stream(f"/jobs/{number}/events", {"Last-Event-ID": place}) as answer:
-                patience.moved()
-                if answer.status_code == HTTPStatus.NO_CONTENT:
+            with client.stream(f"/jobs/{number}/events", {"Last-Event-ID": last}) as response:
+                backoff.reset()
+                if response.status_code == HTTPStatus.NO_CONTENT:
                     return
-                for happened in events_in(answer.iter_lines()):
-                    place = happened.place or place
-                    yield happened
-            if RemoteJob.of(client.ask("GET", f"/jobs/{number}").json()).is_over:
+                for event in parse_events(response.iter_lines()):
+                    last = event.id or last
+                    yield event
+            if RemoteJob.from_json(client.request_object("GET", f"/jobs/{number}")).is_over:
                 return
             time.sleep(FIRST_PAUSE)
         except ServerUnavailable as error:
-            patience.wait(error)
+            backoff.wait(error)
 
 
-def events_in(lines: Iterable[str]) -> Iterator[JobEvent]:
-    """Yield the server-sent events of a stream's lines; one that was cut off is left out."""
+def parse_events(lines: Iterable[str]) -> Iterator[JobEvent]:
+    """Yield the server-sent events of a stream's lines, apart from an incomplete last one."""
     fields: dict[str, str] = {}
     for line in lines:
         if line:

@@ -22,12 +22,12 @@ from runner.service.logs import LOG, AccessLog
 from runner.service.played import load_sweep_libraries
 from runner.service.problems import add_error_handlers, answers
 from runner.service.processes import ProcessPool
-from runner.service.receiving.model import Upload, UploadLimits
-from runner.service.receiving.uploads import Uploads
 from runner.service.response_cache import ResponseCache
 from runner.service.security import Tokens
 from runner.service.sessions import Sessions
 from runner.service.settings import Settings
+from runner.service.upload_model import Upload, UploadLimits
+from runner.service.uploads import Uploads
 from runner.sweep import sweeps_in
 from runner.util.version import __version__
 
@@ -120,7 +120,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
         app.state.uploads = stack.enter_context(
             Uploads(
                 settings.recordings[0],
-                UploadLimits(most_bytes=settings.limits.upload_bytes),
+                UploadLimits(max_bytes=settings.limits.upload_bytes),
                 lambda upload: _uploaded(app, upload),
             )
         )

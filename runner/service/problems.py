@@ -27,8 +27,8 @@ from runner.errors import (
 from runner.service.errors import Refused
 from runner.service.jobs.store import JobNotFound, JobStateConflict, QueueFull
 from runner.service.logs import LOG
-from runner.service.receiving.model import Conflict, TooLarge, TooMany
 from runner.service.settings import Settings
+from runner.service.upload_model import Conflict, TooLarge, TooMany
 from runner.util.processes import CallFailed
 
 _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {

@@ -32,6 +32,7 @@ PRELOADED: Final = (
     "runner.environments.loading",
     "runner.execution.estimate",
     "runner.execution.initial_tables",
+    "runner.runs.importing",
     "runner.service.computed",
 )
 """Modules that every process has from its start, where processes can be forked."""
