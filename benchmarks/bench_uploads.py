@@ -23,8 +23,7 @@ from blake3 import blake3
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
 from benchmarks.serving import Service, serving
-from runner.client.client import Client
-from runner.client.upload_source import UploadSource
+from runner.client.client import Client, UploadSource
 from runner.execution.verify import verify
 from runner.runs.resolve import find_run
 
@@ -58,7 +57,7 @@ def _large_recording(folder: Path, megabytes: int) -> UploadSource:
     sets = ["recording.compression=none", f"episodes={megabytes * 13}", "epsilon=1"]
     sets += ["evaluation.every=1000000", "snapshots.every=1000000"]
     run(run_command("quick", str(folder), *sets))
-    return UploadSource.of(find_run("@latest", folder))
+    return UploadSource.of_run(find_run("@latest", folder))
 
 
 def _speed(source: UploadSource, folder: Path, url: str, repetitions: int) -> list[Figure]:
@@ -69,15 +68,15 @@ def _speed(source: UploadSource, folder: Path, url: str, repetitions: int) -> li
             copied.append(size / seconds(lambda: _copy(source.path, folder / "copy")) / 1e6)
             (folder / "copy").unlink()
             begin = time.perf_counter()
-            sent = client.begin(size=size)
+            sent = client.begin_upload(size=size)
             while sent.offset < size:
-                sent = client.append(sent, source.path, size)
+                sent = client.append_upload(sent, source.path, size)
             last = number == repetitions - 1
-            sent = client.complete(sent, source, size, digest if last else "0" * 64)
+            sent = client.complete_upload(sent, source, size, digest if last else "0" * 64)
             uploaded.append(size / (time.perf_counter() - begin) / 1e6)
             begin = time.perf_counter()
             while sent.state == "verifying":
-                sent = client.standing(sent, 20)
+                sent = client.upload_status(sent, 20)
         assert sent.state == "stored", sent.problem
     checked = size / (time.perf_counter() - begin) / 1e6
     return [

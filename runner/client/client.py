@@ -50,12 +50,18 @@ class UploadSource:
             RunnerError: it is running, or in an archive only.
         """
         if run.status not in ("finished", "interrupted", "failed"):
-            raise RunnerError(f"run {run.run_id} is {run.status}; only one that is over and here can be pushed.")
+            raise RunnerError(
+                f"run {run.run_id} is {run.status}; only one that is over and here can be pushed."
+            )
         known = (run.recording, run.name, run.run_id, run.summary.content_digest)
         if run.stands_alone:  # an exported recording carries its own record of the run
             return cls(*known)
-        details = {"name": run.file.name, "status": run.status, "proof": run.file.proof}
-        details |= {"seconds": run.summary.seconds, "error": run.summary.error}
+        details: dict[str, str | float | None] = {
+            "name": run.file.name,
+            "status": run.status,
+            "proof": run.file.proof,
+        }
+        details |= {"proof": run.file.proof, "seconds": run.summary.seconds, "error": run.summary.error}
         labels = {"name": run.labels.name, "tags": list(run.labels.tags), "note": run.labels.note}
         return cls(*known, {key: value for key, value in details.items() if value is not None}, labels)
 
@@ -192,7 +198,7 @@ class Client(Connection):
         return self._upload("POST", "/uploads", json=known)
 
     def append_upload(self, upload: UploadStatus, path: Path, end: int) -> UploadStatus:
-        """Send what an upload lacks of a file up to an offset, at most `PIECE` bytes; errors as for `request`."""
+        """Send the next piece of a file, not beyond an offset; errors as for `request`."""
         size = min(end - upload.offset, PIECE)
         headers = {"Upload-Offset": str(upload.offset), "Content-Length": str(size)}
         content = _read_pieces(path, upload.offset, size)

@@ -1,4 +1,4 @@
-"""A connection to a server: its address and token, requests, its errors, and retries while it is unavailable."""
+"""A connection to a server: address and token, requests, errors, and retries while it is unavailable."""
 
 from __future__ import annotations
 
@@ -195,7 +195,9 @@ class Connection:
         try:
             yield
         except self._errors as error:
-            raise ServerUnavailable(f"{self.url}: does not answer ({error or type(error).__name__}).") from error
+            raise ServerUnavailable(
+                f"{self.url}: does not answer ({error or type(error).__name__})."
+            ) from error
 
     def _check(self, response: httpx2.Response) -> None:
         if response.is_success:
@@ -220,8 +222,8 @@ def checked_url(url: str) -> str:
         raise RunnerError(f"server: found {url!r}, expected an address such as http://localhost:8000.")
     if parts.username is not None or parts.password is not None:
         raise RunnerError(
-            f"server: found a name or password in the address of {parts.hostname}, expected none: pass a token "
-            f"by --token, ${TOKEN_VARIABLE} or a file named by ${TOKEN_FILE_VARIABLE}."
+            f"server: found a name or password in the address of {parts.hostname}, expected none: a token "
+            f"is given by --token, ${TOKEN_VARIABLE} or a file named by ${TOKEN_FILE_VARIABLE}."
         )
     return url.rstrip("/")
 

@@ -52,7 +52,9 @@ class RemoteJob:
             begun = {int(run["seed"]): str(run["run_id"]) for run in response["begun"]}
             return cls(**{key: response[key] for key in keys}, begun=begun)
         except (KeyError, TypeError, ValueError) as error:
-            raise RunnerError("found an unexpected response, expected a job; is it a dualtaxi server?") from error
+            raise RunnerError(
+                "found an unexpected response, expected a job; is it a dualtaxi server?"
+            ) from error
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The outbox: runs recorded here for a server, until it has stored them.
 
-    ~/.local/state/dualtaxi/outbox/k3v9m2xq/    a run as in any recordings folder
-    ~/.local/state/dualtaxi/outbox/k3v9m2xq/push.json    the server, and the upload that has begun
+~/.local/state/dualtaxi/outbox/k3v9m2xq/    a run as in any recordings folder
+~/.local/state/dualtaxi/outbox/k3v9m2xq/push.json    the server, and the upload that has begun
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ import numpy as np
 from blake3 import blake3
 from numpy.typing import NDArray
 
-from runner.client.outbox import Follower, connected, is_server, outbox_folder
+from runner.client.outbox import Follower, connect, is_server, outbox_folder
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError, kept_message
 from runner.loops import flushing
 from runner.loops.options import ALL_INFO, Plan
@@ -128,7 +128,7 @@ class Loop(Generic[R]):
         rows: Callable[[Recorder, Described, str, Callable[[Any], None]], R],
     ) -> None:
         self._config = plan.mapping(described)
-        client = connected(str(plan.recordings)) if is_server(plan.recordings) else None
+        client = connect(str(plan.recordings)) if is_server(plan.recordings) else None
         folder = outbox_folder() if client else recordings_folder(plan.recordings)
         self._started = time.monotonic()
         self._make_rows = rows

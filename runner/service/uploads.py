@@ -284,8 +284,8 @@ class Uploads:
         owners = [upload.owner for upload in self.all() if upload.state in ("receiving", "verifying")]
         if owners.count(owner) >= limits.max_open_each:
             raise TooMany(
-                f"{limits.max_open_each:,} of your uploads are open, the maximum of a client; complete some or "
-                "delete them."
+                f"{limits.max_open_each:,} of your uploads are open, the maximum of a client; complete or "
+                "delete some."
             )
         if len(owners) >= limits.max_open:
             raise TooMany(f"{limits.max_open:,} uploads are open; try again when some are done.")

@@ -18,10 +18,9 @@ from runner.errors import ExitCode, RunnerError
 from runner.util.humanize import UNKNOWN, size
 
 if TYPE_CHECKING:
-    from runner.client.client import Client
+    from runner.client.client import Client, UploadStatus
     from runner.client.connection import Report
     from runner.client.jobs import JobEvent, RemoteJob
-    from runner.client.upload_source import UploadStatus
     from runner.runs.run import Run
 
     Push = Callable[[Report], tuple[UploadStatus, str, int]]
@@ -46,7 +45,7 @@ class Server:
         url = self.url or default_url
         if not url:
             raise click.UsageError("missing option '--server', such as --server http://localhost:8000.")
-        return Client(url, self.token, tell=say)
+        return Client(url, self.token, log=say)
 
 
 def _server_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -74,7 +73,7 @@ def _server_options(command: Callable[..., Any]) -> Callable[..., Any]:
     def with_server(
         *args: Any, url: str | None, token: str | None, token_file: Path | None, **rest: Any
     ) -> Any:
-        from runner.client.address import find_token
+        from runner.client.connection import find_token
 
         return command(*args, server=Server(url, find_token(token, token_file)), **rest)
 
@@ -149,10 +148,10 @@ def push(
 
 def _runs(names: tuple[str, ...], server: Server, recordings: Path | None) -> Iterator[tuple[str, Push]]:
     """Yield the named runs, and the function that uploads each."""
-    from runner.client.upload_source import UploadSource
+    from runner.client.client import UploadSource
 
     def push_run(name: str, report: Report) -> tuple[UploadStatus, str, int]:
-        source = UploadSource.of(find_recorded(name, recordings))
+        source = UploadSource.of_run(find_recorded(name, recordings))
         return client.push(source, report), source.name, source.path.stat().st_size
 
     with server.client() as client:

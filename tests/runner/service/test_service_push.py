@@ -26,11 +26,9 @@ from served import Served
 import runner
 from runner.cli import cli
 from runner.client import client as client_module
-from runner.client.address import checked_url, find_token
-from runner.client.backoff import Backoff, ServerError, ServerUnavailable
-from runner.client.client import Client
+from runner.client.client import Client, UploadSource, UploadStatus
+from runner.client.connection import Backoff, ServerError, ServerUnavailable, checked_url, find_token
 from runner.client.outbox import outbox_folder
-from runner.client.upload_source import UploadSource, UploadStatus
 from runner.export.mcap import export_mcap
 from runner.recording.labels import change_labels
 from runner.runs.resolve import find_run
@@ -167,20 +165,20 @@ def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recor
 
 def test_what_is_waited_for_is_told_and_for_as_long_as_the_server_says(monkeypatch):
     slept, told = [], []
-    monkeypatch.setattr("runner.client.backoff.time.sleep", slept.append)
+    monkeypatch.setattr("runner.client.connection.time.sleep", slept.append)
     locked = ServerUnavailable("token: too many wrong ones; try again in 40 s.", 429, 40)
-    patience = Backoff(60, told.append)
-    patience.wait(locked)
+    backoff = Backoff(60, told.append)
+    backoff.wait(locked)
     assert (slept, told) == ([40], [f"{locked} Trying again, for 60 s at most."])
     with pytest.raises(ServerUnavailable, match="too many"):
         Backoff(30, told.append).wait(locked)
     slept.clear(), told.clear()
-    patience.moved()
+    backoff.reset()
     for _ in range(3):
-        patience.wait(ServerUnavailable("does not answer"))
+        backoff.wait(ServerUnavailable("does not answer"))
     assert (slept, told) == ([0.2, 0.4, 0.8], []), "what is over at once is not told"
     for _ in range(2):
-        patience.wait(ServerUnavailable("does not answer"))
+        backoff.wait(ServerUnavailable("does not answer"))
     assert (slept[3:], len(told)) == ([1.6, 3.2], 1)
 
 
@@ -189,7 +187,7 @@ def test_how_long_a_server_has_one_wait_is_heard():
     with Client("http://localhost:8000") as client:
         client._http = httpx2.Client(transport=httpx2.MockTransport(lambda _: answer), base_url=client.url)
         with pytest.raises(ServerUnavailable, match="too many") as raised:
-            client.ask("GET", "/runs")
+            client.request("GET", "/runs")
     assert (raised.value.status, raised.value.retry_seconds) == (429, 40)
 
 
@@ -219,7 +217,7 @@ def test_a_server_killed_in_the_middle_of_twenty_uploads_loses_none(own_server, 
     some, begun = threading.Semaphore(0), time.monotonic()
 
     def push(source):
-        with Client(own_server.url, patience=120) as client:
+        with Client(own_server.url, retry_timeout=120) as client:
             return client.push(source, lambda done, total: some.release() if 0 < done < total else None)
 
     with ThreadPoolExecutor(20) as pool:
@@ -244,7 +242,7 @@ def test_a_server_killed_in_the_middle_of_twenty_uploads_loses_none(own_server, 
 def test_a_connection_that_lies_or_is_cut_leaves_what_came(server, run):
     data = run.recording.read_bytes()
     with Client(server.url) as client:
-        sent = client.begin(digest=blake3(data).hexdigest() if data else None, size=len(data) + 5)
+        sent = client.begin_upload(digest=blake3(data).hexdigest() if data else None, size=len(data) + 5)
         head = (
             f"PATCH /api/v1/uploads/{sent.id} HTTP/1.1\r\nHost: 127.0.0.1\r\nOrigin: http://127.0.0.1\r\n"
             f"Upload-Offset: 0\r\nContent-Length: {len(data)}\r\n\r\n"
@@ -253,15 +251,15 @@ def test_a_connection_that_lies_or_is_cut_leaves_what_came(server, run):
             connection.sendall(head.encode() + data[:1000])
             time.sleep(0.2)
             with pytest.raises(ServerError, match="another request") as refused:
-                client.append(sent, run.recording, len(data))
+                client.append_upload(sent, run.recording, len(data))
             assert refused.value.status == 409
-        now = until(lambda now: now.offset, lambda: client.standing(sent))
+        now = until(lambda now: now.offset, lambda: client.upload_status(sent))
         assert now.offset == 1000
         with pytest.raises(ServerError, match="expected the"):
-            client.complete(now, UploadSource(run.recording), len(data), "0" * 64)
-        client.give_up(now)
+            client.complete_upload(now, UploadSource(run.recording), len(data), "0" * 64)
+        client.delete_upload(now)
         with pytest.raises(ServerError, match="no such upload"):
-            client.standing(now)
+            client.upload_status(now)
 
 
 def test_a_pull_goes_on_where_it_was_cut_off(server, recordings, tmp_path, monkeypatch):
@@ -335,7 +333,7 @@ def test_a_loop_recorded_for_a_server_is_there_at_its_end(server, outbox):
         assert [run.run_id for run in list_runs(outbox)] == [rec.run.run_id]
         time.sleep(1.5)
         with Client(server.url) as client:
-            uploads = client.ask("GET", "/uploads", params={"state": "receiving"}).json()["uploads"]
+            uploads = client.request("GET", "/uploads", params={"state": "receiving"}).json()["uploads"]
         assert [(entry["run_id"], entry["offset"] > 0) for entry in uploads] == [(rec.run.run_id, True)]
         drive(rec, 2_000)
     stored = find_run(rec.run.run_id, server.recordings)
@@ -408,8 +406,8 @@ def test_what_is_no_server_is_refused_before_anything_is_recorded(outbox):
 
 def test_an_upload_begun_with_other_bytes_is_sent_anew(server, run):
     with Client(server.url) as client:
-        begun = client.begin(name="stale")
-        wrong = client.append(begun, run.recording, 5_000)
+        begun = client.begin_upload(name="stale")
+        wrong = client.append_upload(begun, run.recording, 5_000)
         assert wrong.offset == 5_000
         other = list_runs(run.folder.parent)[0 if list_runs(run.folder.parent)[0].name == "second" else 1]
         sent = client.push(other, begun=UploadStatus(begun.id, "receiving", 0))

@@ -23,18 +23,17 @@ from runner.export.mcap import export_mcap
 from runner.recording.labels import Labels, change_labels
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
-from runner.service.receiving.folder import FOLDER
-from runner.service.receiving.model import (
+from runner.service.upload_model import (
     Announcement,
     Completion,
     Conflict,
-    Told,
-    ToldLabels,
+    RunDetails,
+    RunLabels,
     TooLarge,
     TooMany,
     UploadLimits,
 )
-from runner.service.receiving.uploads import Uploads
+from runner.service.uploads import FOLDER, Uploads
 from tests.runner.recording.making import TAXIS, experiment, make_run, stopping_after, with_id
 from tests.waiting import until
 
@@ -49,7 +48,7 @@ def uploads(tmp_path):
 
 
 def completion(data: bytes, **told) -> Completion:
-    return Completion(digest=blake3(data).hexdigest(), size=len(data), run=Told(**told))
+    return Completion(digest=blake3(data).hexdigest(), size=len(data), run=RunDetails(**told))
 
 
 def announced(data: bytes, **more) -> Announcement:
@@ -59,8 +58,8 @@ def announced(data: bytes, **more) -> Announcement:
 def send(uploads, data, owner=ANNA, whole=None, **told):
     """Upload bytes in one go, and return the upload when its verification is over."""
     upload, _ = uploads.begin(owner, announced(data))
-    with uploads.appending(upload.upload_id, owner, 0, len(data)) as sink:
-        sink.write(data)
+    with uploads.receive(upload.upload_id, owner, 0, len(data)) as write:
+        write(data)
     return over(uploads, uploads.complete(upload.upload_id, owner, whole or completion(data, **told)))
 
 
@@ -80,8 +79,8 @@ def test_a_recording_becomes_the_run_it_is(uploads, taxis, tmp_path):
     assert new
     for offset in range(0, len(data), 10_000):
         piece = data[offset : offset + 10_000]
-        with uploads.appending(upload.upload_id, ANNA, offset, len(piece)) as sink:
-            sink.write(piece)
+        with uploads.receive(upload.upload_id, ANNA, offset, len(piece)) as write:
+            write(piece)
     assert uploads.offset(upload) == len(data)
     assert list_runs(tmp_path / "runs") == []
     seconds = taxis.summary["seconds"]
@@ -132,9 +131,9 @@ def test_what_was_received_outlives_the_server(lake, tmp_path):
     upload, _ = first.begin(ANNA, announced(data))
     with (
         contextlib.suppress(ConnectionError),
-        first.appending(upload.upload_id, ANNA, 0, len(data)) as sink,
+        first.receive(upload.upload_id, ANNA, 0, len(data)) as write,
     ):
-        sink.write(data[:5_000])
+        write(data[:5_000])
         raise ConnectionError
     with pytest.raises(RunnerError, match="is served by another process already"):
         Uploads(tmp_path / "runs")
@@ -142,8 +141,8 @@ def test_what_was_received_outlives_the_server(lake, tmp_path):
     second = Uploads(tmp_path / "runs")
     known, new = second.begin(ANNA, announced(data))
     assert (known, new, second.offset(known)) == (upload, False, 5_000)
-    with second.appending(upload.upload_id, ANNA, 5_000, len(data) - 5_000) as sink:
-        sink.write(data[5_000:])
+    with second.receive(upload.upload_id, ANNA, 5_000, len(data) - 5_000) as write:
+        write(data[5_000:])
     second._verifier.stop()  # killed while it verifies
     second.complete(upload.upload_id, ANNA, completion(data))
     second.close()
@@ -197,8 +196,8 @@ def test_what_is_no_sound_run_is_refused_and_leaves_nothing(uploads, lake, tmp_p
 def test_bytes_that_changed_on_their_way_are_refused(uploads, lake):
     data = lake.recording.read_bytes()
     upload, _ = uploads.begin(ANNA, announced(data))
-    with uploads.appending(upload.upload_id, ANNA, 0, None) as sink:
-        sink.write(altered(data))
+    with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
+        write(altered(data))
     refused = over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data)))
     assert "another digest" in refused.problem
 
@@ -237,7 +236,7 @@ def test_a_run_that_was_gone_on_with_takes_the_place_of_its_beginning(uploads, s
     change_labels(there, lambda _: Labels("mine", ("here",), "seen"))
     data = whole.recording.read_bytes()
     more = completion(data, status="finished").model_copy(
-        update={"labels": ToldLabels(name="yours", tags=["there"], note="other")}
+        update={"labels": RunLabels(name="yours", tags=["there"], note="other")}
     )
     stored = send(uploads, data, whole=more)
     assert (stored.state, stored.problem, stored.already) == ("stored", "", False)
@@ -285,42 +284,42 @@ def test_a_client_that_lies_or_errs_gets_no_further(uploads, lake):
     upload, _ = uploads.begin(ANNA, announced(data))
     with pytest.raises(RunNotFound):
         uploads.get(upload.upload_id, BEN)
-    with pytest.raises(RunNotFound), uploads.appending("../" + upload.upload_id, ANNA, 0, 1):
+    with pytest.raises(RunNotFound), uploads.receive("../" + upload.upload_id, ANNA, 0, 1):
         pass
-    with pytest.raises(Conflict, match="expected 0"), uploads.appending(upload.upload_id, ANNA, 7, 1):
+    with pytest.raises(Conflict, match="expected 0"), uploads.receive(upload.upload_id, ANNA, 7, 1):
         pass
-    with pytest.raises(TooLarge), uploads.appending(upload.upload_id, ANNA, 0, len(data) + 1):
+    with pytest.raises(TooLarge), uploads.receive(upload.upload_id, ANNA, 0, len(data) + 1):
         pass
-    with uploads.appending(upload.upload_id, ANNA, 0, None) as sink:
+    with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
         with pytest.raises(TooLarge):
-            sink.write(data + b"more")
-        with pytest.raises(Conflict), uploads.appending(upload.upload_id, ANNA, 0, 1):
+            write(data + b"more")
+        with pytest.raises(Conflict), uploads.receive(upload.upload_id, ANNA, 0, 1):
             pass
         with pytest.raises(Conflict):
             uploads.complete(upload.upload_id, ANNA, completion(data))
         with pytest.raises(Conflict):
-            uploads.give_up(upload.upload_id, ANNA)
+            uploads.delete(upload.upload_id, ANNA)
     assert uploads.offset(upload) == 0
     with pytest.raises(Conflict, match="found 0 bytes"):
         uploads.complete(upload.upload_id, ANNA, completion(data))
-    with uploads.appending(upload.upload_id, ANNA, 0, None) as sink:
-        sink.write(data)
+    with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
+        write(data)
     other = completion(data).model_copy(update={"digest": "0" * 64})
     with pytest.raises(Conflict, match="another digest"):
         uploads.complete(upload.upload_id, ANNA, other)
 
 
 def test_what_is_too_much_is_not_taken(lake, tmp_path):
-    uploads = Uploads(tmp_path / "runs", UploadLimits(most_bytes=1_000, most_open=2))
+    uploads = Uploads(tmp_path / "runs", UploadLimits(max_bytes=1_000, max_open=2))
     with pytest.raises(TooLarge, match="1,000"):
         uploads.begin(ANNA, Announcement(size=1_001))
     first, _ = uploads.begin(ANNA, Announcement())
-    with uploads.appending(first.upload_id, ANNA, 0, None) as sink, pytest.raises(TooLarge):
-        sink.write(bytes(1_001))
+    with uploads.receive(first.upload_id, ANNA, 0, None) as write, pytest.raises(TooLarge):
+        write(bytes(1_001))
     uploads.begin(ANNA, Announcement())
     with pytest.raises(TooMany):
         uploads.begin(BEN, Announcement())
-    uploads.give_up(first.upload_id, ANNA)
+    uploads.delete(first.upload_id, ANNA)
     uploads.begin(BEN, Announcement())
     uploads.close()
     full = Uploads(tmp_path / "full", UploadLimits(spare_bytes=1 << 60))
@@ -341,16 +340,16 @@ def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
         room[0] -= written
         return written
 
-    monkeypatch.setattr("runner.service.receiving.appending.os.write", full)
+    monkeypatch.setattr("runner.service.uploads.os.write", full)
     with (
         pytest.raises(StorageError, match="No space left"),
-        uploads.appending(upload.upload_id, ANNA, 0, None) as sink,
+        uploads.receive(upload.upload_id, ANNA, 0, None) as write,
     ):
-        sink.write(data)
+        write(data)
     monkeypatch.undo()
     assert uploads.offset(upload) == 6_000
-    with uploads.appending(upload.upload_id, ANNA, 6_000, None) as sink:
-        sink.write(data[6_000:])
+    with uploads.receive(upload.upload_id, ANNA, 6_000, None) as write:
+        write(data[6_000:])
     assert over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data))).state == "stored"
 
 
@@ -359,20 +358,18 @@ def test_what_is_left_free_stays_free_also_of_bytes_whose_number_is_not_said(tmp
     upload, _ = uploads.begin(ANNA, Announcement())
     free = iter((7_000, 7_000, 6_000))
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(
-        "runner.service.receiving.folder.shutil.disk_usage", lambda _: usage._replace(free=next(free))
-    )
-    with uploads.appending(upload.upload_id, ANNA, 0, None) as sink:
-        sink.write(bytes(2_000))
+    monkeypatch.setattr("runner.service.uploads.shutil.disk_usage", lambda _: usage._replace(free=next(free)))
+    with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
+        write(bytes(2_000))
         with pytest.raises(StorageError, match="room for 1,000 bytes"):
-            sink.write(bytes(2_000))
+            write(bytes(2_000))
     assert uploads.offset(upload) == 2_000
     uploads.close()
 
 
 def test_of_what_is_over_only_so_much_is_remembered(lake, tmp_path):
     shutil.copytree(lake.folder, tmp_path / "runs" / lake.run_id)
-    uploads = Uploads(tmp_path / "runs", UploadLimits(most_open=3))
+    uploads = Uploads(tmp_path / "runs", UploadLimits(max_open=3))
     for number in range(9):
         known = {"run_id": lake.run_id, "content_digest": lake.summary["content_digest"]}
         upload, _ = uploads.begin(ANNA, Announcement(digest=f"{number:064}", **known))
@@ -409,9 +406,9 @@ def test_removing_an_upload_keeps_no_other_waiting(uploads, lake, monkeypatch):
     data, go_on = lake.recording.read_bytes(), threading.Event()
     given_up, _ = uploads.begin(ANNA, Announcement(name="given up"))
     upload, _ = uploads.begin(ANNA, announced(data))
-    monkeypatch.setattr("runner.service.receiving.folder.shutil.rmtree", lambda *_, **__: go_on.wait(60))
+    monkeypatch.setattr("runner.service.uploads.shutil.rmtree", lambda *_, **__: go_on.wait(60))
     with ThreadPoolExecutor(2) as threads:
-        removal = threads.submit(uploads.give_up, given_up.upload_id, ANNA)
+        removal = threads.submit(uploads.delete, given_up.upload_id, ANNA)
         try:
             until(lambda known: len(known) == 1, uploads.all)
             assert threads.submit(uploads.get, upload.upload_id, ANNA).result(20) == upload
@@ -432,7 +429,7 @@ def test_an_upload_whose_verification_fails_unexpectedly_can_be_completed_again(
 
 
 def test_one_client_cannot_hold_all_uploads(tmp_path):
-    uploads = Uploads(tmp_path / "runs", UploadLimits(most_open=3, most_open_each=2))
+    uploads = Uploads(tmp_path / "runs", UploadLimits(max_open=3, max_open_each=2))
     for _ in range(2):
         uploads.begin(ANNA, Announcement())
     with pytest.raises(TooMany, match="2 of your uploads are open"):

@@ -9,9 +9,9 @@ import pytest
 from served import Served
 from submitted import ENDLESS, ICY
 
-from runner.client.backoff import ServerError
 from runner.client.client import Client
-from runner.client.jobs import JobEvent, RemoteJob, events_in
+from runner.client.connection import ServerError
+from runner.client.jobs import JobEvent, RemoteJob, parse_events
 from runner.errors import RunnerError
 from runner.runs.run import list_runs
 
@@ -35,14 +35,14 @@ def test_a_watcher_sees_everything_once_though_the_server_is_killed_meanwhile(tm
         server.start()
         watcher.join(60)
         assert not watcher.is_alive()
-    states = [happened.data["state"] for happened in seen if happened.kind == "state"]
+    states = [event.data["state"] for event in seen if event.kind == "state"]
     assert states[0] == "queued"
     assert states.count("finished") == 1
     assert states[-1] == "finished"
-    said = [happened.data["text"] for happened in seen if happened.kind == "log"]
+    said = [event.data["text"] for event in seen if event.kind == "log"]
     told = [text for text in said if text.startswith("evaluation")]
     assert len(told) == len(set(told)) > 3
-    places = [int(happened.place) for happened in seen if happened.place]
+    places = [int(event.id) for event in seen if event.id]
     assert places == sorted(set(places))
     assert seen[-2].kind == "progress" or seen[-1].kind == "state"
 
@@ -55,7 +55,7 @@ def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
         assert [job.number for job in client.jobs()] == [second.number, first.number]
         assert client.cancel(first.number).is_over
         *_, last = client.watch(second.number)
-        assert last == JobEvent("state", last.data, last.place)
+        assert last == JobEvent("state", last.data, last.id)
         assert last.data["state"] == "finished"
         done = client.job(second.number)
         assert sorted(done.begun.values()) == sorted(
@@ -71,9 +71,9 @@ def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
 def test_events_are_read_and_one_that_was_cut_off_is_left_out():
     lines = ["retry: 1000", "", ": still here", "", "id: 7", "event: log", 'data: {"text": "a: b"}', ""]
     cut_off = ["id: 9", "event: state", 'data: {"sta']
-    assert list(events_in([*lines, *cut_off])) == [JobEvent("log", {"text": "a: b"}, "7")]
+    assert list(parse_events([*lines, *cut_off])) == [JobEvent("log", {"text": "a: b"}, "7")]
 
 
-def test_another_answer_than_that_of_a_job_is_told():
-    with pytest.raises(RunnerError, match="found another answer"):
-        RemoteJob.of({"number": 1})
+def test_a_response_without_a_job_is_reported():
+    with pytest.raises(RunnerError, match="found an unexpected response"):
+        RemoteJob.from_json({"number": 1})
