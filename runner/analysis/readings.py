@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.frames import evaluation_records, training_records
+from runner.analysis.evaluations import evaluation_records, training_records
 from runner.analysis.series import LOGGED, Readings, RunSeries
 from runner.environments.naming import spoken
 from runner.errors import RecordingError

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from runner.analysis.frames import evaluation_records, loop_summary, training_records
+from runner.analysis.evaluations import evaluation_records, loop_summary, training_records
 from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run

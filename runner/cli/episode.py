@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from runner.analysis.outcomes import events_of
 from runner.drawing.text import Drawing
+from runner.environments.mdp import events_of
 from runner.environments.naming import actions_in_words, event_in_words, states_in_words
 from runner.util.humanize import number
 

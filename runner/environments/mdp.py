@@ -19,6 +19,8 @@ MAX_EVENTS = 31
 MAX_AGENTS = 31
 MAX_ARRAYS_BYTES = 128 << 20
 """What all arrays of an environment may take, so that a recording of it can be read again."""
+_BATCH_OUTCOMES = 1 << 20
+"""Outcomes that are compared at a time, so that memory grows with neither steps nor outcomes."""
 _DTYPES = {
     "next_state": np.int32,
     "probability": np.float64,
@@ -144,6 +146,36 @@ def step_counts(
         names = np.arange(len(mdp.event_names), dtype=np.uint32)
         counts[:, :-1] = (events[:, np.newaxis] >> names) & 1
     return counts, found & ~paid.any(axis=1)
+
+
+def events_of(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
+    """Return the events of recorded steps, a bit mask each; none where the table has no such outcome.
+
+    A record holds where a step led, not which outcome it took: that is one with its next state; of several
+    one that ends as it did, and that pays what it did.
+    """
+    found = np.zeros(len(steps), np.uint32)
+    if mdp.event_names:
+        batch = max(1, _BATCH_OUTCOMES // mdp.next_state.shape[2])
+        for start in range(0, len(steps), batch):
+            some = slice(start, start + batch)
+            found[some] = _events(mdp, steps[some])
+    return found
+
+
+def _events(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
+    state, action = steps["state"].astype(np.int64), steps["action"].astype(np.int64)
+    likely = mdp.outcomes_to(state, action, steps["next_state"])
+    outcome = np.zeros(len(steps), np.int64)
+    if likely.shape[1] > 1:
+        ends = mdp.terminated[state, action] == steps["terminated"][:, np.newaxis]
+        rewards = mdp.rewards[state, action].sum(axis=-1)
+        learners = steps["rewards"].shape[1]
+        if mdp.rewards.shape[-1] == 1 and learners > 1:  # every learner was paid the shared reward
+            rewards = rewards * learners
+        pays = np.isclose(rewards, steps["rewards"].sum(axis=-1)[:, np.newaxis])
+        outcome = np.argmax(likely * 4 + (likely & ends) * 2 + (likely & pays), axis=1)
+    return np.where(likely.any(axis=1), mdp.events[state, action, outcome], np.uint32(0))
 
 
 def from_parts(description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Mdp:

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.frames import RECENT_EPISODES
+from runner.analysis.evaluations import RECENT_EPISODES
 from runner.environments.mdp import Mdp
 from runner.recording import schema
 from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_usable

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.frames import Phase, episode_columns, evaluation_records, step_columns, training_records
+from runner.analysis.evaluations import evaluation_records, training_records
+from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.errors import RunnerError
 from runner.recording.reader import open_recording
 from runner.service.errors import Refused

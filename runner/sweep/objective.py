@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from runner.analysis.compare.statistics import NEVER
-from runner.analysis.frames import evaluation_record
+from runner.analysis.evaluations import evaluation_record
 from runner.analysis.readings import evaluation_readings, exact_readings, training_readings
 from runner.analysis.series import first_crossing, mean_height
 from runner.errors import RunnerError, nearest

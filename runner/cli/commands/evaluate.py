@@ -92,7 +92,7 @@ def command(
 
 
 def _summarise(run: Run, origin: dict[str, object]) -> None:
-    from runner.analysis.frames import evaluation_records
+    from runner.analysis.evaluations import evaluation_records
     from runner.cli.evaluations import evaluation_table
     from runner.recording.reader import open_recording
 

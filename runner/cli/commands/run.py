@@ -231,7 +231,7 @@ def _someone_answers() -> bool:
 
 def _summarise(run: Run, blank: bool) -> None:
     """Print what came of a run and what to type next."""
-    from runner.analysis.frames import evaluation_records
+    from runner.analysis.evaluations import evaluation_records
     from runner.cli.evaluations import evaluation_table, spread
     from runner.cli.output import console, draw, facts
     from runner.recording.reader import open_recording

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_after, evaluations_of
-from runner.analysis.outcomes import events_of
-from runner.environments.mdp import Mdp
+from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import (
     action_names,
     actions_in_words,

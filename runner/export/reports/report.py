@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from runner.analysis.frames import evaluation_records, evaluation_summary
+from runner.analysis.evaluations import evaluation_records, evaluation_summary
 from runner.analysis.groups import groups_of
 from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries, values_left_out

@@ -12,9 +12,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from runner.analysis.outcomes import events_of
 from runner.drawing import palette
-from runner.environments.mdp import Mdp
+from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import events_in_words, spoken, states_in_words
 from runner.export.rerun.columns import Batch, Sender, instances, place, rgba, scalars, strips, texts
 from runner.export.rerun.labels import Labels

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from runner.analysis.frames import loop_summary
+from runner.analysis.evaluations import loop_summary
 from runner.errors import RecordingError
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics

@@ -14,7 +14,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.frames import evaluation_record, evaluation_records
+from runner.analysis.evaluations import evaluation_record, evaluation_records
 from runner.environments.naming import event_in_words
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema

@@ -8,6 +8,7 @@ import pytest
 
 import runner
 from runner.analysis import frames
+from runner.analysis.evaluations import evaluation_records
 from runner.errors import MissingExtra, RecordingError
 from tests.runner.loops.making import recorded
 
@@ -107,7 +108,7 @@ def test_where_success_is_unknown(corridor_run):
     assert frames.evaluations(corridor_run)["success_percent"].isna().all()
     assert {"return.agent"} <= set(frames.episodes(corridor_run))
     with runner.open_recording(corridor_run.recording) as recording:
-        (first, *_) = frames.evaluation_records(recording)
+        (first, *_) = evaluation_records(recording)
     assert (first["success_percent"], first["successes"], first["events"]) == (None, None, {})
 
 
@@ -132,4 +133,4 @@ def test_without_pandas_it_says_which_extra(run, monkeypatch):
         with pytest.raises(MissingExtra, match=r"pip install .*\[frames\]"):
             make(run)
     with runner.open_recording(run.recording) as recording:
-        assert len(frames.evaluation_records(recording)) == 4
+        assert len(evaluation_records(recording)) == 4

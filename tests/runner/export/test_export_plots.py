@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from runner.analysis.frames import evaluation_records
+from runner.analysis.evaluations import evaluation_records
 from runner.analysis.groups import groups_of
 from runner.analysis.readings import read_series
 from runner.analysis.series import RunSeries

@@ -9,8 +9,8 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from runner.analysis.outcomes import events_of
 from runner.drawing.palette import COMPARED
+from runner.environments.mdp import events_of
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.layout import PLOTS
 from runner.export.rerun.scene import own_actions, scene_of

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from starlette.testclient import TestClient
 
 import runner
-from runner.analysis import frames
+from runner.analysis.evaluations import loop_summary
 from runner.analysis.readings import read_series
 from runner.cli import cli
 from runner.export.contents import shortcomings
@@ -99,11 +99,11 @@ def test_ls_and_show_have_the_returns_of_a_loop_and_what_it_logged(folder, name)
 def test_what_a_loop_says_of_itself_at_its_end_is_what_its_recording_holds(folder, name):
     run = runner.find_run(name, folder)
     with open_recording(run.recording) as recording:
-        counted = frames.loop_summary(recording)
+        counted = loop_summary(recording)
         assert counted["last_evaluation"] == pytest.approx(recording.result["last_evaluation"])
         assert counted["recent_training"] == pytest.approx(recording.result["recent_training"])
         recording.result = Summary()  # as in recordings made before, which say nothing of logged values
-        assert frames.loop_summary(recording)["logged"] == counted["logged"]
+        assert loop_summary(recording)["logged"] == counted["logged"]
 
 
 def test_a_report_does_not_say_that_a_loop_learns(folder, tmp_path):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import runner
-from runner.analysis import outcomes
-from runner.analysis.outcomes import events_of
+from runner.environments import mdp as mdps
+from runner.environments.mdp import events_of
 from runner.recording import schema
 
 WORLDS = {
@@ -26,7 +26,7 @@ def test_every_episode_has_the_events_that_were_counted(tmp_path, world, monkeyp
         mdp = recording.mdp
         steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
         counted = recording.episodes("train")["events"]
-    monkeypatch.setattr(outcomes, "_COMPARED", 1000)  # so that some steps are looked at after others
+    monkeypatch.setattr(mdps, "_BATCH_OUTCOMES", 1000)  # so that some steps are looked at after others
     bits = events_of(mdp, steps)[:, np.newaxis] >> np.arange(len(mdp.event_names)) & 1
     found = np.zeros_like(counted)
     np.add.at(found, steps["episode"].astype(np.int64), bits.astype(counted.dtype))
