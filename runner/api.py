@@ -115,9 +115,9 @@ def jobs_in(config: ExperimentConfig, recordings: Path) -> Iterator[Job]:
         RunnerError: it begins with the table of a run that is not there.
     """
     if isinstance(config.initial_q, RunTable):
-        from runner.execution.initial_tables import settled
+        from runner.execution.initial_tables import resolve_initial_q
 
-        config = settled(config, recordings)
+        config = resolve_initial_q(config, recordings)
     return jobs_of(config)
 
 

@@ -1,1 +1,1 @@
-"""Training a job: recording it, resuming it, verifying it and recording it again."""
+"""Run a job: record, resume, verify and rerecord it."""

@@ -1,9 +1,9 @@
-"""How many steps a run may take, and how much disk: known only roughly before it has learned.
+"""Estimate the steps and the disk space of a run before it has learned.
 
-At most, every episode lasts until the step limit. Typically they do not: an agent that learns soon gets
-to the end. The typical figure takes half the limit for each evaluation trial and for the first
-500 training episodes, and a tenth of it for the others; for random actions half of it throughout. Those
-are rules of thumb from the shipped experiments, whose steps came out between a quarter of it and all of it.
+At most, every episode lasts until the step limit. A typical agent soon learns to reach the end: the typical
+figure assumes half the limit for each evaluation trial and for the first 500 training episodes, and a tenth
+of it for the others; for random actions half of it throughout. These are rules of thumb from the shipped
+experiments, whose steps were between a quarter of the typical figure and all of it.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from runner.config import ExperimentConfig
 
 CLUMSY_EPISODES: Final = 500
 CLUMSY, SKILLED = 0.5, 0.1
-"""Typical length of an episode as a share of the step limit: at first and in trials; later."""
+"""Typical length of an episode as a share of the step limit: at first and in trials, and later."""
 BYTES_A_STEP: Final = {"zstd": 15, "lz4": 30, "none": 100}
-"""By compression, measured; without the message index."""
+"""Measured bytes of a step by compression, without the message index."""
 INDEX_BYTES: Final = 16
-"""Of the message index, a step."""
+"""Bytes of the message index for a step."""
 OTHER_BYTES: Final = 2
-"""Of all else, spread over the steps."""
+"""Bytes of everything else, spread over the steps."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Evaluations, snapshots, steps and bytes of one run."""
+    """The estimated evaluations, snapshots, steps and bytes of one run."""
 
     evaluations: int
     snapshots: int
     typical_steps: int
     typical_bytes: int
-    most_steps: int
-    most_bytes: int
+    max_steps: int
+    max_bytes: int
 
 
 def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
@@ -56,12 +56,12 @@ def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
 
 
 def _occasions(episodes: int, every: int) -> int:
-    """Return how often something is done before training, after every so many episodes, and at the end."""
+    """Return how often something happens that is due at the start, every `every` episodes, and at the end."""
     return -(-episodes // every) + 1
 
 
 def bytes_a_step(config: ExperimentConfig) -> int:
-    """Return about how many bytes of a recording fall to a step."""
+    """Return the typical number of bytes of a step in a recording."""
     plan = config.recording
     if plan.steps == "none":
         return OTHER_BYTES
@@ -69,10 +69,7 @@ def bytes_a_step(config: ExperimentConfig) -> int:
 
 
 def step_limit(config: ExperimentConfig) -> int | None:
-    """Return after how many steps the environment truncates an episode; 0 for never, None if it is unknown.
-
-    What is wrong with an unknown environment is told when it is made.
-    """
+    """Return the step limit of the environment; 0 if it has none, None if the environment is unknown."""
     import gymnasium
 
     given = config.env.kwargs.get("max_episode_steps")
@@ -87,6 +84,6 @@ def step_limit(config: ExperimentConfig) -> int | None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Return how much the disk of a folder, which need not exist, would still take."""
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    return shutil.disk_usage(there).free
+    """Return the free bytes on the disk of a folder, which need not exist."""
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    return shutil.disk_usage(existing).free

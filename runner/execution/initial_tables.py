@@ -1,7 +1,7 @@
-"""Where a run's first tables come from, if from another run: its id and step, and the tables themselves.
+"""The initial Q-tables of a job that come from another run, by its id and a step.
 
-A name answers to another run tomorrow, and an interrupted run goes on. So what `initial_q` names is settled
-when the job is created: from then on the configuration says which run it is, and after which step.
+A name may stand for another run tomorrow, and an interrupted run may be resumed. So `initial_q` is resolved
+when the job is created: from then on the configuration has the run's id and the step.
 """
 
 from __future__ import annotations
@@ -15,27 +15,14 @@ from runner.config.sections import RunTable
 from runner.environments.mdp import Mdp
 from runner.errors import RunnerError
 from runner.learning.learner import Held
-from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
-from runner.replay.tables import held_at
+from runner.replay.tables import held_at, initially_held, last_step
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
 
 
-def settle(job: Job, run: Run) -> tuple[Job, Run]:
-    """Return a job and its run with the configuration `settled`; noted in `run.json` if that changed it.
-
-    Raises:
-        RunnerError: `initial_q` names no run, or its folder cannot be written.
-    """
-    config = settled(job.config, run.folder.parent, exclude=run.run_id)
-    if config == job.config:
-        return job, run
-    return Job(config, job.seed), run.update(config=config.to_mapping())
-
-
-def settled(config: ExperimentConfig, recordings: Path, exclude: str = "") -> ExperimentConfig:
-    """Return a configuration that says by id and step which table it begins with, if it begins with a run's.
+def resolve_initial_q(config: ExperimentConfig, recordings: Path, exclude: str = "") -> ExperimentConfig:
+    """Return a configuration whose `initial_q`, if it is a run's table, has the run's id and the step.
 
     Args:
         config: the configuration.
@@ -51,20 +38,32 @@ def settled(config: ExperimentConfig, recordings: Path, exclude: str = "") -> Ex
     source, step = find_run(start.run, recordings, exclude), start.step
     if step is None:
         with open_recording(at_hand(source).recording) as recording:
-            step = _last_step(recording)
+            step = last_step(recording)
     return from_mapping(
         config.to_mapping() | {"initial_q": {"run": address(source, recordings), "step": step}}
     )
 
 
+def resolve_job(job: Job, run: Run) -> tuple[Job, Run]:
+    """Return a job and its run with `initial_q` resolved, also in `run.json`.
+
+    Raises:
+        RunnerError: `initial_q` names no run, or the run's folder cannot be written.
+    """
+    config = resolve_initial_q(job.config, run.folder.parent, exclude=run.run_id)
+    if config == job.config:
+        return job, run
+    return Job(config, job.seed), run.update(config=config.to_mapping())
+
+
 def address(run: Run, recordings: Path) -> str:
-    """Return what a run is found by, from a recordings folder: its id, or its path if it is elsewhere."""
+    """Return how to find a run from a recordings folder: by its id, or by its path if it is elsewhere."""
     inside = run.folder.parent.resolve() == recordings.resolve()
     return run.run_id if inside and not run.stands_alone else str(run.recording.resolve())
 
 
 def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
-    """Return what the learners of the run held that a settled job's `initial_q` names; None if it names none.
+    """Return what the learners of the run in a job's `initial_q` held; None if it has none.
 
     Raises:
         RunnerError: there is no such run or step, or its tables have another shape.
@@ -74,7 +73,7 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
         return None
     source = find_run(start.run, run.folder.parent, exclude=run.run_id)
     with open_recording(at_hand(source).recording) as recording:
-        held = held_at(recording, _last_step(recording) if start.step is None else start.step)
+        held = held_at(recording, last_step(recording) if start.step is None else start.step)
     joint = job.config.tables == "joint"
     shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
     found = [one["q"].shape for one in held]
@@ -83,9 +82,11 @@ def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
     return held
 
 
-def _last_step(recording: Recording) -> int:
-    """Return how many training steps a recording knows of, also one that leaves its steps out."""
-    recorded = recording.count(schema.TRAIN_STEP)
-    ended = recording.count(schema.TRAIN_EPISODE)
-    last = int(recording.episodes("train", ended - 1, ended)[0]["last_step"]) + 1 if ended else 0
-    return max(recorded, last)
+def recorded_tables(recording: Recording) -> list[Held] | None:
+    """Return the tables that a run took from another run, from its own first snapshots.
+
+    None if it took none, or was interrupted before them: then its configuration has their origin.
+    """
+    if not isinstance(from_mapping(recording.config).initial_q, RunTable):
+        return None
+    return initially_held(recording)

@@ -1,4 +1,4 @@
-"""A recorded run taken up again: its steps recorded later, its table played in new episodes."""
+"""Record the steps of a finished run later; evaluate its Q-table in new episodes."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.environments.loading import load_mdp
 from runner.errors import Diverged, RunnerError
-from runner.execution.initial_tables import address
+from runner.execution.initial_tables import address, recorded_tables
 from runner.execution.session import Report, Session, Stop, describe, recorder_for, run_job
-from runner.execution.verify import initial_tables
 from runner.learning.learner import Learner
 from runner.recording.metadata import write_result
 from runner.recording.reader import open_recording
@@ -30,21 +29,21 @@ Start = int | Literal["random", "each"]
 
 
 def holds_steps(run: Run) -> bool:
-    """Return whether a run's recording holds its steps."""
+    """Return whether a run's recording has its steps."""
     with open_recording(run.recording) as recording:
         return not recording.leaves_out_steps
 
 
 def rerecord(run: Run, report: Report = lambda _: None, stop: Stop = lambda: False) -> Run:
-    """Record the steps of a run that left them out; proven by the digest that they had.
+    """Record the steps of a run that left them out.
 
-    The new recording takes the old one's place when it is complete and has the same content digest. A run
-    that holds its steps is returned as it is.
+    The new recording replaces the old one when it is complete and has the same content digest. A run that has
+    its steps is returned as it is.
 
     Raises:
         RunnerError: the run is not finished, or its folder cannot be used.
-        Diverged: the job gives another content here than it gave then; the recording stays as it is.
-        KeyboardInterrupt: `stop` said so; the recording stays as it is.
+        Diverged: the job gives another content than it gave then; the recording stays as it is.
+        KeyboardInterrupt: `stop` returned True; the recording stays as it is.
     """
     with locked(run) as current:
         if current.status != "finished":
@@ -83,20 +82,20 @@ def evaluate(
     report: Report = lambda _: None,
     stop: Stop = lambda: False,
 ) -> Run:
-    """Play a run's table of some moment, greedily, in new episodes, recorded as a run of its own.
+    """Play a run's greedy policy at some step in new episodes, recorded as a run of its own.
 
     Args:
-        run: whose table; the new run's `initial_q` names it.
+        run: the run with the Q-table, which becomes the new run's `initial_q`.
         recordings: the folder for the new run.
-        step: after how many training steps; None for the last.
-        trials: how many episodes; None for one in each start state.
+        step: the number of training steps; None for the last.
+        trials: the number of episodes; None for one from each start state.
         start: where they start: at random, in each start state in turn, or in one state.
-        seed: fixes the new run's draws.
+        seed: the new run's seed.
         report: called with the progress a few times a second.
-        stop: asked every few milliseconds whether to stop.
+        stop: called every few milliseconds; return True to stop.
 
     Raises:
-        RunnerError: the table cannot be had, or the new run not be recorded.
+        RunnerError: there is no such table, or the new run cannot be recorded.
     """
     config = evaluation_of(run, recordings, step, trials, start, seed)
     fresh = runs.create_run(recordings, config, seed)
@@ -107,10 +106,10 @@ def evaluate(
 def evaluation_of(
     run: Run, recordings: Path, step: int | None, trials: int | None, start: Start, seed: int
 ) -> ExperimentConfig:
-    """Return the experiment that plays a run's table; arguments and errors as for `evaluate`."""
+    """Return the experiment that evaluates a run's table; arguments and errors as for `evaluate`."""
     with open_recording(run.recording) as recording:
         chosen = last_step(recording) if step is None else step
-        tables_at(recording, chosen)  # refused here, before there is a run
+        tables_at(recording, chosen)  # raises here, before there is a new run
         states = recording.mdp.states
         if isinstance(start, int) and not 0 <= start < states:
             raise RunnerError(f"--start: found state {start}, expected one of 0 to {states - 1}.")
@@ -133,10 +132,10 @@ def evaluation_of(
 
 
 def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict[str, Any]:
-    """Do the job again into a new file; return its summary, proven to be the old one's."""
+    """Run the job again into a new file; return its summary, with the digest of the old recording."""
     mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
     with open_recording(run.recording) as recording:
-        learner = Learner(job.config, mdp, job.seed, initial_tables(recording))
+        learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))
         expected, made_by = recording.result["content_digest"], recording.provenance
         resumed = {
             name: recording.metadata(name) for name in recording.metadata_names if name.startswith("resume/")
@@ -163,5 +162,4 @@ def _record(job: Job, run: Run, fresh: Path, report: Report, stop: Stop) -> dict
 
 
 def _with(config: ExperimentConfig, **changes: Any) -> ExperimentConfig:
-    """Return the configuration with other values for some keys."""
     return from_mapping(config.to_mapping() | changes)

@@ -1,11 +1,11 @@
-"""Going on with a run that was interrupted, so that it ends as if it never had been.
+"""Resume an interrupted run, so that it ends as if it had never been interrupted.
 
-The job is done again from its beginning, without recording: what the recording holds already is compared
-with what comes, byte for byte, and from its end on everything is recorded. Learning is so much faster
-than recording that this costs a fraction of what it saves, and it proves what it continues.
+The job is run again from its beginning: what the recording has already is compared byte for byte, and
+everything after its end is recorded. Learning is so much faster than recording that this costs a fraction of
+what it saves, and it proves what it continues.
 
-A recording with a hole, or with damage that good chunks stand behind, is left alone: the run is recorded
-anew beside it, in `recording.anew`, which takes its place when it is complete. That is resumed as well.
+A recording with a hole, or with damage before undamaged chunks, is left alone: the run is recorded again in
+`recording.anew`, which replaces it when it is complete. That is resumed as well.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +23,7 @@ from runner.config.sections import RunTable
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, kept_message
-from runner.execution.initial_tables import configured_tables, settle
+from runner.execution.initial_tables import configured_tables, recorded_tables, resolve_job
 from runner.execution.session import (
     Report,
     Session,
@@ -33,7 +33,7 @@ from runner.execution.session import (
     execute,
     recorder_for,
 )
-from runner.execution.verify import differing_environment, differing_provenance, initial_tables
+from runner.execution.verify import differing_environment
 from runner.learning.learner import Held, Learner
 from runner.recording import schema
 from runner.recording.integrity import may_be_cut, survey
@@ -44,7 +44,7 @@ from runner.recording.records import Contents
 from runner.recording.reference import Past
 from runner.recording.writer import RecordingFile, storage_error
 from runner.runs.locking import locked
-from runner.runs.provenance import provenance
+from runner.runs.provenance import Differences, differing_provenance, provenance
 from runner.runs.run import RECORDING_FILE, Run, run_at
 from runner.util.files import storage_errors
 
@@ -52,14 +52,13 @@ DECISIVE: Final = (
     *("dualtaxi", "git", "python", "machine"),
     *("package.numpy", "package.numba", "package.llvmlite"),
 )
-"""Provenance that a continued run must share with its beginning, unless told otherwise."""
+"""Provenance that must be the same at the beginning of a run and when it is resumed."""
 _ANEW: Final = ".anew"
-
-Changes = dict[str, tuple[str, str]]
+"""The suffix of a recording that replaces a damaged one."""
 
 
 def is_finished(run: Run) -> bool:
-    """Return whether a run came to its end and its recording is whole, as far as it says itself."""
+    """Return whether a run's recording says that it is finished."""
     try:
         with open_recording(run.recording) as recording:
             return recording.finished and recording.status == "finished"
@@ -70,14 +69,14 @@ def is_finished(run: Run) -> bool:
 def resume(
     run: Run, accept_changes: bool = False, report: Report = lambda _: None, stop: Stop = lambda: False
 ) -> Run:
-    """Go on with a run to its end; return it as it then is. A finished one is returned as it is.
+    """Resume a run; return it, finished or interrupted. A finished run is returned as it is.
 
     Args:
         run: an interrupted or failed run.
-        accept_changes: go on although the code, the environment's package or a numerical library is
-            another than at the beginning; recorded. The recorded steps are compared all the same.
+        accept_changes: resume although the code, the environment's package or a numerical library changed;
+            this is recorded. The recorded steps are compared all the same.
         report: called with the progress a few times a second.
-        stop: asked every few milliseconds whether to stop.
+        stop: called every few milliseconds; return True to stop.
 
     Raises:
         RunnerError: the run is running; something decisive differs; or its folder cannot be used.
@@ -85,28 +84,26 @@ def resume(
     """
     if run.stands_alone:
         raise RunnerError(
-            f"{run.recording}: found a recording that stands alone, expected a run. To go on with it, put it "
+            f"{run.recording}: found a recording that stands alone, expected a run. To resume it, put it "
             f"into a folder of its own as {RECORDING_FILE}."
         )
     with locked(run) as current:
         if is_finished(current):
-            return _settled(current)
-        return _go_on(current, accept_changes, report, stop)
+            return _with_finished_status(current)
+        return _resume(current, accept_changes, report, stop)
 
 
 def require_same_makers(run: Run) -> None:
-    """Refuse a run that would be gone on with by other code or libraries than began it.
+    """Refuse to resume a run with other code or libraries than it was started with.
 
     Raises:
-        RunnerError: what differs.
+        RunnerError: they differ.
     """
-    changes = _changes(run)
-    if changes:
-        raise RunnerError(_refusal(run, changes))
+    _refuse_changes(run, _changes(run))
 
 
-def _settled(run: Run) -> Run:
-    """Return a run whose recording is finished; if its owner died before saying so, say it."""
+def _with_finished_status(run: Run) -> Run:
+    """Return a run with a finished recording, also marked so if its process was killed before that."""
     if run.status == "finished":
         return run
     with open_recording(run.recording) as recording:
@@ -114,20 +111,21 @@ def _settled(run: Run) -> Run:
         return run.update(status="finished", summary=facts["summary"] | {"bytes": recording.size})
 
 
-def _go_on(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
+def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
     started = time.monotonic()
     job, described = _job(run)
     if not described:
-        job, run = settle(job, run)
+        job, run = resolve_job(job, run)
     path, contents = _place(run, described)
     changes = _changes(run)
     mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
     changes |= _environment_changes(run, mdp)
-    if changes and not accept_changes:
-        raise RunnerError(_refusal(run, changes))
+    if not accept_changes:
+        _refuse_changes(run, changes)
     learner = Learner(job.config, mdp, job.seed, _first_tables(job, run, mdp))
-    proof = _proof(run)
-    run = run.update(status="running", owner=owner(), summary={}, proof=proof)
+    # the content digest that the run had when it was finished, if it ever was
+    proof = run.summary.content_digest if run.status == "finished" else run.file.proof
+    run = run.update(status="running", owner=owner(), summary={}, proof=str(proof) if proof else None)
     try:
         with (
             _opened(path, contents, job, run, learner, changes) as file,
@@ -135,16 +133,16 @@ def _go_on(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
         ):
             past = Past(recording, without_steps=job.config.recording.steps == "none")
             recorder = recorder_for(job, learner, file, past, beat=run.beat)
-            session = _Continued(recording, past, job, learner, recorder, report, stop)
+            session = _ResumedSession(recording, past, job, learner, recorder, report, stop)
             done = execute(session, file, run, started)
     except BaseException as error:
         _mark_failed(run, error)
         raise
-    return _put_in_place(done, path) if done.status == "finished" else done
+    return _complete(done, path) if done.status == "finished" else done
 
 
 def _mark_failed(run: Run, error: BaseException) -> None:
-    """Say that a run failed, if `execute`, which says so itself, was not come to."""
+    """Mark the run as failed if it never reached `execute`, which records failures itself."""
     with contextlib.suppress(RunnerError):
         now = run_at(run.folder)
         if now.file.status == "running":
@@ -152,11 +150,11 @@ def _mark_failed(run: Run, error: BaseException) -> None:
 
 
 def _place(run: Run, described: bool) -> tuple[Path, Contents]:
-    """Return the file to go on with, and what of it is good: the recording, or one made anew beside it.
+    """Return the file to continue, and its undamaged contents: the recording, or its replacement.
 
     Args:
-        run: whose.
-        described: whether the recording says of which job it is.
+        run: the run.
+        described: whether the recording has the job's description.
     """
     anew = run.recording.with_suffix(_ANEW)
     if not run.recording.is_file():
@@ -169,46 +167,40 @@ def _place(run: Run, described: bool) -> tuple[Path, Contents]:
 
 
 def _job(run: Run) -> tuple[Job, bool]:
-    """Return the job that a run does, and whether its recording says so; else `run.json` does.
+    """Return the job of a run, and whether it comes from the recording; else it comes from `run.json`.
 
     Raises:
-        Diverged: the recording says that it is of another job than it describes.
+        Diverged: the recording has the identity of another job than it describes.
     """
-    told = Job(from_mapping(run.file.config), run.seed)
+    stated = Job(from_mapping(run.file.config), run.seed)
     try:
         with open_recording(run.recording) as recording:
             recorded = Job(from_mapping(recording.config), recording.seed or 0)
             claimed = recording.job
     except (RecordingError, ConfigError, KeyError, ValueError):
-        return told, False
-    if claimed in (recorded.identity, told.identity):
-        return (recorded, True) if claimed == recorded.identity else (told, False)
+        return stated, False
+    if claimed == recorded.identity:
+        return recorded, True
+    if claimed == stated.identity:
+        return stated, False
     raise Diverged("metadata run", "job", claimed, recorded.identity)
 
 
-def _proof(run: Run) -> str | None:
-    """Return the content digest that the run had when it was finished, if it ever was."""
-    if run.status == "finished":
-        return run.summary.content_digest
-    proof = run.file.proof
-    return str(proof) if proof else None
-
-
 def _first_tables(job: Job, run: Run, mdp: Mdp) -> list[Held] | None:
-    """Return the tables that the run began with if it took them over from another; None if it did not."""
+    """Return the tables that the run took from another run; None if it took none."""
     if not isinstance(job.config.initial_q, RunTable):
         return None
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        if (tables := initial_tables(recording)) is not None:
+        if (tables := recorded_tables(recording)) is not None:
             return tables
     return configured_tables(job, run, mdp)
 
 
 @contextlib.contextmanager
 def _opened(
-    path: Path, contents: Contents, job: Job, run: Run, learner: Learner, changes: Changes
+    path: Path, contents: Contents, job: Job, run: Run, learner: Learner, changes: Differences
 ) -> Iterator[RecordingFile]:
-    """Give the file to go on with: cut behind what is good of it, or begun anew where that says nothing."""
+    """Open the file to continue: cut after its undamaged contents, or new if it has no description."""
     described = bool(contents.chunks) and {entry.name for entry in contents.metadata} >= NEEDED
     with storage_errors(path):
         if not described:
@@ -219,35 +211,33 @@ def _opened(
             describe(file, job, run, learner)
         if described or changes:
             number = 1 + sum(entry.name.startswith("resume/") for entry in contents.metadata)
-            _add(file, f"resume/{number}", _note(changes))
+            accepted = {key: f"{then} -> {now}" for key, (then, now) in changes.items()}
+            note = {**provenance(), "accepted_changes": json.dumps(accepted, sort_keys=True)}
+            try:
+                file.add_metadata(f"resume/{number}", note)
+            except OSError as error:
+                file.cut_back()
+                raise storage_error(file, error) from error
         yield file
 
 
-def _add(file: RecordingFile, name: str, entries: dict[str, str]) -> None:
-    try:
-        file.add_metadata(name, entries)
-    except OSError as error:
-        file.cut_back()
-        raise storage_error(file, error) from error
-
-
-def _put_in_place(run: Run, path: Path) -> Run:
-    """Prove a finished recording by the digest it once had; let one made anew take the old one's place.
+def _complete(run: Run, path: Path) -> Run:
+    """Compare a finished recording's digest with the one it once had; let a replacement replace the old file.
 
     Raises:
-        Diverged: it is another; the damaged recording stays.
+        Diverged: the digests differ; the damaged recording stays.
     """
     found, expected = run.summary["content_digest"], run.file.proof
     if expected and found != expected:
         run.update(status="interrupted")
-        raise Diverged("the recording made anew", "content digest", found, expected)
+        raise Diverged("the new recording", "content digest", found, expected)
     if path != run.recording:
         path.replace(run.recording)
     return run.update(proof=None)
 
 
-class _Continued(Session):
-    """A session that, if it is stopped before the end of what is recorded, tells of all that is recorded."""
+class _ResumedSession(Session):
+    """A session whose summary covers all that is recorded, also if it is stopped before the end of that."""
 
     def __init__(self, recording: Recording, past: Past, *session: Any) -> None:
         super().__init__(*session)
@@ -255,28 +245,25 @@ class _Continued(Session):
         self._past = past
 
     def summary(self, topics: dict[str, str]) -> dict[str, Any]:
-        """Return what is worth knowing of the run without opening its recording."""
-        own = super().summary(topics)
-        return own if self._past.exhausted else own | _recorded(self._recording)
-
-
-def _recorded(recording: Recording) -> dict[str, Any]:
-    """Return how far a recording goes, as a summary says it; its digest is not known."""
-    counts = {topic.name: recording.count(topic) for topic in schema.TOPICS}
-    evaluations = recording.metrics("eval")
-    return {
-        "content_digest": None,
-        "topic_digests": {},
-        "episodes": counts[schema.TRAIN_EPISODE.name],
-        "train_steps": _steps(recording, "train"),
-        "eval_steps": _steps(recording, "eval"),
-        "messages": {name: count for name, count in counts.items() if count},
-        "last_evaluation": evaluation_brief(evaluations[-1]) if evaluations else None,
-    }
+        """Return the summary of the run."""
+        summary, recording = super().summary(topics), self._recording
+        if self._past.exhausted:
+            return summary
+        counts = {topic.name: recording.count(topic) for topic in schema.TOPICS}
+        evaluations = recording.metrics("eval")
+        return summary | {
+            "content_digest": None,
+            "topic_digests": {},
+            "episodes": counts[schema.TRAIN_EPISODE.name],
+            "train_steps": _steps(recording, "train"),
+            "eval_steps": _steps(recording, "eval"),
+            "messages": {name: count for name, count in counts.items() if count},
+            "last_evaluation": evaluation_brief(evaluations[-1]) if evaluations else None,
+        }
 
 
 def _steps(recording: Recording, phase: str) -> int:
-    """Return how many steps of a phase are recorded, or were taken in the episodes that are."""
+    """Return the number of steps of a phase, also if the recording leaves them out."""
     steps, episodes = schema.PHASES[phase]
     ended = recording.count(episodes)
     if ended == 0:
@@ -285,35 +272,33 @@ def _steps(recording: Recording, phase: str) -> int:
     return max(recording.count(steps), int(last["last_step"]) + 1)
 
 
-def _changes(run: Run) -> Changes:
-    """Return what is decisive and differs from the recording's beginning: key to (then, now)."""
+def _changes(run: Run) -> Differences:
+    """Return the decisive differences from the provenance at the beginning of the recording."""
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        found = differing_provenance(recording)
+        found = differing_provenance(recording.provenance)
         return {key: values for key, values in found.items() if key in DECISIVE}
     return {}
 
 
-def _environment_changes(run: Run, mdp: Mdp) -> Changes:
+def _environment_changes(run: Run, mdp: Mdp) -> Differences:
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
         return differing_environment(recording, mdp)
     return {}
 
 
-def _refusal(run: Run, changes: Mapping[str, tuple[str, str]]) -> str:
+def _refuse_changes(run: Run, changes: Differences) -> None:
+    if not changes:
+        return
     lines = [
         f"  {key}: {then or 'unknown'} then, {now or 'unknown'} now" for key, (then, now) in changes.items()
     ]
-    return "\n".join(
-        [
-            f"run {run.run_id} was begun by something else than what would go on with it:",
-            *lines,
-            "Bring back what it was begun with, or go on all the same with --accept-changes: every recorded "
-            "step is compared either way.",
-        ]
+    raise RunnerError(
+        "\n".join(
+            [
+                f"run {run.run_id} was started with something else than what would resume it:",
+                *lines,
+                "Bring back what it was started with, or resume it all the same with --accept-changes: every "
+                "recorded step is compared either way.",
+            ]
+        )
     )
-
-
-def _note(changes: Mapping[str, tuple[str, str]]) -> dict[str, str]:
-    """Return the metadata that says who went on, and in spite of which changes."""
-    accepted = {key: f"{then} -> {now}" for key, (then, now) in changes.items()}
-    return {**provenance(), "accepted_changes": json.dumps(accepted, sort_keys=True)}

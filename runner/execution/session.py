@@ -1,4 +1,4 @@
-"""Running a job: the only place where learning meets recording."""
+"""Run a job: the only place where learning meets recording."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,7 @@ from runner.config.job import Job
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import Diverged, RunnerError, StorageError, kept_message
-from runner.execution.initial_tables import configured_tables, settle
-from runner.execution.observer import Observer
+from runner.execution.initial_tables import configured_tables, resolve_job
 from runner.learning.learner import Learner
 from runner.planning import Yardstick
 from runner.recording import schema
@@ -43,7 +42,7 @@ REPORT_SECONDS: Final = 0.1
 
 @dataclass
 class Progress:
-    """How far a run is, as its `report` is told a few times a second."""
+    """The progress of a run, reported a few times a second."""
 
     episodes: int
     """Training episodes to do."""
@@ -52,9 +51,22 @@ class Progress:
     eval_steps: int = 0
     bytes_written: int = 0
     evaluations: list[dict[str, Any]] = field(default_factory=list)
-    """The metrics of every evaluation so far; under `optimality` the exact ones, if they are taken."""
+    """The metrics of every evaluation so far; `optimality` has the exact ones, if they are computed."""
     log: list[str] = field(default_factory=list)
-    """What the run said of itself so far; of one that is gone on with, what it had not said before."""
+    """The log so far; of a resumed run, what its recording did not have before."""
+
+
+class Observer(Protocol):
+    """Sees every step and metric as they come; must return at once, and copy what it keeps."""
+
+    def begin(self, mdp: Mdp, learners: tuple[str, ...]) -> None:
+        """See the environment and the names of the learners before the first step."""
+
+    def steps(self, phase: str, before: int, steps: NDArray[np.void]) -> None:
+        """See new steps of a phase; `before` steps of both phases were executed before the first."""
+
+    def metrics(self, phase: str, time: int, metrics: dict[str, Any]) -> None:
+        """See new metrics of a phase, after `time` steps of both."""
 
 
 Report = Callable[[Progress], None]
@@ -73,14 +85,14 @@ def run_job(
     """Train, evaluate and record a job; return its run, finished or interrupted.
 
     Args:
-        job: what to do.
-        run: the folder made for it by `create_run`.
+        job: the job.
+        run: its run, from `create_run`.
         report: called with the progress a few times a second, and after every evaluation.
-        stop: asked every few milliseconds; when it says True the recording is closed properly and the
+        stop: called every few milliseconds; when it returns True the recording is closed properly and the
             run is marked interrupted.
-        observer: shown every step and metric as they come.
+        observer: sees every step and metric as they come.
         mdp: the job's environment, if it is loaded already.
-        threads: False records in the thread that learns: quicker where it has one processor to itself.
+        threads: False records in the learning thread: quicker if it has one processor to itself.
 
     Raises:
         RunnerError: the environment cannot be used, or the disk is full; the run is then marked failed.
@@ -88,7 +100,7 @@ def run_job(
     started = time.monotonic()
     with _failing(run):
         mdp = mdp or load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
-        job, run = settle(job, run)
+        job, run = resolve_job(job, run)
         learner = Learner(job.config, mdp, job.seed, configured_tables(job, run, mdp))
         file = create_recording(run.folder / runs.RECORDING_FILE)
     with file:
@@ -101,7 +113,7 @@ def run_job(
 
 
 def execute(session: Session, file: RecordingFile, run: Run, started: float) -> Run:
-    """Do what is left of a session's job, and close its recording; return the run as it then is."""
+    """Run a session to its end, close its recording and return the run."""
     try:
         status = "finished" if session.run() else "interrupted"
         summary = session.summary(session.recorder.drain())
@@ -109,11 +121,11 @@ def execute(session: Session, file: RecordingFile, run: Run, started: float) -> 
     except BaseException as error:
         session.recorder.abandon()
         status = "interrupted" if isinstance(error, KeyboardInterrupt | Diverged) else "failed"
-        with contextlib.suppress(StorageError):  # a full disk may still have room for the index
+        with contextlib.suppress(StorageError):  # a full disk may still have space for the index
             write_result(file, status, {"error": kept_message(error)})
-        with contextlib.suppress(StorageError):  # nor need there be room for this
+        with contextlib.suppress(StorageError):
             run.update(status=status, summary={"error": kept_message(error), "bytes": file.size})
-        _tell_what_next(run, error)
+        _add_advice(run, error)
         raise
     summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": file.size}
     return run.update(status=status, summary=summary)
@@ -121,24 +133,24 @@ def execute(session: Session, file: RecordingFile, run: Run, started: float) -> 
 
 @contextlib.contextmanager
 def _failing(run: Run) -> Iterator[None]:
-    """Mark the run failed if what is done here is refused."""
+    """Mark the run as failed if the block raises an error."""
     try:
         yield
     except RunnerError as error:
         with contextlib.suppress(StorageError):
             run.update(status="failed", summary={"error": kept_message(error)})
-        _tell_what_next(run, error)
+        _add_advice(run, error)
         raise
 
 
-def _tell_what_next(run: Run, error: BaseException) -> None:
-    """Add to the error of a full disk how to go on with what was recorded."""
+def _add_advice(run: Run, error: BaseException) -> None:
+    """Add to the error of a full disk how to resume the run."""
     if isinstance(error, StorageError) and run.recording.exists():
-        error.add_note(f"`dualtaxi resume {run.run_id}` goes on when there is room.")
+        error.add_note(f"`dualtaxi resume {run.run_id}` continues it when there is space.")
 
 
 class Session:
-    """One execution: alternates training and evaluation, and hands every block to the recorder."""
+    """The execution of a job: alternates training and evaluation, and passes every block to the recorder."""
 
     def __init__(
         self,
@@ -161,11 +173,11 @@ class Session:
 
     @property
     def learners(self) -> tuple[str, ...]:
-        """The names of what learns: the agents, or `agency` for one joint table."""
+        """The names of the learners: the agents, or `agency` for one joint table."""
         return self._learner.agents
 
     def run(self) -> bool:
-        """Do the whole job; return False if it was stopped before the end."""
+        """Run the whole job; return False if it was stopped before the end."""
         if self._observer is not None:
             self._observer.begin(self._learner.mdp, self._learner.agents)
         self._log(f"training {self._config.episodes} episodes with {self._config.algorithm}")
@@ -183,7 +195,7 @@ class Session:
         return False
 
     def summary(self, topics: dict[str, str]) -> dict[str, Any]:
-        """Return what is worth knowing of the run without opening its recording."""
+        """Return the summary of the run, for `run.json`."""
         last = self._progress.evaluations[-1] if self._progress.evaluations else None
         return self.recorder.totals(topics) | {
             "episodes": self._learner.episode,
@@ -203,7 +215,7 @@ class Session:
         yield last
 
     def _train(self, until_episode: int) -> bool:
-        """Train up to an episode, reporting metrics on the way; return False if stopped."""
+        """Train up to an episode; return False if stopped."""
         recorder, learner = self.recorder, self._learner
         every = self._config.log.every_steps if self._config.log else 2**62
         while learner.episode < until_episode:
@@ -216,7 +228,7 @@ class Session:
             recorder.commit("train", steps, episodes)
             if learner.step == next_log:
                 self._measure("train", schema.TRAIN_METRICS_TOPIC, learner.training_side())
-            self._tell()
+            self._report_progress()
         return True
 
     def _evaluate(self, episode: int) -> bool:
@@ -238,7 +250,7 @@ class Session:
             trials.append(records[:ended].copy())
             recorder.commit("eval", steps, ended)
             done += ended
-            self._tell()
+            self._report_progress()
         metrics = evaluation_metrics(learner, self._evaluated, np.concatenate(trials))
         self._measure("eval", schema.EVAL_METRICS_TOPIC, metrics)
         self._evaluated += 1
@@ -246,7 +258,7 @@ class Session:
         if plan.exact:
             self._measure_exactly(metrics)
         self._log(f"evaluation after {episode} episodes: {metrics['success_percent']:.1f} % success")
-        self._tell(now=True)
+        self._report_progress(now=True)
         return True
 
     def _show(self, phase: str, steps: NDArray[np.void]) -> None:
@@ -261,7 +273,7 @@ class Session:
             self._observer.metrics(phase, sum(self.recorder.steps.values()), metrics)
 
     def _measure_exactly(self, metrics: dict[str, Any]) -> None:
-        """Record what the evaluated policy gets from every start state, beside what is possible."""
+        """Record what the evaluated policy gets from every start state, and the optimum."""
         exact = self._yardstick.measure(self._learner.policy, metrics["discount"])
         position = {name: metrics[name] for name in ("step", "episode", "evaluation")}
         topic = schema.OPTIMALITY_TOPIC
@@ -285,12 +297,12 @@ class Session:
 
     def _log(self, text: str, level: str = "INFO") -> None:
         steps = sum(self.recorder.steps.values())
-        said = encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level)
-        if self.recorder.message(schema.LOG_TOPIC, said):
+        message = encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level)
+        if self.recorder.message(schema.LOG_TOPIC, message):
             self._progress.log.append(text)
 
-    def _tell(self, now: bool = False) -> None:
-        """Report the progress, not more often than is worth it."""
+    def _report_progress(self, now: bool = False) -> None:
+        """Report the progress, at most once in `REPORT_SECONDS` unless `now`."""
         moment = time.monotonic()
         if not now and moment - self._last_report < REPORT_SECONDS:
             return
@@ -306,7 +318,7 @@ class Session:
 
 
 def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> dict[str, Any]:
-    """Return the measures of an evaluation from its episode records, and training's at that moment."""
+    """Return the metrics of an evaluation from its episode records, and of training at that moment."""
     known = bool(learner.mdp.success_events)
     successes = int(trials["success"].sum())
     return learner.training_side() | {
@@ -321,7 +333,7 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Any) -> dict[s
 
 
 def evaluation_brief(metrics: dict[str, Any]) -> dict[str, Any]:
-    """Return the figures of an evaluation that a summary has; None for what is unknown."""
+    """Return the metrics of an evaluation for a summary; unknown values are None."""
     values = {metric.name: metrics[metric.field] for metric in METRICS if not metric.per_agent}
     return {
         "episode": metrics["episode"],
@@ -337,7 +349,7 @@ def recorder_for(
     beat: Callable[[], None] = lambda: None,
     threads: bool = True,
 ) -> Recorder:
-    """Return a recorder for what a learner does, into a file, packed as the job's configuration says."""
+    """Return a recorder for a learner's steps into a file, packed as in the job's configuration."""
     options = job.config.recording
     return Recorder(
         file,
@@ -354,7 +366,9 @@ def recorder_for(
 def describe(
     file: RecordingFile, job: Job, run: Run, learner: Learner, made_by: Mapping[str, str] | None = None
 ) -> None:
-    """Write what makes the recording self-contained; `made_by` is its provenance if not this process's.
+    """Write the description that makes a recording self-contained.
+
+    `made_by` is its provenance; this process's by default.
 
     Raises:
         StorageError: the disk is full or failing.
@@ -369,5 +383,4 @@ def describe(
 
 @lru_cache(maxsize=4)
 def _environment(mdp: Mdp) -> Attachments:
-    """Return the attachments that tell of an environment."""
     return environment_attachments(mdp.description(), mdp.arrays())

@@ -1,4 +1,4 @@
-"""Where and by what a run was made: it explains a difference, and is never part of what is compared."""
+"""The provenance of a run: versions, host and source; it may explain a difference, and is never compared."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import platform
 import socket
 import subprocess
 import sys
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -28,9 +29,23 @@ def provenance() -> dict[str, str]:
     }
 
 
+Differences = dict[str, tuple[str, str]]
+"""Differences in provenance: key to (recorded, here)."""
+
+
+def differing_provenance(recorded: Mapping[str, str]) -> Differences:
+    """Return the differences between recorded provenance and this process's."""
+    here = provenance()
+    return {
+        key: (recorded.get(key, ""), here.get(key, ""))
+        for key in sorted({*recorded, *here})
+        if recorded.get(key) != here.get(key)
+    }
+
+
 @cache
 def _installed() -> dict[str, str]:
-    """Return what does not change while a process lives: what it runs on, and the code it has loaded."""
+    """Return what does not change during a process: the machine, and the versions of the code."""
     facts = {
         "dualtaxi": __version__,
         "python": platform.python_version(),

@@ -215,7 +215,7 @@ def _announce(config: ExperimentConfig, folder: Path) -> None:
     one = estimate(config, limit)
     say(
         f"{runs}: about {amount(one.typical_steps * seeds)} steps, {size(one.typical_bytes * seeds)} "
-        f"(at most {amount(one.most_steps * seeds)}, {size(one.most_bytes * seeds)})."
+        f"(at most {amount(one.max_steps * seeds)}, {size(one.max_bytes * seeds)})."
     )
     if free >= one.typical_bytes * seeds:
         return

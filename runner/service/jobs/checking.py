@@ -71,14 +71,14 @@ def check(text: str, source: str, recordings: Path) -> CheckedJob:
 def _check_config(text: str, source: str, document: Document, recordings: Path) -> CheckedJob:
     from runner.environments.loading import load_mdp
     from runner.execution.estimate import estimate, step_limit
-    from runner.execution.initial_tables import settled
+    from runner.execution.initial_tables import resolve_initial_q
 
     config = from_text(text, source)
     _refuse_paths({("initial_q",): document.value.get("initial_q")}, document)
     with _problems_at(("env",), document):
         load_mdp(config.env.id, config.env.kwargs, config.rewards)
     with _problems_at(("initial_q",), document):
-        config = settled(config, recordings)
+        config = resolve_initial_q(config, recordings)
     limit, seeds = step_limit(config), len(config.seeds)
     size = estimate(config, limit).typical_bytes * seeds if limit else 0
     return CheckedJob("config", config.name, seeds, size, config.to_mapping())

@@ -168,9 +168,9 @@ def test_a_drawing_says_everything_in_letters():
 def test_the_estimate_is_bounded_and_grows_with_what_is_recorded():
     config = from_mapping({"episodes": 1000, "evaluation": {"every": 300, "trials": 10}})
     made = estimate(config, 100)
-    assert made.most_steps == (1000 + 5 * 10) * 100  # evaluations after 0, 300, 600, 900 and 1000
+    assert made.max_steps == (1000 + 5 * 10) * 100  # evaluations after 0, 300, 600, 900 and 1000
     assert made.typical_steps == (500 + 5 * 10) * 50 + 500 * 10
-    assert made.most_bytes == made.most_steps * 33
+    assert made.max_bytes == made.max_steps * 33
     bare = from_mapping({"episodes": 1000, "recording": {"index": "chunk"}})
     none = from_mapping({"episodes": 1000, "recording": {"steps": "none"}})
     assert estimate(none, 100).typical_bytes < estimate(bare, 100).typical_bytes < made.typical_bytes * 10

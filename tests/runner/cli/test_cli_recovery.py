@@ -154,10 +154,10 @@ def test_resume_refuses_a_living_run(command, copied):
 
 
 def test_accepted_changes(command, copied, monkeypatch):
-    from runner.execution import verify
+    from runner.runs import provenance
 
-    here = verify.provenance()
-    monkeypatch.setattr(verify, "provenance", lambda: here | {"dualtaxi": "9.9"})
+    here = provenance.provenance()
+    monkeypatch.setattr(provenance, "provenance", lambda: here | {"dualtaxi": "9.9"})
     cut(copied)
     result = command("resume", "@latest")
     assert result.exit_code == 2

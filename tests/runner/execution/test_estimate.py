@@ -21,4 +21,4 @@ def test_evaluations_and_snapshots_are_counted_as_they_are_made(tmp_path, episod
         assert one.evaluations == len(recording.metrics("eval"))
         assert one.snapshots == len(list(recording.snapshots()))
         trials = one.evaluations * 2
-        assert one.most_steps == 20 * (episodes + trials)
+        assert one.max_steps == 20 * (episodes + trials)

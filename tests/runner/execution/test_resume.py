@@ -23,6 +23,7 @@ from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.schema import TRAIN_STEP
 from runner.recording.writer import RecordingFile
+from runner.runs import provenance
 from runner.runs import run as runs
 from runner.runs.locking import locked
 from runner.runs.resolve import find_run
@@ -274,8 +275,8 @@ def test_after_a_full_disk(whole, tmp_path, monkeypatch, room):
 def test_other_versions_are_refused_with_what_differs(whole, tmp_path, monkeypatch):
     run = copy_of(whole, tmp_path, summary={})
     cut(run, run.recording.stat().st_size // 2)
-    here = verify.provenance()
-    monkeypatch.setattr(verify, "provenance", lambda: here | {"package.numpy": "1.0", "host": "another"})
+    here = provenance.provenance()
+    monkeypatch.setattr(provenance, "provenance", lambda: here | {"package.numpy": "1.0", "host": "another"})
     with pytest.raises(RunnerError, match=r"package\.numpy: \S+ then, 1\.0 now") as refused:
         resume(run)
     assert "--accept-changes" in str(refused.value)

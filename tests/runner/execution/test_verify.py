@@ -23,6 +23,7 @@ from runner.recording.reader import open_recording
 from runner.recording.records import read_chunk
 from runner.recording.repair import repair
 from runner.recording.writer import RecordingFile
+from runner.runs import provenance
 from runner.runs.run import create_run
 from runner.util.packing import Packing
 from tests.runner.altering import altered
@@ -275,9 +276,9 @@ def test_damage_is_placed(run, tmp_path):
 
 def test_a_rerun_tells_what_differs(tmp_path, monkeypatch):
     whole = make_run(tmp_path, TAXIS)
-    here = verifying.provenance()
+    here = provenance.provenance()
     other = here | {"package.numpy": "1.0", "command": "x"}
-    monkeypatch.setattr(verifying, "provenance", lambda: other)
+    monkeypatch.setattr(provenance, "provenance", lambda: other)
     found = verify(whole.recording, rerun=True)
     assert found.sound
     assert found.provenance == {"package.numpy": (here["package.numpy"], "1.0")}

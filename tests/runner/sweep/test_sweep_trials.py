@@ -16,10 +16,10 @@ from sweeping import Here, described, digests, swept
 from runner.config import from_mapping
 from runner.config.job import Job
 from runner.errors import RunnerError
-from runner.execution import verify
 from runner.execution.rerecord import rerecord
 from runner.execution.session import run_job
 from runner.recording.labels import read_labels
+from runner.runs import provenance
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
 from runner.sweep import local, state
@@ -78,8 +78,8 @@ def test_a_sweep_whose_unfinished_run_was_begun_by_other_code_is_refused_before_
     first = Here(most=3)
     swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
     before = len(list_runs(tmp_path))
-    here = verify.provenance()
-    monkeypatch.setattr(verify, "provenance", lambda: here | {"git": "another"})
+    here = provenance.provenance()
+    monkeypatch.setattr(provenance, "provenance", lambda: here | {"git": "another"})
     with pytest.raises(RunnerError, match=r"git: \S* then, another now"):
         swept(tmp_path, sweep)
     assert len(list_runs(tmp_path)) == before
