@@ -1,15 +1,20 @@
-"""Runs by configuration: those belong together whose configurations differ in nothing but the seed."""
+"""Runs in groups: together are those whose configurations differ in nothing but the seed."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 from runner.analysis.series import RunSeries, is_loop
+from runner.errors import RunnerError, nearest
+from runner.recording.metrics import METRICS, SHARES
 from runner.util.humanize import listed
 from runner.util.values import flatten
+
+_NOT_CONTENT: Final = ("seeds", "recording", "name")
+_TRAINING_METRICS: Final = ("training.mean_return", "training.mean_reward", "training.mean_length")
 
 
 @dataclass(frozen=True)
@@ -19,11 +24,11 @@ class Group:
     label: str
     runs: tuple[RunSeries, ...]
     left_out: tuple[str, ...] = ()
-    """The ids of runs that are one of these once more."""
+    """The ids of runs that repeat one of these."""
 
     @property
     def described(self) -> str:
-        """Its label, and which runs they are: `quick, 3 runs (k3v9m2xq seed 0, ...)`."""
+        """The label and the runs: `quick, 3 runs (k3v9m2xq seed 0, ...)`."""
         shown = listed(
             [
                 run.run_id
@@ -38,59 +43,175 @@ class Group:
 
 
 def groups_of(series: Sequence[RunSeries]) -> list[Group]:
-    """Return the runs by configuration, in the order given, labelled by name and by what differs.
+    """Return the runs by name and configuration, in the order given, labelled by name and by what differs.
 
-    A run that was recorded twice counts once, lest it weigh twice in a median: of a job's runs of one seed
-    the finished and then the last given counts; of somebody's own loops, which a seed need not tell apart,
-    the last of those of one content.
+    A run that was recorded twice counts once, or it would weigh twice in a median: of a job's runs of one
+    seed the finished and then the last given counts; of loops, which a seed need not distinguish, the last of
+    those of one content.
+    """
+    found: dict[Hashable, list[RunSeries]] = {}
+    for run in series:
+        found.setdefault((run.name, _content(run)), []).append(run)
+    runs_of = list(found.values())
+    return _labelled(runs_of, [runs[0].name for runs in runs_of])
+
+
+def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Group], list[str]]:
+    """Return runs in groups for a comparison, and notes on them, a sentence each.
+
+    Together are runs whose configurations differ in nothing but the seed, whatever their names and however
+    they were recorded; or, with `by`, those that have the same value there. Of a job that was run twice one
+    run counts, as in `groups_of`. Several loops of one configuration and seed, such as the workers of one
+    training, all count: the value of their seed is the mean over them.
+
+    Args:
+        series: the runs.
+        by: path of a configuration's value, such as `quirks.epsilon_exploits`.
+
+    Raises:
+        RunnerError: no run has a value of that path.
     """
     found: dict[str, list[RunSeries]] = {}
+    key = _content if by is None else _value_at(by, series)
     for run in series:
-        content = {key: value for key, value in run.config.items() if key not in ("seeds", "recording")}
-        found.setdefault(f"{run.name} {json.dumps(content, sort_keys=True)}", []).append(run)
-    flat = [flat_config(runs[0].config) for runs in found.values()]
-    names = [runs[0].name for runs in found.values()]
-    labels = [label_of(i, names, flat) for i in range(len(names))]
-    once = [each_once(runs, sameness) for runs in found.values()]
-    return [
-        Group(label, tuple(kept), tuple(run.run_id for run in runs if run not in kept))
-        for label, kept, runs in zip(labels, once, found.values(), strict=True)
-    ]
+        found.setdefault(key(run), []).append(run)
+    if by is None:
+        names = [" / ".join(dict.fromkeys(run.name for run in runs)) for runs in found.values()]
+        groups = _labelled(list(found.values()), names)
+    else:
+        groups = [_group(f"{by} = {value}", runs) for value, runs in found.items()]
+    notes = duplicates(groups)
+    for group in groups:
+        if (count := len({_content(run) for run in group.runs})) > 1:
+            notes.append(f"{group.label} has runs of {count} configurations")
+    return groups, notes
 
 
-def each_once(runs: Sequence[RunSeries], same: Callable[[RunSeries], Hashable]) -> list[RunSeries]:
-    """Return of the runs that are the same one run: a finished one if there is one, the last given."""
+def require_two(groups: Sequence[Group], by: str | None = None) -> None:
+    """Refuse a single group.
+
+    Raises:
+        RunnerError: there are not two groups.
+    """
+    if len(groups) > 1:
+        return
+    (group,) = groups
+    count = len(group.runs)
+    if count == 1:
+        raise RunnerError(
+            f"found one run, {group.runs[0].run_id}, expected at least two to compare; a job that "
+            "was run twice counts once, and runner.record's `config` distinguishes loops."
+        )
+    if by is not None:
+        raise RunnerError(f"found {count} runs, all with {group.label}, expected two values at least.")
+    raise RunnerError(
+        f"found {count} runs of one configuration, {group.label}, expected two configurations at "
+        "least; `dualtaxi plot` draws their median, `dualtaxi ls` lists what there is."
+    )
+
+
+def duplicates(groups: Sequence[Group]) -> list[str]:
+    """Return a sentence about the runs that are left out because they repeat others, if there are any."""
+    left_out = [run_id for group in groups for run_id in group.left_out]
+    return [f"left out, as the same run is there: {listed(left_out)}"] if left_out else []
+
+
+def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tuple[str, str]]:
+    """Return the (metric, line) pairs to compare: those chosen, or those of evaluations, or of training.
+
+    Args:
+        groups: the runs.
+        chosen: metrics (`mean_return`, of all its agents), or single lines of them (`mean_return.taxi_1`).
+
+    Raises:
+        RunnerError: no run has one of them, or any at all.
+    """
+    known: dict[str, list[tuple[str, str]]] = {}
+    pairs = {
+        (metric, line): None
+        for group in groups
+        for run in group.runs
+        for _, readings in (*run.evaluation, *run.training)
+        for metric, lines in readings.items()
+        for line in (lines if metric != SHARES else ())
+    }
+    for metric, line in pairs:
+        for name in {metric, f"{metric}.{line}" if line else metric}:
+            known.setdefault(name, []).append((metric, line))
+    if not known:
+        raise RunnerError(
+            "found neither an evaluation nor a report of training in any run, so there is nothing to compare."
+        )
+    usual = [metric.name for metric in METRICS]
+    if not any(metric.name in known for metric in METRICS if metric.requires == "success_events"):
+        usual.sort(key=lambda name: name != "mean_return")  # without a goal the return says most
+    names = list(chosen)
+    for some in (usual, _TRAINING_METRICS):
+        names = names or [name for name in some if name in known]
+    for name in names:
+        if name not in known:
+            expected = ", ".join(sorted(known))
+            raise RunnerError(f"--metric: found {name!r}, expected one of {expected}.{nearest(name, known)}")
+    return list(dict.fromkeys(pair for name in names for pair in known[name]))
+
+
+# --- inside -------------------------------------------------------------------------------------------
+
+
+def _content(run: RunSeries) -> str:
+    return json.dumps({k: v for k, v in run.config.items() if k not in _NOT_CONTENT}, sort_keys=True)
+
+
+def _group(label: str, runs: Sequence[RunSeries]) -> Group:
+    """Return a group of these runs, each once: of repetitions the last given, finished ones first."""
     best: dict[Hashable, RunSeries] = {}
     for run in runs:
-        key = same(run)
+        # A job follows from its seed. Of loops only the content tells: workers of one training share a seed.
+        identity = run.content_digest or run.run_id if is_loop(run) else run.seed
+        key = (_content(run), identity)
         if key not in best or run.finished >= best[key].finished:
             best[key] = run
-    return list(best.values())
+    kept = tuple(best.values())
+    return Group(label, kept, tuple(run.run_id for run in runs if run not in kept))
 
 
-def left_out(groups: Sequence[Group]) -> list[str]:
-    """Return what is to be said of runs that are there twice: a sentence, or nothing."""
-    twice = [run_id for group in groups for run_id in group.left_out]
-    return [f"left out, as the same run is there: {listed(twice)}"] if twice else []
-
-
-def sameness(run: RunSeries) -> Hashable:
-    """Return what is equal for two runs of one configuration only if one repeats the other.
-
-    A job follows from its seed. Of loops only the content tells: workers of one training share a seed.
-    """
-    return run.content_digest or run.run_id if is_loop(run) else run.seed
-
-
-def label_of(own: int, names: Sequence[str], flat: Sequence[Mapping[str, Any]]) -> str:
-    """Return a group's name, with the values in which it differs from others of that name."""
-    same = [flat[i] for i, name in enumerate(names) if name == names[own]]
-    keys = sorted({key for other in same for key in other if key not in ("name", "seeds")})
-    differing = [key for key in keys if any(other.get(key) != same[0].get(key) for other in same)]
-    told = ", ".join(f"{key}={flat[own].get(key)}" for key in differing if not key.startswith("recording."))
-    return f"{names[own]}, {told}" if told else names[own]
+def _labelled(runs_of: Sequence[Sequence[RunSeries]], names: Sequence[str]) -> list[Group]:
+    """Return a group for each sequence of runs, labelled by its name and the values in which it differs."""
+    flat = [flat_config(runs[0].config) for runs in runs_of]
+    groups = []
+    for name, own, runs in zip(names, flat, runs_of, strict=True):
+        same = [values for values, other in zip(flat, names, strict=True) if other == name]
+        differing = [
+            key
+            for key in sorted({key for values in same for key in values})
+            if not key.startswith("recording.")
+            and any(values.get(key) != same[0].get(key) for values in same)
+        ]
+        values = ", ".join(f"{key}={own.get(key)}" for key in differing)
+        groups.append(_group(f"{name}, {values}" if values else name, runs))
+    return groups
 
 
 def flat_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a configuration by dotted key, without name and seeds."""
-    return flatten({key: value for key, value in config.items() if key not in ("seeds", "name")})
+    """Return the values of a configuration by dotted key, but for its name and seeds."""
+    return {key: value for key, value in flatten(config).items() if key not in ("seeds", "name")}
+
+
+def _value_at(path: str, series: Sequence[RunSeries]) -> Callable[[RunSeries], str]:
+    """Return a function that returns a run's value at a path of the configuration, as JSON."""
+
+    def paths(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for key, value in values.items():
+            found[f"{prefix}{key}"] = value
+            if isinstance(value, Mapping):
+                found |= paths(value, f"{prefix}{key}.")
+        return found
+
+    known = {name for run in series for name in paths(run.config)}
+    if path not in known:
+        raise RunnerError(
+            f"--by: found {path!r}, expected a path of the configuration such as discount or "
+            f"evaluation.trials; `dualtaxi config check` prints all.{nearest(path, sorted(known))}"
+        )
+    return lambda run: json.dumps(paths(run.config).get(path), sort_keys=True)

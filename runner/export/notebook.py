@@ -105,7 +105,7 @@ def plot(*runs: Run) -> Picture:
         RecordingError: a recording cannot be read.
     """
     from runner.analysis.groups import groups_of
-    from runner.analysis.readings import read_series
+    from runner.analysis.series import read_series
     from runner.archive.places import at_hand
     from runner.export.plots.curves import curves_sheet
     from runner.export.plots.image import write_image

@@ -39,8 +39,7 @@ def curves(path: Path, chosen: Sequence[str], start: int, stop: int | None, poin
         stop: behind the last; None: to the end.
         points: at most so many of a curve; of more, the lowest and the highest of each stretch are given.
     """
-    from runner.analysis.readings import read_series
-    from runner.analysis.series import title_of
+    from runner.analysis.series import read_series, title_of
 
     with open_recording(path) as recording:
         series = read_series(recording)
@@ -214,9 +213,9 @@ def comparison(
         RunnerError: there is nothing to compare.
     """
     from runner.analysis.compare import compare
-    from runner.analysis.compare.groups import grouped, metrics_of, require_two
     from runner.analysis.compare.moments import moment_of
     from runner.analysis.compare.statistics import require_scipy
+    from runner.analysis.groups import grouped, metrics_of, require_two
 
     require_scipy()
     moment, metrics = moment_of(at, target, chosen)
@@ -247,7 +246,7 @@ def as_json(value: Any) -> bytes:
 
 
 def _series(paths: Sequence[Path]) -> list[RunSeries]:
-    from runner.analysis.readings import read_series
+    from runner.analysis.series import read_series
 
     found = []
     for path in paths:

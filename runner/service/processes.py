@@ -28,7 +28,7 @@ MAX_WAITING: Final = 32
 PRELOADED: Final = (
     "runner.analysis.diff",
     "runner.analysis.qtable",
-    "runner.analysis.readings",
+    "runner.analysis.series",
     "runner.environments.loading",
     "runner.execution.estimate",
     "runner.execution.initial_tables",

@@ -11,8 +11,13 @@ import numpy as np
 
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.evaluations import evaluation_record
-from runner.analysis.readings import evaluation_readings, exact_readings, training_readings
-from runner.analysis.series import first_crossing, mean_height
+from runner.analysis.series import (
+    evaluation_readings,
+    exact_readings,
+    first_crossing,
+    mean_height,
+    training_readings,
+)
 from runner.errors import RunnerError, nearest
 from runner.recording.reader import Recording
 from runner.sweep.model import Objective

@@ -11,7 +11,7 @@ from typing import Any
 
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
-from runner.analysis.readings import read_series
+from runner.analysis.series import read_series
 from runner.archive.places import at_hand
 from runner.errors import RunnerError
 from runner.export.plots.metrics import Panel, panels_of

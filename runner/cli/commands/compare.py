@@ -71,10 +71,10 @@ def command(
       dualtaxi compare cooperative competitive --html comparison.html
     """  # noqa: D301 - Click wants the backspace itself
     from runner.analysis.compare import compare
-    from runner.analysis.compare.groups import grouped, metrics_of, require_two
     from runner.analysis.compare.moments import moment_of
     from runner.analysis.compare.sections import sections
     from runner.analysis.compare.statistics import require_scipy
+    from runner.analysis.groups import grouped, metrics_of, require_two
     from runner.cli.progress import stage_line
 
     require_one_form(as_json, as_markdown)
@@ -104,7 +104,7 @@ def command(
 
 def _read(runs: list[Run]) -> list[RunSeries]:
     """Return the metrics of runs."""
-    from runner.analysis.readings import read_series
+    from runner.analysis.series import read_series
     from runner.recording.reader import open_recording
 
     found = []

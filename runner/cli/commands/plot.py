@@ -41,9 +41,8 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
       dualtaxi plot cooperative competitive -o comparison.pdf
       dualtaxi plot hyperparameters -o hyperparameters.png
     """  # noqa: D301 - Click wants the backspace itself
-    from runner.analysis.groups import groups_of, left_out
-    from runner.analysis.readings import read_series
-    from runner.analysis.series import values_left_out
+    from runner.analysis.groups import duplicates, groups_of
+    from runner.analysis.series import read_series, values_left_out
     from runner.export.contents import shortcomings
     from runner.export.places import write_new
     from runner.export.plots.curves import curves_sheet
@@ -68,7 +67,7 @@ def command(run_names: tuple[str, ...], output: Path, force: bool, recordings: P
                     say(shortcoming)
             progress(len(series))
     groups = groups_of(series)
-    for note in left_out(groups):
+    for note in duplicates(groups):
         say(f"{note[0].upper()}{note[1:]}.")
     for sentence in values_left_out(series):
         say(sentence)

@@ -20,8 +20,8 @@ from runner.analysis.diff.sections import (
 )
 from runner.analysis.diff.tables import common_snapshots
 from runner.analysis.groups import Group
-from runner.analysis.readings import read_series
 from runner.analysis.sections import Grid, Section
+from runner.analysis.series import read_series
 from runner.drawing import svg, svg_maps
 from runner.environments.mdp import Mdp
 from runner.environments.naming import exploration_in_words, spoken, states_in_words

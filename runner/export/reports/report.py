@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from runner.analysis.evaluations import evaluation_records, evaluation_summary
 from runner.analysis.groups import groups_of
-from runner.analysis.readings import read_series
-from runner.analysis.series import RunSeries, values_left_out
+from runner.analysis.series import RunSeries, read_series, values_left_out
 from runner.analysis.summary import random_policy_sentence
 from runner.drawing import palette, svg
 from runner.environments.naming import event_in_words, spoken

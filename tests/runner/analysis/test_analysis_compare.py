@@ -11,10 +11,9 @@ import pytest
 
 import runner
 from runner.analysis.compare import compare, statistics
-from runner.analysis.compare.groups import grouped, metrics_of
 from runner.analysis.compare.moments import Moment
 from runner.analysis.compare.sections import in_short, sections
-from runner.analysis.groups import groups_of
+from runner.analysis.groups import grouped, groups_of, metrics_of
 from runner.analysis.sections import markdown
 from runner.analysis.series import RunSeries
 from runner.errors import RunnerError

@@ -10,10 +10,10 @@ import pytest
 from click.testing import CliRunner
 
 from runner.analysis.compare import compare
-from runner.analysis.compare.groups import grouped, metrics_of
 from runner.analysis.compare.moments import Moment
 from runner.analysis.diff import diff
-from runner.analysis.readings import read_series
+from runner.analysis.groups import grouped, metrics_of
+from runner.analysis.series import read_series
 from runner.cli import cli
 from runner.export.reports.compare import render_comparison
 from runner.export.reports.diff import render_diff

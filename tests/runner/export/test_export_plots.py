@@ -11,8 +11,7 @@ from click.testing import CliRunner
 
 from runner.analysis.evaluations import evaluation_records
 from runner.analysis.groups import groups_of
-from runner.analysis.readings import read_series
-from runner.analysis.series import RunSeries
+from runner.analysis.series import RunSeries, read_series
 from runner.cli import cli
 from runner.errors import RunnerError
 from runner.export.plots import image

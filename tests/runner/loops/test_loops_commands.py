@@ -18,7 +18,7 @@ from starlette.testclient import TestClient
 
 import runner
 from runner.analysis.evaluations import loop_summary
-from runner.analysis.readings import read_series
+from runner.analysis.series import read_series
 from runner.cli import cli
 from runner.export.contents import shortcomings
 from runner.recording import schema

@@ -9,7 +9,7 @@ import pytest
 import runner
 from runner.analysis.compare.sections import unpaired
 from runner.analysis.groups import groups_of
-from runner.analysis.readings import read_series
+from runner.analysis.series import read_series
 from runner.errors import RunNotFound
 from runner.export.mlflow import _tags
 from runner.recording.reader import open_recording
