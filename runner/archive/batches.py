@@ -9,8 +9,8 @@ from typing import Any, Final
 import pyarrow as pa
 from blake3 import blake3
 
-from runner.archive.columns import Records, checked_batch, merged, record_bytes, shape_of
-from runner.archive.layout import Shape, Table
+from runner.archive.columns import Shape, checked_batch, merged, record_bytes, shape_of
+from runner.archive.layout import Records, Table
 from runner.archive.manifest import Entry
 from runner.archive.rows import message_payload, message_row
 from runner.errors import RecordingError

@@ -1,18 +1,21 @@
-"""Message records of steps and episodes to columns and back: the two directions of one mapping."""
+"""Message records of steps, episodes and resets as columns: one table of columns for both directions."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from runner.archive.layout import PHASES, Shape
-from runner.archive.values import SpaceColumns
+from runner.archive import layout
+from runner.archive.layout import PHASES, SCHEMAS, Column, Records, Table
+from runner.archive.values import SpaceColumns, numbers
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -20,28 +23,203 @@ from runner.recording.blocks import Sizes, blank_records, record_dtype
 from runner.recording.metadata import kind_of, sizes_of, spaces_of
 from runner.recording.reader import Recording
 from runner.recording.recorder import BLOCK_BYTES
-from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.recording.schema import STEP_NANOSECONDS, MessageType, Topic
 
-Records = NDArray[np.void]
-Columns = Mapping[str, pa.Array]
 _TICK: Final = np.uint64(STEP_NANOSECONDS)
 _BLANKS: Final = 16_384
-_WHOLE_OF_STEPS: Final = ("t", "state", "action", "next_state")
-_SAME_OF_STEPS: Final = ("step", "episode", "terminated", "truncated")
-_WHOLE_OF_EPISODES: Final = ("length", "penalties")
-_SAME_OF_TRANSITIONS: Final = ("step", "episode", "terminated", "truncated")
-_WHOLE_OF_TRANSITIONS: Final = ("t", "acted", "agents_terminated", "agents_truncated")
-_SAME_OF_RESETS: Final = ("reset", "episode", "step")
-_SAME_OF_EPISODES: Final = ("episode", "last_step", "success", "terminated", "truncated")
+_INT64, _INT32, _FLOAT, _FLAG = pa.int64(), pa.int32(), pa.float64(), pa.bool_()
+
+
+@dataclass(frozen=True)
+class Shape:
+    """The facts of a run that determine its tables and their columns."""
+
+    run_id: str
+    kind: str
+    """One of `schema.KINDS`."""
+    learners: tuple[str, ...]
+    agents: tuple[str, ...]
+    action_counts: tuple[int, ...]
+    events: tuple[str, ...]
+    sizes: Mapping[Topic, Sizes]
+    """The sizes of each fixed-width topic, for `record_dtype`."""
+    spaces: Mapping[str, SpaceColumns] = field(default_factory=dict)
+    """Of a loop, by the field with the values: `action`, `next_observation`, `observation`."""
+
+    @cached_property
+    def tables(self) -> tuple[Table, ...]:
+        """The tables of messages, without Q-tables, in the order in which they are written."""
+        own = {topic.name: topic for topic in schema.KINDS[self.kind]}
+
+        def table(name: str, *topics: str) -> Table:
+            columns = SCHEMAS[name] if name in SCHEMAS else self.schema_of(own[topics[0]].message)
+            return Table(name, tuple(own[topic] for topic in topics), columns)
+
+        steps = table(layout.STEPS, "/train/step", "/eval/step")
+        episodes = table(layout.EPISODES, "/train/episode", "/eval/episode")
+        log = table(layout.LOG, schema.LOG_TOPIC.name)
+        if self.kind == "job":
+            return (
+                *(steps, episodes),
+                *(table(layout.TRAIN_METRICS, "/train/metrics"), table(layout.EVAL_METRICS, "/eval/metrics")),
+                *(table(layout.OPTIMALITY, "/eval/optimality"), log),
+            )
+        return (
+            *(steps, episodes, table(layout.RESETS, "/train/reset", "/eval/reset")),
+            *(table(layout.INFOS, "/train/info", "/eval/info"), table(layout.SCALARS, "/scalar")),
+            *(table(layout.ARRAYS, "/array"), table(layout.FRAMES, "/train/frame", "/eval/frame"), log),
+        )
+
+    def schema_of(self, message: MessageType) -> pa.Schema:
+        """Return the columns of a message whose columns differ between runs."""
+        own = [(column.name, column.type) for column in self.columns_of(message)]
+        return pa.schema([*layout.PLACED_IN_PHASE, *own])
+
+    def columns_of(self, message: MessageType) -> list[Column]:
+        """Return the columns of a message, without run, phase and position."""
+        if message is schema.STEP:
+            return self._steps
+        if message is schema.TRANSITION:
+            return self._transitions
+        return self._resets if message is schema.RESET else self._episodes
+
+    @property
+    def joint_actions(self) -> int:
+        """The number of joint actions."""
+        return math.prod(self.action_counts)
+
+    def per_learner(self, name: str) -> list[str]:
+        """Return the columns of each learner, such as `reward_taxi_1`; none if there is one learner."""
+        return _names(f"{name}_", self.learners) if len(self.learners) > 1 else []
+
+    @cached_property
+    def own_actions(self) -> list[str]:
+        """The columns of the agents' own actions, such as `action_taxi_1`; none if there is one agent."""
+        return _names("action_", self.agents) if len(self.agents) > 1 else []
+
+    @cached_property
+    def event_columns(self) -> list[str]:
+        """The columns that count events, such as `n_taxi_1_drop_off`."""
+        return _names("n_", self.events)
+
+    @cached_property
+    def _steps(self) -> list[Column]:
+        return [
+            *(_plain("step", _INT64), _plain("episode", _INT64)),
+            *(_plain("t", _INT32), _plain("state", _INT32), _plain("action", _INT32)),
+            *(Column(name, _INT32, self._action_of(i)) for i, name in enumerate(self.own_actions)),
+            _plain("next_state", _INT32),
+            *self._summed("reward", "rewards"),
+            *self._explored(),
+            *(_plain("terminated", _FLAG), _plain("truncated", _FLAG)),
+        ]
+
+    @cached_property
+    def _transitions(self) -> list[Column]:
+        return [
+            *(_plain("step", _INT64), _plain("episode", _INT64), _plain("t", _INT32)),
+            *(*self.spaces["action"].columns, *self.spaces["next_observation"].columns),
+            *self._summed("reward", "rewards"),
+            *(_plain("terminated", _FLAG), _plain("truncated", _FLAG)),
+            *(_plain(name, _INT32) for name in ("acted", "agents_terminated", "agents_truncated")),
+        ]
+
+    @cached_property
+    def _resets(self) -> list[Column]:
+        def read_seed(records: Records) -> pa.Array:
+            return pa.array(np.ascontiguousarray(records["seed"]), pa.uint64(), mask=~records["seeded"])
+
+        def write_seed(records: Records, column: pa.Array) -> None:
+            records["seed"] = numbers(column.fill_null(0))
+            records["seeded"] = numbers(column.is_valid())
+
+        return [
+            *(_plain(name, _INT64) for name in ("reset", "episode", "step")),
+            *(_plain("environment", _INT32), Column("seed", pa.uint64(), read_seed, write_seed)),
+            *self.spaces["observation"].columns,
+        ]
+
+    @cached_property
+    def _episodes(self) -> list[Column]:
+        return [
+            *(_plain("episode", _INT64), _plain("last_step", _INT64)),
+            *(_plain("length", _INT32), _plain("penalties", _INT32)),
+            *self._summed("return", "returns"),
+            *(_plain(name, _FLAG) for name in ("success", "terminated", "truncated")),
+            *(_element(name, _INT32, "events", i) for i, name in enumerate(self.event_columns)),
+        ]
+
+    def _action_of(self, agent: int) -> Any:
+        """Return the function that reads an agent's own action from the joint one."""
+        counts, joint = self.action_counts, np.uint32(self.joint_actions)
+        divisor, count = np.uint32(math.prod(counts[agent + 1 :])), np.uint32(counts[agent])
+        return lambda records: (records["action"] % joint // divisor % count).astype(np.int32)
+
+    def _summed(self, name: str, source: str) -> list[Column]:
+        """Return the column of the learners' sum and, where there are several, one for each."""
+        own = self.per_learner(name)
+        if not own:
+            return [_element(name, _FLOAT, source, 0)]
+        total = Column(name, _FLOAT, lambda records: records[source].sum(axis=1))
+        return [total, *(_element(key, _FLOAT, source, i) for i, key in enumerate(own))]
+
+    def _explored(self) -> list[Column]:
+        """Return the column for any learner's exploration and, where there are several, one for each."""
+
+        def bit(name: str, i: int) -> Column:
+            def write(records: Records, column: pa.Array) -> None:
+                records["explored"] |= numbers(column).astype(np.uint32) << np.uint32(i)
+
+            return Column(
+                name, _FLAG, lambda records: records["explored"] >> np.uint32(i) & np.uint32(1) != 0, write
+            )
+
+        own = [bit(name, i) for i, name in enumerate(self.per_learner("explored"))]
+        any_explored = Column("explored", _FLAG, lambda records: records["explored"] != 0)
+        return [any_explored, *own] if own else [bit("explored", 0)]
+
+
+def _plain(name: str, kind: pa.DataType) -> Column:
+    """Return the column of a field. Unsigned 32-bit numbers become signed, which readers can subtract."""
+
+    def read(records: Records) -> NDArray[Any]:
+        values = np.ascontiguousarray(records[name])
+        return values.view(np.int32) if kind == _INT32 else values
+
+    def write(records: Records, column: pa.Array) -> None:
+        records[name] = numbers(column)
+
+    return Column(name, kind, read, write)
+
+
+def _element(name: str, kind: pa.DataType, source: str, i: int) -> Column:
+    """Return the column of an element of a field that is an array."""
+
+    def read(records: Records) -> NDArray[Any]:
+        values = np.ascontiguousarray(records[source][:, i])
+        return values.view(np.int32) if kind == _INT32 else values
+
+    def write(records: Records, column: pa.Array) -> None:
+        records[source][:, i] = numbers(column)
+
+    return Column(name, kind, read, write)
+
+
+def _names(prefix: str, names: tuple[str, ...]) -> list[str]:
+    """Return a column for each name, numbered if the names would not be unique."""
+    made = [prefix + name.replace(".", "_") for name in names]
+    if len(set(made)) < len(made):
+        made = [f"{prefix}{number}" for number in range(1, len(made) + 1)]
+    return made
 
 
 def shape_of(run: Mapping[str, str], mdp: Mdp | None, where: str) -> Shape:
-    """Return what fixes the tables of a run and their columns.
+    """Return the shape of a run.
 
     Args:
-        run: the recording's metadata record of that name.
+        run: the recording's metadata record `run`.
         mdp: its environment, if that is tabular.
-        where: named in errors.
+        where: the archive or recording, for errors.
 
     Raises:
         RecordingError: they contradict each other.
@@ -57,6 +235,13 @@ def shape_of(run: Mapping[str, str], mdp: Mdp | None, where: str) -> Shape:
             f"{where}: found learners {learners!r} and {len(events)} events, "
             f"expected {run['learners']} and {run['events']}."
         )
+    spaces = {}
+    if kind_of(run) != "job":
+        described = spaces_of(run, where)
+        for name, space in (
+            *(("action", "action"), ("next_observation", "observation"), ("observation", "observation")),
+        ):
+            spaces[name] = SpaceColumns(described[space], name, where)
     return Shape(
         run_id=run["run_id"],
         kind=kind_of(run),
@@ -65,24 +250,15 @@ def shape_of(run: Mapping[str, str], mdp: Mdp | None, where: str) -> Shape:
         action_counts=mdp.action_counts if mdp else (),
         events=events,
         sizes=sizes_of(run, where),
-        spaces=_space_columns(run, where),
+        spaces=spaces,
     )
-
-
-def _space_columns(run: Mapping[str, str], where: str) -> dict[str, SpaceColumns]:
-    """Return the columns of values by the field that holds them; none of a job."""
-    if kind_of(run) == "job":
-        return {}
-    spaces = spaces_of(run, where)
-    fields = {"action": "action", "next_observation": "observation", "observation": "observation"}
-    return {field: SpaceColumns(spaces[space], field, where) for field, space in fields.items()}
 
 
 def merged(recording: Recording, topics: tuple[Topic, Topic]) -> Iterator[tuple[Topic, Records]]:
     """Yield the messages of a topic of training and one of evaluation in the order they were recorded.
 
     Args:
-        recording: whose.
+        recording: the recording.
         topics: two fixed-width topics.
     """
     waiting = [(topic, iter(recording.blocks(topic))) for topic in topics]
@@ -101,54 +277,50 @@ def merged(recording: Recording, topics: tuple[Topic, Topic]) -> Iterator[tuple[
 
 def batch_of(topic: Topic, records: Records, shape: Shape) -> pa.RecordBatch:
     """Return the columns of message records of one fixed-width topic, [n] rows."""
-    columns, _ = _WAYS[topic.message]
-    made = {
-        "run_id": _constant(0, len(records), [shape.run_id]),
-        "phase": _constant(PHASES.index(topic.phase), len(records), PHASES),
-        "position": (records["log_time"] // _TICK).astype(np.int64),
-        **columns(records, shape),
-    }
-    table = shape.columns_of(topic.message)
-    arrays = [made[field.name] for field in table]
-    ready = [
-        one if isinstance(one, pa.Array) else pa.array(one, field.type)
-        for one, field in zip(arrays, table, strict=True)
+    n = len(records)
+    arrays = [
+        _constant(0, n, (shape.run_id,)),
+        _constant(PHASES.index(topic.phase), n, PHASES),
+        pa.array((records["log_time"] // _TICK).astype(np.int64)),
     ]
-    return pa.record_batch(ready, schema=table)
+    for column in shape.columns_of(topic.message):
+        values = column.read(records)
+        arrays.append(values if isinstance(values, pa.Array) else pa.array(values, column.type))
+    return pa.record_batch(arrays, schema=shape.schema_of(topic.message))
 
 
 def records_of(topic: Topic, batch: pa.RecordBatch, shape: Shape) -> Records:
     """Return the message records of rows that are all of one topic."""
     records = _blanks(topic, shape.sizes[topic], batch.num_rows)
-    columns = {name: batch.column(name) for name in batch.schema.names if name not in ("run_id", "phase")}
-    times = _numbers(columns.pop("position")).astype(np.uint64) * _TICK
+    times = numbers(batch.column("position")).astype(np.uint64) * _TICK
     records["log_time"] = records["publish_time"] = times
-    _, fill = _WAYS[topic.message]
-    fill(records, columns, shape)
+    for column in shape.columns_of(topic.message):
+        if column.write is not None:
+            column.write(records, batch.column(column.name))
     return records
 
 
 def checked_batch(topic: Topic, records: Records, shape: Shape, where: str) -> pa.RecordBatch:
-    """Return the columns of message records, after comparing what they are turned back into.
+    """Return the columns of message records, which turn back into exactly these records.
 
     Raises:
-        RecordingError: it is not the same, to the byte: they hold what no recorder writes.
+        RecordingError: they do not: the records have what no recorder writes.
     """
     batch = batch_of(topic, records, shape)
-    back = records_of(topic, batch, shape)
-    found, told = (rows.view(np.uint8).reshape(len(records), -1) for rows in (records, back))
-    if not np.array_equal(found, told):
-        differs = (found != told).any(axis=1)
+    restored = records_of(topic, batch, shape)
+    found, expected = (rows.view(np.uint8).reshape(len(records), -1) for rows in (records, restored))
+    if not np.array_equal(found, expected):
+        differs = (found != expected).any(axis=1)
         number = int(records[int(differs.argmax())][schema.NUMBERED_BY[topic.message]])
         raise RecordingError(
-            f"{where}: message {number} of {topic.name} holds what no recorder writes, so that columns "
-            "cannot hold it; `dualtaxi verify` tells more."
+            f"{where}: message {number} of {topic.name} has what no recorder writes, so that it cannot be "
+            "archived; `dualtaxi verify` names the damage."
         )
     return batch
 
 
 def record_bytes(records: Records) -> memoryview:
-    """Return the bytes of message records that stand one behind the other."""
+    """Return the bytes of contiguous message records."""
     return records.view(np.uint8).data.cast("B")
 
 
@@ -156,23 +328,23 @@ def of_phase(batch: pa.RecordBatch, phase: str, where: str) -> pa.RecordBatch:
     """Return the rows of one phase.
 
     Raises:
-        RecordingError: there are others than training's and evaluation's.
+        RecordingError: there is a phase other than training and evaluation.
     """
     column = batch.column("phase")
-    words = column.dictionary.to_pylist()
-    codes = _numbers(column.indices)
-    if not {words[code] for code in np.unique(codes)} <= set(PHASES):
-        raise RecordingError(f"{where}: found phases {words}, expected {list(PHASES)}.")
-    chosen = codes == words.index(phase) if phase in words else np.zeros(len(codes), np.bool_)
+    names = column.dictionary.to_pylist()
+    codes = numbers(column.indices)
+    if not {names[code] for code in np.unique(codes)} <= set(PHASES):
+        raise RecordingError(f"{where}: found phases {names}, expected {list(PHASES)}.")
+    chosen = codes == names.index(phase) if phase in names else np.zeros(len(codes), np.bool_)
     return batch if chosen.all() else batch.filter(pa.array(chosen))
 
 
 def _blanks(topic: Topic, sizes: Sizes, n: int) -> Records:
-    """Return n blank records: if they are small, copied from others, which is quicker than to make them."""
-    most = -(-n // _BLANKS) * _BLANKS
-    if most * record_dtype(topic.message, sizes).itemsize > BLOCK_BYTES:
+    """Return n blank records, which are copied from cached ones if they are small: that is quicker."""
+    rounded = -(-n // _BLANKS) * _BLANKS
+    if rounded * record_dtype(topic.message, sizes).itemsize > BLOCK_BYTES:
         return blank_records(topic, sizes, n)
-    return _blank(topic, sizes, most)[:n].copy()
+    return _blank(topic, sizes, rounded)[:n].copy()
 
 
 @lru_cache(8)
@@ -180,105 +352,5 @@ def _blank(topic: Topic, sizes: Sizes, n: int) -> Records:
     return blank_records(topic, sizes, n)
 
 
-def _step_columns(records: Records, shape: Shape) -> dict[str, Any]:
-    columns: dict[str, Any] = {name: _int32(records[name]) for name in _WHOLE_OF_STEPS}
-    columns |= {name: np.ascontiguousarray(records[name]) for name in _SAME_OF_STEPS}
-    if shape.own_actions:
-        own = np.unravel_index(records["action"] % np.uint32(shape.joint_actions), shape.action_counts)
-        columns |= dict(zip(shape.own_actions, (digit.astype(np.int32) for digit in own), strict=True))
-    columns["explored"] = records["explored"] != 0
-    for i, name in enumerate(shape.per_learner("explored")):
-        columns[name] = (records["explored"] >> np.uint32(i) & np.uint32(1)) != 0
-    return columns | _summed("reward", records["rewards"], shape)
-
-
-def _fill_steps(records: Records, columns: Columns, shape: Shape) -> None:
-    for name in (*_WHOLE_OF_STEPS, *_SAME_OF_STEPS):
-        records[name] = _numbers(columns[name])
-    explored = shape.per_learner("explored") or ["explored"]
-    for i, name in enumerate(explored):
-        records["explored"] |= _numbers(columns[name]).astype(np.uint32) << np.uint32(i)
-    _fill_summed(records["rewards"], "reward", columns, shape)
-
-
-def _transition_columns(records: Records, shape: Shape) -> dict[str, Any]:
-    columns: dict[str, Any] = {name: _int32(records[name]) for name in _WHOLE_OF_TRANSITIONS}
-    columns |= {name: np.ascontiguousarray(records[name]) for name in _SAME_OF_TRANSITIONS}
-    for name in ("action", "next_observation"):
-        columns |= shape.spaces[name].columns(records[name])
-    return columns | _summed("reward", records["rewards"], shape)
-
-
-def _fill_transitions(records: Records, columns: Columns, shape: Shape) -> None:
-    for name in (*_WHOLE_OF_TRANSITIONS, *_SAME_OF_TRANSITIONS):
-        records[name] = _numbers(columns[name])
-    for name in ("action", "next_observation"):
-        shape.spaces[name].fill(records[name], columns)
-    _fill_summed(records["rewards"], "reward", columns, shape)
-
-
-def _reset_columns(records: Records, shape: Shape) -> dict[str, Any]:
-    columns: dict[str, Any] = {name: np.ascontiguousarray(records[name]) for name in _SAME_OF_RESETS}
-    columns["environment"] = _int32(records["environment"])
-    seed = np.ascontiguousarray(records["seed"])
-    columns["seed"] = pa.array(seed, pa.uint64(), mask=~records["seeded"])
-    return columns | shape.spaces["observation"].columns(records["observation"])
-
-
-def _fill_resets(records: Records, columns: Columns, shape: Shape) -> None:
-    for name in (*_SAME_OF_RESETS, "environment"):
-        records[name] = _numbers(columns[name])
-    records["seed"] = _numbers(columns["seed"].fill_null(0))
-    records["seeded"] = _numbers(columns["seed"].is_valid())
-    shape.spaces["observation"].fill(records["observation"], columns)
-
-
-def _episode_columns(records: Records, shape: Shape) -> dict[str, Any]:
-    columns: dict[str, Any] = {name: _int32(records[name]) for name in _WHOLE_OF_EPISODES}
-    columns |= {name: np.ascontiguousarray(records[name]) for name in _SAME_OF_EPISODES}
-    columns |= {name: _int32(records["events"][:, i]) for i, name in enumerate(shape.event_columns)}
-    return columns | _summed("return", records["returns"], shape)
-
-
-def _fill_episodes(records: Records, columns: Columns, shape: Shape) -> None:
-    for name in (*_WHOLE_OF_EPISODES, *_SAME_OF_EPISODES):
-        records[name] = _numbers(columns[name])
-    for i, name in enumerate(shape.event_columns):
-        records["events"][:, i] = _numbers(columns[name])
-    _fill_summed(records["returns"], "return", columns, shape)
-
-
-_WAYS: Final = {
-    schema.STEP: (_step_columns, _fill_steps),
-    schema.TRANSITION: (_transition_columns, _fill_transitions),
-    schema.EPISODE: (_episode_columns, _fill_episodes),
-    schema.RESET: (_reset_columns, _fill_resets),
-}
-"""To columns and back, by the message."""
-
-
-def _summed(name: str, values: NDArray[np.float64], shape: Shape) -> dict[str, Any]:
-    """Return what the learners got, [n, L], as columns: together and, where there are several, each."""
-    own = dict(zip(shape.per_learner(name), values.T, strict=False))
-    together = values.sum(axis=1) if own else np.ascontiguousarray(values[:, 0])
-    return {name: together} | {key: np.ascontiguousarray(column) for key, column in own.items()}
-
-
-def _fill_summed(values: NDArray[np.float64], name: str, columns: Columns, shape: Shape) -> None:
-    for i, key in enumerate(shape.per_learner(name) or [name]):
-        values[:, i] = _numbers(columns[key])
-
-
-def _int32(values: NDArray[np.uint32]) -> NDArray[np.int32]:
-    """Return numbers as signed ones, which readers can subtract; none of ours is as large as 2**31."""
-    return np.ascontiguousarray(values).view(np.int32)
-
-
-def _constant(code: int, n: int, words: Sequence[str]) -> pa.DictionaryArray:
-    return pa.DictionaryArray.from_arrays(pa.array(np.full(n, code, np.int8)), pa.array(words, pa.string()))
-
-
-def _numbers(column: pa.Array) -> NDArray[Any]:
-    """Return a column as an array: a view where it can be one."""
-    values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
-    return values
+def _constant(code: int, n: int, names: tuple[str, ...]) -> pa.DictionaryArray:
+    return pa.DictionaryArray.from_arrays(pa.array(np.full(n, code, np.int8)), pa.array(names, pa.string()))

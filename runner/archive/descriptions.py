@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from runner.archive import layout
-from runner.archive.layout import Shape
+from runner.archive.columns import Shape
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.errors import RecordingError

@@ -15,8 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from runner.archive import layout
-from runner.archive.columns import shape_of
-from runner.archive.layout import Shape
+from runner.archive.columns import Shape, shape_of
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
 from runner.archive.pages import largest_page
 from runner.environments.mdp import Mdp

@@ -14,8 +14,8 @@ import numpy as np
 from blake3 import blake3
 
 from runner.archive import layout
-from runner.archive.columns import Records, of_phase, record_bytes, records_of
-from runner.archive.layout import Table
+from runner.archive.columns import of_phase, record_bytes, records_of
+from runner.archive.layout import Records, Table
 from runner.archive.manifest import Entry, Manifest
 from runner.archive.reading import Archive
 from runner.archive.rows import message_payload

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from blake3 import blake3
 
-from runner.archive.layout import Shape
+from runner.archive.columns import Shape
 from runner.recording import schema
 from runner.recording.messages import QTable, decode, encode, encode_image, encode_log
 from runner.recording.schema import STEP_NANOSECONDS, Topic

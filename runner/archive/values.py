@@ -1,11 +1,11 @@
-"""Values of a space to columns and back: a column a number where there are few, else an array's bytes in one.
+"""Values of a space as columns: one for each number if there are few, else one with the bytes of the array.
 
     Box(4,) float32              action_0, action_1, action_2, action_3
     Dict(at=Box(2,), image=Box(84, 84, 3))
                                  observation_at_0, observation_at_1, observation_image (bytes, row by row)
     Text                         one column of text
 
-Columns are named by the way to the number: keys of `Dict`s, places in `Tuple`s and arrays.
+Names are the path to the number: keys of `Dict`s, positions in `Tuple`s and arrays.
 """
 
 from __future__ import annotations
@@ -14,123 +14,115 @@ import itertools
 import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from runner.archive.layout import Column, Records
 from runner.recording.spaces import Leaf, encode_text, leaves_of
 
-MOST_NUMBERS: Final = 64
-"""An array of more numbers is one column of bytes."""
-MOST_COLUMNS: Final = 1024
-"""In a space that would have more columns, every array is one of bytes."""
+MAX_NUMBERS: Final = 64
+"""An array with more numbers is one column of bytes."""
+MAX_COLUMNS: Final = 1024
+"""In a space with more columns than this, every array is one column of bytes."""
 _LENGTH: Final = struct.Struct("<I")
 
 
 @dataclass(frozen=True)
 class _LeafColumns:
-    """The columns of a leaf: one a number, or one for all of it."""
+    """The columns of a leaf: one for each number, or one for all of it."""
 
     leaf: Leaf
     names: tuple[str, ...]
-    spread: bool
+    is_spread: bool
 
     @property
-    def base(self) -> np.dtype[Any]:
-        """The dtype of one of its numbers."""
+    def dtype(self) -> np.dtype[Any]:
+        """The dtype of a value."""
         assert self.leaf.dtype is not None
-        return self.leaf.dtype.base
+        return self.leaf.dtype
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """The shape of a value."""
-        assert self.leaf.dtype is not None
-        return self.leaf.dtype.shape
-
-    @property
-    def bytes(self) -> int:
-        """The bytes of a value."""
-        assert self.leaf.dtype is not None
-        return self.leaf.dtype.itemsize
-
-    @property
-    def kind(self) -> pa.DataType:
-        """The type of its columns; numbers of 16 bits with a point are widened, for what reads tables."""
+    def columns(self, field: str) -> Iterator[Column]:
+        """Yield the columns; they are read from a field of records."""
         if self.leaf.dtype is None:
-            return pa.string()
-        if not self.spread:
-            return pa.binary(self.bytes)
-        return pa.from_numpy_dtype(_held(self.base))
+            yield from (Column(name, pa.string(), _not_fixed) for name in self.names)
+        elif self.is_spread:
+            places = np.ndindex(self.dtype.shape)
+            yield from (self._number(field, name, at) for name, at in zip(self.names, places, strict=True))
+        else:
+            yield from (self._bytes(field, name) for name in self.names)
+
+    def _number(self, field: str, name: str, at: tuple[int, ...]) -> Column:
+        base = self.dtype.base
+        index: tuple[slice | int, ...] = (slice(None), *at)
+        # 16-bit floats are widened for programs that read tables
+        held = np.dtype("<f4") if base == np.dtype("<f2") else base.newbyteorder("=")
+
+        def read(records: Records) -> NDArray[Any]:
+            return np.ascontiguousarray(self._inside(records[field])[index].astype(held, copy=False))
+
+        def write(records: Records, column: pa.Array) -> None:
+            self._inside(records[field])[index] = numbers(column)
+
+        return Column(name, pa.from_numpy_dtype(held), read, write)
+
+    def _bytes(self, field: str, name: str) -> Column:
+        size = self.dtype.itemsize
+        kind = pa.binary(size)
+
+        def read(records: Records) -> pa.Array:
+            own = np.ascontiguousarray(self._inside(records[field]))
+            buffers = [None, pa.py_buffer(own.view(np.uint8).data)]
+            return pa.FixedSizeBinaryArray.from_buffers(kind, len(records), buffers)
+
+        def write(records: Records, column: pa.Array) -> None:
+            raw = np.frombuffer(column.buffers()[1], np.uint8)[column.offset * size :][: len(records) * size]
+            self._inside(records[field])[...] = raw.view(self.dtype.base).reshape(-1, *self.dtype.shape)
+
+        return Column(name, kind, read, write)
+
+    def _inside(self, values: NDArray[Any]) -> NDArray[Any]:
+        for name in self.leaf.path:
+            values = values[name]
+        return values
 
 
 class SpaceColumns:
     """The columns of the values of a space.
 
     Args:
-        description: the space's, as the recording has it.
-        prefix: what the names of its columns begin with: `action`.
-        where: named in errors.
+        description: the space's description in the recording.
+        field: the field of records with the values, and the prefix of the columns' names.
+        where: the archive or recording, for errors.
 
     Raises:
-        RecordingError: this describes no space.
+        RecordingError: the description is not of a space.
     """
 
-    def __init__(self, description: Mapping[str, Any], prefix: str, where: str) -> None:
-        self._parts = _named(leaves_of(description, where), prefix)
-        self.fields: list[pa.Field] = [
-            pa.field(name, part.kind) for part in self._parts for name in part.names
-        ]
-
-    def columns(self, values: NDArray[Any]) -> dict[str, Any]:
-        """Return the columns of values of fixed width, [n] of the space's dtype."""
-        made: dict[str, Any] = {}
-        for part in self._parts:
-            own = np.ascontiguousarray(_inside(values, part.leaf))
-            if part.spread:
-                flat = own.reshape(len(values), len(part.names)).astype(_held(part.base), copy=False)
-                made |= {name: np.ascontiguousarray(flat[:, i]) for i, name in enumerate(part.names)}
-            elif part.names:
-                buffers = [None, pa.py_buffer(own.view(np.uint8).data)]
-                made[part.names[0]] = pa.FixedSizeBinaryArray.from_buffers(part.kind, len(values), buffers)
-        return made
-
-    def fill(self, values: NDArray[Any], columns: Mapping[str, pa.Array]) -> None:
-        """Fill in values of fixed width, [n], from their columns."""
-        for part in self._parts:
-            own = _inside(values, part.leaf)
-            if part.spread:
-                for at, name in zip(np.ndindex(part.shape), part.names, strict=True):
-                    own[(slice(None), *at)] = columns[name].to_numpy(zero_copy_only=False)
-            elif part.names:
-                column = columns[part.names[0]]
-                raw = np.frombuffer(column.buffers()[1], np.uint8)
-                start = column.offset * part.bytes
-                own[...] = (
-                    raw[start : start + len(values) * part.bytes]
-                    .view(part.base)
-                    .reshape(len(values), *part.shape)
-                )
+    def __init__(self, description: Mapping[str, Any], field: str, where: str) -> None:
+        self._leaves = _named(leaves_of(description, where), field)
+        self.columns: list[Column] = [column for leaf in self._leaves for column in leaf.columns(field)]
 
     def row(self, value: bytes) -> dict[str, Any]:
-        """Return the columns of one value as it stands in a recording.
+        """Return the columns of one encoded value.
 
         Raises:
-            ValueError: it is no value of the space.
+            ValueError: it is not a value of the space.
         """
         row: dict[str, Any] = {}
         at = 0
-        for part in self._parts:
+        for part in self._leaves:
             if part.leaf.dtype is None:
                 start = at + _LENGTH.size
                 at = start + int.from_bytes(value[at:start], "little")
                 row[part.names[0]] = value[start:at].decode()
                 continue
-            own, at = value[at : at + part.bytes], at + part.bytes
-            if part.spread:
-                row |= zip(part.names, np.frombuffer(own, part.base).tolist(), strict=True)
+            own, at = value[at : at + part.dtype.itemsize], at + part.dtype.itemsize
+            if part.is_spread:
+                row |= zip(part.names, np.frombuffer(own, part.dtype.base).tolist(), strict=True)
             elif part.names:
                 row[part.names[0]] = own
         if at != len(value):
@@ -138,34 +130,30 @@ class SpaceColumns:
         return row
 
     def value(self, row: Mapping[str, Any]) -> bytes:
-        """Return the value that `row` came from, as it stands in a recording."""
-        return b"".join(self._pieces(row))
-
-    def _pieces(self, row: Mapping[str, Any]) -> Iterator[bytes]:
-        for part in self._parts:
+        """Return the encoded value of a row of columns."""
+        pieces = []
+        for part in self._leaves:
             if part.leaf.dtype is None:
-                yield encode_text(row[part.names[0]])
-            elif part.spread:
-                yield np.array([row[name] for name in part.names], part.base).tobytes()
+                pieces.append(encode_text(row[part.names[0]]))
+            elif part.is_spread:
+                pieces.append(np.array([row[name] for name in part.names], part.dtype.base).tobytes())
             elif part.names:
-                yield row[part.names[0]]
+                pieces.append(row[part.names[0]])
+        return b"".join(pieces)
 
 
 def _named(leaves: Sequence[Leaf], prefix: str) -> list[_LeafColumns]:
-    """Return the columns of the leaves; they are numbered where their names would not differ."""
-    few = sum(map(_numbers, leaves)) <= MOST_COLUMNS
+    """Return the columns of the leaves, numbered if their names would not be unique."""
+    few = sum(map(_spreadable, leaves)) <= MAX_COLUMNS
     made = []
     for leaf in leaves:
-        spread = leaf.dtype is not None and (not leaf.dtype.shape or (few and bool(_numbers(leaf))))
+        spread = leaf.dtype is not None and (not leaf.dtype.shape or (few and bool(_spreadable(leaf))))
         made.append(_LeafColumns(leaf, tuple(_names(leaf, prefix, spread)), spread))
-    known = [name for part in made for name in part.names]
-    if len(set(known)) == len(known):
+    names = [name for part in made for name in part.names]
+    if len(set(names)) == len(names):
         return made
     numbered = (f"{prefix}_{number}" for number in itertools.count(1))
-    return [
-        _LeafColumns(part.leaf, tuple(itertools.islice(numbered, len(part.names))), part.spread)
-        for part in made
-    ]
+    return [replace(part, names=tuple(itertools.islice(numbered, len(part.names)))) for part in made]
 
 
 def _names(leaf: Leaf, prefix: str, spread: bool) -> Iterator[str]:
@@ -177,18 +165,17 @@ def _names(leaf: Leaf, prefix: str, spread: bool) -> Iterator[str]:
         yield name
 
 
-def _numbers(leaf: Leaf) -> int:
-    """Return how many numbers a leaf has, if they are few enough for a column each; else 0."""
+def _spreadable(leaf: Leaf) -> int:
+    """Return the count of numbers in a leaf, if they are few enough for a column each; else 0."""
     count = math.prod(leaf.dtype.shape) if leaf.dtype is not None else 0
-    return count if count <= MOST_NUMBERS else 0
+    return count if count <= MAX_NUMBERS else 0
 
 
-def _inside(values: NDArray[Any], leaf: Leaf) -> NDArray[Any]:
-    for name in leaf.path:
-        values = values[name]
+def _not_fixed(records: Records) -> Any:
+    raise TypeError(f"a text is not of fixed width: {records.dtype}")
+
+
+def numbers(column: pa.Array) -> NDArray[Any]:
+    """Return a column as an array: a view where possible."""
+    values: NDArray[Any] = column.to_numpy(zero_copy_only=False)
     return values
-
-
-def _held(base: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the dtype of a column of these numbers."""
-    return np.dtype("<f4") if base == np.dtype("<f2") else base.newbyteorder("=")

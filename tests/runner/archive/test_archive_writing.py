@@ -85,7 +85,7 @@ def test_a_message_that_columns_cannot_hold_is_refused_and_named(run, tmp_path):
     (tmp_path / "archive").mkdir()
     with (
         open_recording(path) as recording,
-        pytest.raises(RecordingError, match=r"message 7 of /train/step holds what no recorder writes"),
+        pytest.raises(RecordingError, match=r"message 7 of /train/step has what no recorder writes"),
     ):
         write_archive(recording, tmp_path / "archive")
 
