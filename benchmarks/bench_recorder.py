@@ -14,7 +14,7 @@ from benchmarks.figures import Figure, figure, seconds
 from benchmarks.learners import NO_LIMIT, blocks, tutorial_learner
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
-from runner.recording.protobuf import file_descriptor_set
+from runner.recording.messages import file_descriptor_set
 from runner.recording.recorder import Recorder
 from runner.recording.writer import RecordingFile
 from runner.util.packing import Packing

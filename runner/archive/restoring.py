@@ -23,12 +23,11 @@ from runner.config import from_mapping
 from runner.config.loading import packing_from
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.batching import Piles
 from runner.recording.blocks import HEADER_BYTES, message_record
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.messages import QTable, encode_q_table
 from runner.recording.metadata import json_object
-from runner.recording.pipeline import Pipeline
+from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reader import open_recording
 from runner.recording.recorder import BLOCK_BYTES, capacity_of
 from runner.recording.schema import STEP_NANOSECONDS, Topic
@@ -97,7 +96,7 @@ class _Restoring:
         packing = _packing_of(archive)
         self._chunk_steps = packing.chunk_steps
         self._pipeline = Pipeline(file, packing, lambda: None)
-        self._piles = Piles(self._send)
+        self._batches = MessageBatches(self._send)
         self._room = threading.Semaphore(_UNDER_WAY)
         topics = schema.KINDS[archive.kind]
         self._undigested = {topic: blake3() for topic in topics if not topic.digested}
@@ -110,7 +109,7 @@ class _Restoring:
             self._describe()
             for table in self._shape.tables:
                 self._restore_table(table)
-                self._piles.flush()
+                self._batches.flush()
         finally:
             self._pipeline.close()
         self._pipeline.raise_failure()
@@ -189,16 +188,16 @@ class _Restoring:
             )
         if not topic.digested:
             self._undigested[topic].update(message_record(topic, time, payload))
-        self._piles.add(topic, time, payload)
+        self._batches.extend(topic, [time], [payload])
         if topic.message is schema.IMAGE or self._archive.kind == "job":
-            self._piles.flush()
+            self._batches.flush()
         self._count_steps(topic, 1)
 
     def _send(self, topic: Topic, records: memoryview, times: Any, offsets: Any) -> None:
         self._pipeline.raise_failure()
         self._counts[topic.name] += len(times)
         self._room.acquire()
-        self._pipeline.send(topic, records, times, offsets, used=self._room.release)
+        self._pipeline.send(topic, records, times, offsets, done=self._room.release)
 
     def _rows(self, table: Table) -> Iterator[dict[str, Any]]:
         """Yield the rows of a table."""

@@ -41,7 +41,7 @@ from runner.recording.liveness import owner
 from runner.recording.metadata import NEEDED
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Contents
-from runner.recording.reference import Past
+from runner.recording.reference import Reference
 from runner.recording.writer import RecordingFile, storage_error
 from runner.runs.locking import locked
 from runner.runs.provenance import Differences, differing_provenance, provenance
@@ -131,9 +131,9 @@ def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop) -> Run:
             _opened(path, contents, job, run, learner, changes) as file,
             open_recording(path) as recording,
         ):
-            past = Past(recording, without_steps=job.config.recording.steps == "none")
-            recorder = recorder_for(job, learner, file, past, beat=run.beat)
-            session = _ResumedSession(recording, past, job, learner, recorder, report, stop)
+            reference = Reference(recording, without_steps=job.config.recording.steps == "none")
+            recorder = recorder_for(job, learner, file, reference, beat=run.beat)
+            session = _ResumedSession(recording, reference, job, learner, recorder, report, stop)
             done = execute(session, file, run, started)
     except BaseException as error:
         _mark_failed(run, error)
@@ -239,15 +239,15 @@ def _complete(run: Run, path: Path) -> Run:
 class _ResumedSession(Session):
     """A session whose summary covers all that is recorded, also if it is stopped before the end of that."""
 
-    def __init__(self, recording: Recording, past: Past, *session: Any) -> None:
+    def __init__(self, recording: Recording, reference: Reference, *session: Any) -> None:
         super().__init__(*session)
         self._recording = recording
-        self._past = past
+        self._reference = reference
 
     def summary(self, topics: dict[str, str]) -> dict[str, Any]:
         """Return the summary of the run."""
         summary, recording = super().summary(topics), self._recording
-        if self._past.exhausted:
+        if self._reference.exhausted:
             return summary
         counts = {topic.name: recording.count(topic) for topic in schema.TOPICS}
         evaluations = recording.metrics("eval")

@@ -31,7 +31,7 @@ from runner.recording.metadata import (
 )
 from runner.recording.metrics import METRICS, defined_metrics
 from runner.recording.recorder import Recorder
-from runner.recording.reference import Past
+from runner.recording.reference import Reference
 from runner.recording.writer import RecordingFile, create_recording
 from runner.runs import run as runs
 from runner.runs.provenance import provenance
@@ -345,7 +345,7 @@ def recorder_for(
     job: Job,
     learner: Learner,
     file: RecordingFile | None,
-    past: Past | None = None,
+    reference: Reference | None = None,
     beat: Callable[[], None] = lambda: None,
     threads: bool = True,
 ) -> Recorder:
@@ -357,7 +357,7 @@ def recorder_for(
         events=len(learner.mdp.event_names),
         packing=options.packing,
         record_steps=options.steps == "all",
-        past=past,
+        reference=reference,
         beat=beat,
         threads=threads,
     )

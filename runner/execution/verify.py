@@ -35,7 +35,7 @@ from runner.recording.digest import ContentHash
 from runner.recording.integrity import check_integrity, may_be_cut, survey
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Report as BytesReport
-from runner.recording.reference import Past
+from runner.recording.reference import Reference
 from runner.runs.provenance import Differences, differing_provenance
 from runner.util.files import open_regular
 
@@ -219,7 +219,7 @@ def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> 
     env = job.config.env
     mdp = load_mdp(env.id, env.kwargs, job.config.rewards) if rerun else recording.mdp
     complete = recording.status == "finished"
-    reference = Past(recording, complete, without_steps=job.config.recording.steps == "none")
+    reference = Reference(recording, complete, without_steps=job.config.recording.steps == "none")
     learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))
     recorder = recorder_for(job, learner, None, reference)
     variable = set(schema.TOPICS) - set(schema.BLOCK_TOPICS) - {schema.LOG_TOPIC}

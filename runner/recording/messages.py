@@ -1,4 +1,4 @@
-"""Messages of variable size, to and from protobuf: metrics, tables, arrays, log lines, pictures."""
+"""Messages as protobuf: their descriptors and classes, and those of variable size encoded and decoded."""
 
 from __future__ import annotations
 
@@ -6,18 +6,63 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import varint
-from runner.recording.protobuf import message_class
-from runner.recording.schema import STEP_NANOSECONDS, MessageType
+from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, MessageType
 from runner.recording.spaces import NUMBERS
+
+
+@cache
+def file_descriptor_set(message: MessageType) -> bytes:
+    """Return the schema of a message as MCAP wants it: a serialized FileDescriptorSet with its imports."""
+    return descriptor_pb2.FileDescriptorSet(file=_files(message)).SerializeToString(deterministic=True)
+
+
+@cache
+def message_class(message: MessageType) -> Any:
+    """Return the protobuf class of a message."""
+    pool = descriptor_pool.DescriptorPool()
+    for file in _files(message):
+        pool.AddSerializedFile(file.SerializeToString())
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(message.full_name))
+
+
+def _files(message: MessageType) -> list[descriptor_pb2.FileDescriptorProto]:
+    """Return the file that describes a message, after the files it imports."""
+    file = descriptor_pb2.FileDescriptorProto(
+        name=f"{message.package}/{message.name}.proto", package=message.package, syntax="proto3"
+    )
+    described = file.message_type.add(name=message.name)
+    imports = []
+    for field in message.fields:
+        added = described.field.add(
+            name=field.stored_name,
+            number=field.number,
+            type=field.kind,
+            label=Pb.LABEL_REPEATED if field.repeated else Pb.LABEL_OPTIONAL,
+        )
+        if field.kind == Pb.TYPE_MESSAGE:
+            added.type_name = ".google.protobuf.Timestamp"
+            timestamp = descriptor_pb2.FileDescriptorProto()
+            timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
+            imports.append(timestamp)
+            file.dependency.append(timestamp.name)
+        elif field.kind == Pb.TYPE_ENUM:
+            added.type_name = f".{message.full_name}.Level"
+            levels = described.enum_type.add(name="Level")
+            for number, name in enumerate(LOG_LEVELS):
+                levels.value.add(name=name, number=number)
+    return [*imports, file]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +78,7 @@ class QTable:
 
 
 def encode(message: MessageType, values: Mapping[str, Any]) -> bytes:
-    """Return the message with these field values; a field that is missing is protobuf's zero."""
+    """Return the message with these field values; a missing field is protobuf's zero."""
     stored = {field.name: field.stored_as for field in message.fields if field.stored_as}
     values = {stored.get(name, name): value for name, value in values.items()}
     return bytes(message_class(message)(**values).SerializeToString(deterministic=True))
@@ -42,8 +87,8 @@ def encode(message: MessageType, values: Mapping[str, Any]) -> bytes:
 def scalar_encoder(name: str, phase: str) -> Callable[[float, int, int], bytes]:
     """Return a function that encodes `dualtaxi.Scalar` messages, from value, step and episode.
 
-    It returns the bytes that `encode` returns, in a tenth of the time, because only three numbers change.
-    Neither name nor phase may be empty.
+    It gives the same bytes as `encode`, in a tenth of the time, because only three numbers change. Neither
+    name nor phase may be empty.
     """
     named, phased = name.encode(), phase.encode()
     head = b"\n" + varint(len(named)) + named
@@ -70,7 +115,7 @@ def decode(message: MessageType, payload: bytes) -> dict[str, Any]:
     """Return the values of a message's fields; repeated ones as lists.
 
     Raises:
-        RecordingError: the payload is no such message.
+        RecordingError: the payload is not such a message.
     """
     try:
         parsed = message_class(message).FromString(payload)
@@ -148,7 +193,7 @@ def encode_log(text: str, seconds: float, level: str = "INFO", name: str = "dual
         schema.LOG,
         {
             "timestamp": {"seconds": whole, "nanos": round((seconds - whole) * 1e9)},
-            "level": schema.LOG_LEVELS.index(level),
+            "level": LOG_LEVELS.index(level),
             "message": text,
             "name": name,
         },
@@ -156,7 +201,7 @@ def encode_log(text: str, seconds: float, level: str = "INFO", name: str = "dual
 
 
 def encode_image(data: bytes, kind: str, position: int, phase: str) -> bytes:
-    """Return a `foxglove.CompressedImage` after so many steps; `kind` is `png` or `jpeg`."""
+    """Return a `foxglove.CompressedImage` logged after `position` steps; `kind` is `png` or `jpeg`."""
     seconds, nanos = divmod(position * STEP_NANOSECONDS, 10**9)
     stamp = {"seconds": seconds, "nanos": nanos}
     return encode(schema.IMAGE, {"timestamp": stamp, "data": data, "format": kind, "frame_id": phase})

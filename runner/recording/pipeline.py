@@ -1,9 +1,9 @@
-"""From records to the file, beside the thread that learns: threads that checksum, compress and write.
+"""From records to the file, off the thread that learns: threads that checksum, compress and write.
 
     send(records) -> encoder threads (checksum, compression) -> writer thread (digest, file)
 
-Work reaches the digest and the file in the order it was sent; how much can be under way is bounded. Where
-there is one processor for all, whoever sends does it: handing it over would only cost.
+Work reaches the digest and the file in the order in which it was sent; how much is pending is bounded. On a
+single processor the sending thread does the work itself: handing it over would only cost time.
 """
 
 from __future__ import annotations
@@ -12,16 +12,16 @@ import contextlib
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.recording.blocks import message_record
+from runner.recording.blocks import HEADER_BYTES, MESSAGE_HEAD, RECORD_HEAD, message_record
 from runner.recording.chunks import Chunk, encode_chunk
 from runner.recording.digest import ContentHash
 from runner.recording.schema import Topic
@@ -29,35 +29,41 @@ from runner.recording.writer import RecordingFile, storage_error
 from runner.util.packing import Packing
 
 ENCODERS: Final = 2
-WORK_UNDER_WAY: Final = 32
-MOST_HELD: Final = 4
+MAX_PENDING: Final = 32
+MAX_HELD: Final = 4
 """Pieces of work that are held before threads are started; fewer than a topic has buffers."""
 SYNC_SECONDS: Final = 5.0
-"""How often the system is asked to put on disk what was written."""
+"""Interval at which what was written is synced to disk."""
+MAX_BATCH_BYTES: Final = 1 << 18
+MAX_BATCH_MESSAGES: Final = 4096
 _BEAT_SECONDS: Final = 1.0
+
+Send = Callable[[Topic, memoryview, NDArray[np.uint64], NDArray[np.uint64]], None]
+"""Takes the records of a topic, their times in nanoseconds, and where each begins."""
 
 
 @dataclass(frozen=True)
 class _Work:
-    """Records for the digest, perhaps a chunk of them for the file, and whom to tell when they are used."""
+    """Records for the digest, the encoding of a chunk for the file if there is one, and a callback."""
 
     topic: Topic
     records: memoryview
     encode: Callable[[], Chunk] | None
-    used: Callable[[], None]
+    done: Callable[[], None]
+    """Called when the records are not needed any more."""
 
 
 class Pipeline:
     """Takes whole message records in order; `close` waits until all is written.
 
     Args:
-        file: where chunks go; None for the digest alone.
+        file: the file that chunks are written to; None for the digest alone.
         packing: how chunks are packed.
         beat: called about once a second from the writer's thread, or when something is sent.
-        threads: False has the sender do the work.
-        before: called once, before anything is written. Given it, the pipeline holds what it is sent, up to
-            `MOST_HELD` pieces, until `release`; threads are started only then, and a recording that is
-            closed before does without them.
+        threads: False makes the sender do the work.
+        before: called once, before anything is written. With it, the pipeline holds up to `MAX_HELD` pieces
+            of work until `release`; only then are threads started, so a recording that is closed earlier
+            needs none.
     """
 
     def __init__(
@@ -70,7 +76,7 @@ class Pipeline:
     ) -> None:
         self.hash = ContentHash()
         self.failure: BaseException | None = None
-        """What went wrong while writing; from then on nothing more is written."""
+        """The error that stopped the writing."""
         self._file = file
         self._packing = packing
         self._beat = beat
@@ -78,7 +84,7 @@ class Pipeline:
         self._last_beat = self._last_sync = time.monotonic()
         self._encoders: ThreadPoolExecutor | None = None
         self._writer: threading.Thread | None = None
-        self._work: queue.Queue[tuple[_Work, Future[Chunk] | None] | None] = queue.Queue(WORK_UNDER_WAY)
+        self._queue: queue.Queue[tuple[_Work, Future[Chunk] | None] | None] = queue.Queue(MAX_PENDING)
         self._before = before
         self._held: list[_Work] | None = None if before is None else []
         if threads and before is None:
@@ -96,40 +102,39 @@ class Pipeline:
         log_times: NDArray[np.uint64],
         offsets: NDArray[np.uint64],
         write: bool = True,
-        used: Callable[[], None] = lambda: None,
+        done: Callable[[], None] = lambda: None,
     ) -> None:
-        """Send message records of one topic on their way; waits while too many are.
+        """Send message records of one topic; waits while too much is pending.
 
         Args:
             topic: the topic of all of them.
-            records: their bytes; must not change until `used` is called.
+            records: their bytes; must not change until `done` is called.
             log_times: nanoseconds, one a record.
             offsets: where each begins.
             write: False leaves them out of the file; the digest covers them all the same.
-            used: called when they were written, by who writes.
+            done: called when they were written, by the thread that writes.
         """
         encode = None
         if write and self._file is not None:
             encode = partial(encode_chunk, topic, records, log_times, offsets, self._packing)
-        self._hand_over(_Work(topic, records, encode, used))
+        self._submit(_Work(topic, records, encode, done))
 
     def submit(self, topic: Topic, make: Callable[[], bytes], log_time: int) -> None:
-        """Send one message of a topic on its way that is yet to be made; waits while too many are.
+        """Send one message of a topic that an encoder thread makes; waits while too much is pending.
 
         Args:
-            topic: its topic; the digest must not cover it.
-            make: returns the message; called by who encodes.
+            topic: its topic, which the digest must not cover.
+            make: returns the message.
             log_time: nanoseconds.
         """
         assert not topic.digested
 
-        def encoded() -> Chunk:
+        def encode() -> Chunk:
             record = message_record(topic, log_time, make())
             times = np.array([log_time], np.uint64)
             return encode_chunk(topic, record, times, np.zeros(1, np.uint64), self._packing)
 
-        encode = encoded if self._file is not None else None
-        self._hand_over(_Work(topic, memoryview(b""), encode, lambda: None))
+        self._submit(_Work(topic, memoryview(b""), encode if self._file is not None else None, lambda: None))
 
     def release(self, threads: bool = True) -> None:
         """Write what is held, and hold nothing from now on; `threads` False does so without threads.
@@ -148,15 +153,15 @@ class Pipeline:
         if threads:
             self._start()
         for work in held:
-            self._hand_over(work)
+            self._submit(work)
 
     @property
-    def open(self) -> bool:
+    def is_open(self) -> bool:
         """Whether it takes more: it was not closed."""
         return not self._closed and (self._writer is None or self._writer.is_alive())
 
     def raise_failure(self) -> None:
-        """Raise what went wrong while writing, if something did.
+        """Raise the error that stopped the writing, if there was one.
 
         Raises:
             StorageError: the disk is full or failing.
@@ -173,40 +178,37 @@ class Pipeline:
         finally:
             self._closed = True
             if self._writer is not None and self._writer.is_alive():
-                self._work.put(None)
+                self._queue.put(None)
                 self._writer.join()
             if self._encoders is not None:
                 self._encoders.shutdown(cancel_futures=True)
 
-    def _hand_over(self, work: _Work) -> None:
+    def _submit(self, work: _Work) -> None:
         if self._held is not None:
             self._held.append(work)
-            if len(self._held) == MOST_HELD:
+            if len(self._held) == MAX_HELD:
                 self.release()
         elif self._writer is None:
-            self._do(work, None)
+            self._process(work, None)
         else:
-            self._work.put((work, self._encode(work.encode)))
-
-    def _encode(self, encode: Callable[[], Chunk] | None) -> Future[Chunk] | None:
-        """Give work to an encoder thread; None if there is none, also when the interpreter is exiting."""
-        if self._encoders is not None and encode is not None:
-            with contextlib.suppress(RuntimeError):
-                return self._encoders.submit(encode)
-        return None
+            chunk = None
+            if self._encoders is not None and work.encode is not None:
+                with contextlib.suppress(RuntimeError):  # the interpreter is exiting: the writer encodes
+                    chunk = self._encoders.submit(work.encode)
+            self._queue.put((work, chunk))
 
     def _run(self) -> None:
         while True:
             try:
-                work = self._work.get(timeout=_BEAT_SECONDS)
+                work = self._queue.get(timeout=_BEAT_SECONDS)
             except queue.Empty:
                 self._beat()
                 continue
             if work is None:
                 return
-            self._do(*work)
+            self._process(*work)
 
-    def _do(self, work: _Work, chunk: Future[Chunk] | None) -> None:
+    def _process(self, work: _Work, chunk: Future[Chunk] | None) -> None:
         now = time.monotonic()
         try:
             if self.failure is None:
@@ -214,9 +216,9 @@ class Pipeline:
                 if now - self._last_sync > SYNC_SECONDS and self._file is not None:
                     self._file.sync()
                     self._last_sync = now
-        except BaseException as error:  # handed to who records
+        except BaseException as error:  # the recording thread raises it
             self.failure = error
-        work.used()
+        work.done()
         if now - self._last_beat > _BEAT_SECONDS:
             self._beat()
             self._last_beat = now
@@ -231,3 +233,54 @@ class Pipeline:
         except OSError:
             self._file.cut_back()
             raise
+
+
+@dataclass
+class _Batch:
+    records: list[bytes] = field(default_factory=list)
+    times: list[int] = field(default_factory=list)
+    size: int = 0
+    """Bytes of the records."""
+
+
+class MessageBatches:
+    """Messages of variable size that share chunks: some thousands of a topic, or some hundred kilobytes.
+
+    Args:
+        send: called with each batch that is full, or flushed.
+    """
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self._batches: dict[Topic, _Batch] = {}
+
+    def extend(self, topic: Topic, log_times: Sequence[int], payloads: Sequence[bytes]) -> None:
+        """Add messages to their topic's batch."""
+        pack, channel, head = MESSAGE_HEAD.pack, topic.channel, HEADER_BYTES - RECORD_HEAD.size
+        records = [
+            pack(5, head + len(payload), channel, 0, time, time) + payload
+            for time, payload in zip(log_times, payloads, strict=True)
+        ]
+        size = sum(map(len, records))
+        batch = self._batches.get(topic)
+        if batch is not None and (
+            batch.size + size > MAX_BATCH_BYTES or len(batch.times) + len(records) > MAX_BATCH_MESSAGES
+        ):
+            self._flush(topic)
+            batch = None
+        if batch is None:
+            batch = self._batches[topic] = _Batch()
+        batch.records += records
+        batch.times += log_times
+        batch.size += size
+
+    def flush(self) -> None:
+        """Send every batch."""
+        for topic in list(self._batches):
+            self._flush(topic)
+
+    def _flush(self, topic: Topic) -> None:
+        batch = self._batches.pop(topic)
+        sizes = np.array([len(record) for record in batch.records], np.uint64)
+        times = np.array(batch.times, np.uint64)
+        self._send(topic, memoryview(b"".join(batch.records)), times, np.cumsum(sizes) - sizes)

@@ -1,7 +1,7 @@
-"""The recorder: a learner fills message records in place, in buffers that go round, and commits them.
+"""The recorder: a learner fills message records in place, in buffers that are used again, and commits them.
 
-When all buffers are under way the learner waits, so memory is bounded. What a recording already holds
-(its past) is compared with what is committed, not written again: so a run is resumed, and verified.
+When all buffers are in use the learner waits, so memory is bounded. What a recording already holds is
+compared with what is committed, not written again: this is how a run is resumed, and verified.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
-from runner.recording.batching import Piles
 from runner.recording.blocks import Sizes, blank_records, block_counts, message_record, record_dtype
 from runner.recording.digest import combine
-from runner.recording.pipeline import Pipeline
-from runner.recording.reference import Past
+from runner.recording.pipeline import MessageBatches, Pipeline
+from runner.recording.reference import Reference
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 from runner.util.packing import Packing
 
 FLUSH_SECONDS: Final = 0.5
-"""An open block is closed when it is this old; with the time to write it, well under a second."""
-BLOCKS_UNDER_WAY: Final = 8
+"""A block is written when it is this old, though it is not full; with the writing, well under a second."""
+MAX_BLOCKS: Final = 8
+"""The most buffers of a topic."""
 EPISODES_A_BLOCK: Final = 2048
 _FIRST_RECORDS: Final = 256
-"""Records in the first block of a topic where recordings may be short: to clear more of them costs time."""
+"""Records in the first block of a topic where recordings may be short: clearing more of them costs time."""
 BLOCK_BYTES: Final = 8 << 20
-"""A block has no more bytes than this, unless one record has."""
+"""The most bytes of a block, unless one record has more."""
 
 
 @dataclass
@@ -59,7 +59,7 @@ class _Lane:
 
 
 class Recorder:
-    """Records one run; in the end call `drain`, or `abandon`.
+    """Records one run; at its end call `drain`, or `abandon`.
 
     Args:
         file: the recording to write; None records nothing but the digest.
@@ -67,14 +67,13 @@ class Recorder:
         events: number of event counters.
         packing: how chunks are packed, and their most steps.
         record_steps: False keeps the steps' digest but not the steps.
-        past: what the recording already holds.
-        beat: called about once a second while the recorder lives, by who writes.
-        sizes: the fixed-width topics of the recording; those of a job unless given.
+        reference: what the recording already holds.
+        beat: called about once a second while the recorder is in use, by the thread that writes.
+        sizes: the fixed-width topics of the recording; those of a job by default.
         threads: False packs and writes in the thread that records.
-        watch: called with the records of a block as they are taken in; the block is used again.
-        before: called once, before the first message is written. Given it, threads are started and
-            messages written only when some have gathered, or by `release`, so that a short recording
-            costs little.
+        watch: called with the records of a block as they are committed; the block is used again.
+        before: called once, before the first message is written. With it, threads are started and messages
+            written only when some have gathered, or by `release`, so that a short recording costs little.
     """
 
     def __init__(
@@ -84,7 +83,7 @@ class Recorder:
         events: int,
         packing: Packing | None = None,
         record_steps: bool = True,
-        past: Past | None = None,
+        reference: Reference | None = None,
         beat: Callable[[], None] = lambda: None,
         sizes: Mapping[Topic, Sizes] | None = None,
         threads: bool = True,
@@ -96,24 +95,22 @@ class Recorder:
         self._watch = watch
         self._chunk_steps = packing.chunk_steps
         self._first_records = _FIRST_RECORDS if before is not None else None
-        self._past = past or Past()
+        self._reference = reference or Reference()
         sizes = sizes or {topic: block_counts(topic, learners, events) for topic in schema.BLOCK_TOPICS}
         self._lanes = {
-            topic: _Lane(
-                topic,
-                own,
-                capacity=capacity_of(topic, own, packing.chunk_steps),
-                write=record_steps or topic.message is not schema.STEP,
-            )
+            topic: self._lane(topic, own, record_steps or topic.message is not schema.STEP)
             for topic, own in sizes.items()
         }
         self.steps = {"train": 0, "eval": 0}
-        """Steps committed so far, a phase."""
+        """Steps committed so far, by phase."""
         self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
-        """Messages committed so far, a topic."""
+        """Messages committed so far, by topic."""
         self._last_flush = time.monotonic()
         self._pipeline = Pipeline(file, packing, beat, threads, before)
-        self._piles = Piles(self._pipeline.send)
+        self._batches = MessageBatches(self._pipeline.send)
+
+    def _lane(self, topic: Topic, sizes: Sizes, write: bool) -> _Lane:
+        return _Lane(topic, sizes, capacity_of(topic, sizes, self._chunk_steps), write)
 
     @property
     def bytes_written(self) -> int:
@@ -126,7 +123,7 @@ class Recorder:
             lane = self._lanes[topic]
             if lane.sizes != own:
                 assert not self.counts[topic.name], f"{topic.name} has messages already"
-                self._lanes[topic] = _Lane(topic, own, capacity_of(topic, own, self._chunk_steps), lane.write)
+                self._lanes[topic] = self._lane(topic, own, lane.write)
 
     def release(self) -> None:
         """Write what was held back, and hold nothing back from now on.
@@ -137,7 +134,7 @@ class Recorder:
         self._pipeline.release()
 
     def blank(self, topic: Topic, n: int) -> NDArray[np.void]:
-        """Return n records of a fixed-width topic of their own, with every constant byte set."""
+        """Return n new records of a fixed-width topic, with every constant byte set."""
         return blank_records(topic, self._lanes[topic].sizes, n)
 
     def block(self, topic: Topic) -> NDArray[np.void]:
@@ -146,7 +143,7 @@ class Recorder:
         if lane.open is None:
             lane.open = self._take_block(lane)
         free = lane.open.records[lane.open.filled :]
-        already = self._past.remaining(topic)
+        already = self._reference.remaining(topic)
         return free[:already] if already else free
 
     def capacity(self, topic: Topic) -> int:
@@ -154,11 +151,11 @@ class Recorder:
         return self._lanes[topic].capacity
 
     def commit(self, phase: str, steps: int, episodes: int) -> None:
-        """Say how many records of the phase's blocks were filled; closes what is full or old.
+        """Record the filled records of the phase's blocks; write blocks that are full or old.
 
         Raises:
             StorageError: the disk is full or failing; everything before is kept.
-            Diverged: a record differs from the one that the recording holds already.
+            Diverged: a record differs from the one that the recording already holds.
         """
         self._pipeline.raise_failure()
         step_topic, episode_topic = schema.PHASES[phase]
@@ -175,46 +172,40 @@ class Recorder:
             self.flush()
 
     def message(self, topic: Topic, payload: bytes) -> bool:
-        """Record one message of a topic of variable size, at the present logical time.
+        """Record one message of variable size at the current logical time, in a chunk of its own.
 
         Returns whether it is new: not in the recording already.
         """
         self._pipeline.raise_failure()
         log_time = sum(self.steps.values()) * STEP_NANOSECONDS
         self.counts[topic.name] += 1
-        known = self._past.compare_message(topic, log_time, payload)
+        known = self._reference.compare_message(topic, log_time, payload)
         records = memoryview(message_record(topic, log_time, payload))
         times = np.array([log_time], dtype=np.uint64)
         self._pipeline.send(topic, records, times, np.zeros(1, np.uint64), write=not known)
         return not known
 
     def append(self, topic: Topic, payload: bytes, position: int) -> None:
-        """Record one message of a topic of variable size, in a chunk with others.
-
-        Args:
-            topic: its topic.
-            payload: the message.
-            position: the number of steps executed so far.
-
-        Raises:
-            StorageError: the disk is full or failing; everything before is kept.
-        """
-        self._pipeline.raise_failure()
-        self._piles.add(topic, position * STEP_NANOSECONDS, payload)
-        self.counts[topic.name] += 1
+        """Record one message of variable size; arguments and errors as for `extend`."""
+        self.extend(topic, [payload], [position])
 
     def extend(self, topic: Topic, payloads: Sequence[bytes], positions: Sequence[int]) -> None:
-        """Record messages of a topic of variable size, as `append` does one.
+        """Record messages of variable size, in a chunk with others of their topic.
+
+        Args:
+            topic: their topic.
+            payloads: the messages.
+            positions: for each message the number of steps executed so far.
 
         Raises:
             StorageError: the disk is full or failing; everything before is kept.
         """
         self._pipeline.raise_failure()
-        self._piles.extend(topic, [position * STEP_NANOSECONDS for position in positions], payloads)
+        self._batches.extend(topic, [position * STEP_NANOSECONDS for position in positions], payloads)
         self.counts[topic.name] += len(payloads)
 
     def submit(self, topic: Topic, make: Callable[[], bytes], position: int) -> None:
-        """Record one message that is yet to be made, by a thread of the recorder's own.
+        """Record one message that is made by a thread of the recorder.
 
         Its topic must be one that the digest does not cover.
 
@@ -226,11 +217,11 @@ class Recorder:
         self._pipeline.submit(topic, make, position * STEP_NANOSECONDS)
 
     def flush(self) -> None:
-        """Close every open block, so that it is written now."""
-        self._piles.flush()
+        """Write every open block and batch now."""
+        self._batches.flush()
         for lane in self._lanes.values():
             if lane.open is not None and lane.open.filled:
-                self._close_block(lane)
+                self._send_block(lane)
         self._last_flush = time.monotonic()
 
     def drain(self) -> dict[str, str]:
@@ -245,7 +236,7 @@ class Recorder:
         return self._pipeline.hash.topics()
 
     def totals(self, topics: Mapping[str, str]) -> dict[str, Any]:
-        """Return what a result says of all that was recorded; `topics` are the hashes that `drain` gave."""
+        """Return the totals in a result; `topics` are the hashes that `drain` returned."""
         return {
             "content_digest": combine(topics),
             "topic_digests": topics,
@@ -255,59 +246,58 @@ class Recorder:
         }
 
     def abandon(self) -> None:
-        """Write what was committed, unless writing failed, and stop the threads: the run ends badly."""
-        if self._file is not None and self._pipeline.open and self._pipeline.failure is None:
+        """Write what was committed, unless writing failed, and stop the threads of a run that failed."""
+        if self._file is not None and self._pipeline.is_open and self._pipeline.failure is None:
             self.flush()
         self._pipeline.close()
+
+    def take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
+        """Take the next filled records of the topic's block: set their times, compare or keep them.
+
+        Args:
+            topic: a fixed-width topic.
+            positions: for each record the number of steps executed so far, 0.1 s each.
+
+        Raises:
+            Diverged: a record differs from the one that the recording already holds.
+        """
+        lane, block = self._lanes[topic], self._open(topic)
+        known = self._reference.remaining(topic) > 0
+        fresh: Any = block.records[block.filled : block.filled + len(positions)]
+        times = positions * np.uint64(STEP_NANOSECONDS)
+        fresh["log_time"] = times
+        fresh["publish_time"] = times
+        if known:
+            self._reference.compare_block(topic, fresh)
+        else:
+            self._reference.check_new(topic, fresh)
+        block.filled += len(positions)
+        self.counts[topic.name] += len(positions)
+        self._watch(topic, fresh)
+        if known:
+            self._send_block(lane, write=False)
+        elif block.filled == len(block.records):
+            self._send_block(lane)
 
     def _open(self, topic: Topic) -> _Block:
         block = self._lanes[topic].open
         assert block is not None, "commit without block"
         return block
 
-    def take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
-        """Take the next records of the topic's block in: give them their times, compare or keep them.
-
-        Args:
-            topic: whose block.
-            positions: for each record the number of steps executed so far, 0.1 s each.
-
-        Raises:
-            Diverged: a record differs from the one that the recording holds already.
-        """
-        lane, block = self._lanes[topic], self._open(topic)
-        known = self._past.remaining(topic) > 0
-        fresh: Any = block.records[block.filled : block.filled + len(positions)]
-        times = positions * np.uint64(STEP_NANOSECONDS)
-        fresh["log_time"] = times
-        fresh["publish_time"] = times
-        if known:
-            self._past.compare_block(topic, fresh)
-        else:
-            self._past.check_new(topic, fresh)
-        block.filled += len(positions)
-        self.counts[topic.name] += len(positions)
-        self._watch(topic, fresh)
-        if known:
-            self._close_block(lane, write=False)
-            return
-        if block.filled == len(block.records):
-            self._close_block(lane)
-
     def _take_block(self, lane: _Lane) -> _Block:
-        """Return a block to fill: a used one that came back, or a new one while there may be more."""
+        """Return a block to fill: one that was used before, or a new one while there may be more."""
         if self._first_records is not None and not lane.is_used:
             lane.is_used = True
             return _Block(blank_records(lane.topic, lane.sizes, min(self._first_records, lane.capacity)))
-        if lane.made < BLOCKS_UNDER_WAY and lane.free.empty():
+        if lane.made < MAX_BLOCKS and lane.free.empty():
             lane.made += 1
             return _Block(blank_records(lane.topic, lane.sizes, lane.capacity))
         block = lane.free.get()
         block.filled = 0
         return block
 
-    def _close_block(self, lane: _Lane, write: bool = True) -> None:
-        """Send the lane's open block on its way; it comes back when it was used."""
+    def _send_block(self, lane: _Lane, write: bool = True) -> None:
+        """Send the lane's open block to the pipeline; it comes back when it was written."""
         block, lane.open = lane.open, None
         if block is None:
             return
@@ -320,11 +310,11 @@ class Recorder:
             filled["log_time"],
             offsets,
             write=write and lane.write,
-            used=partial(lane.free.put, block) if is_whole else lambda: None,
+            done=partial(lane.free.put, block) if is_whole else lambda: None,
         )
 
 
 def capacity_of(topic: Topic, sizes: Sizes, chunk_steps: int) -> int:
     """Return how many records a block of a topic has."""
-    most = EPISODES_A_BLOCK if topic.message in (schema.EPISODE, schema.RESET) else chunk_steps
-    return max(1, min(most, BLOCK_BYTES // record_dtype(topic.message, sizes).itemsize))
+    limit = EPISODES_A_BLOCK if topic.message in (schema.EPISODE, schema.RESET) else chunk_steps
+    return max(1, min(limit, BLOCK_BYTES // record_dtype(topic.message, sizes).itemsize))

@@ -1,12 +1,12 @@
-"""What a recording already holds, to be compared with what a run of the same job gives.
+"""The messages that a recording already holds, compared with those that a run of the same job gives.
 
-A job fixes its content, so running it again gives the recorded messages, byte for byte, and then those
-that are still missing. That is how a run is resumed, and how a recording is verified.
+A job determines its content, so doing it again gives the recorded messages, byte for byte, and then those
+that are still missing. This is how a run is resumed, and how a recording is verified.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,19 +15,17 @@ from numpy.typing import NDArray
 from runner.errors import Diverged
 from runner.recording import schema
 from runner.recording.messages import decode
-from runner.recording.schema import BLOCK_TOPICS, MessageType, Topic
-
-PLACES = ("step", "episode")
+from runner.recording.schema import BLOCK_TOPICS, Topic
 
 if TYPE_CHECKING:
     from runner.recording.reader import Recording
 
 
-class Past:
-    """The messages of a recording, topic by topic, taken off as they are compared.
+class Reference:
+    """The messages of a recording, topic by topic, each compared once and in order.
 
     Args:
-        recording: whose; None for a run without a past.
+        recording: the recording; None for a new run.
         complete: whether a message that the recording does not hold is a difference, not new.
         without_steps: whether the recording leaves its steps out.
     """
@@ -36,7 +34,6 @@ class Past:
         self, recording: Recording | None = None, complete: bool = False, without_steps: bool = False
     ) -> None:
         self.complete = complete
-        """Whether a message that the recording does not hold is a difference, not new."""
         self._remaining: dict[Topic, int] = {}
         self._blocks: dict[Topic, Iterator[NDArray[np.void]]] = {}
         self._block: dict[Topic, NDArray[np.void]] = {}
@@ -75,7 +72,7 @@ class Past:
             n = min(len(block), len(records) - done)
             expected = records[done : done + n]
             if block[:n].tobytes() != expected.tobytes():
-                raise _difference(topic, block[:n], expected)
+                raise _block_difference(topic, block[:n], expected)
             self._block[topic] = block[n:]
             self._remaining[topic] -= n
             done += n
@@ -94,24 +91,23 @@ class Past:
                 raise Diverged(topic.name, "message", "none", f"one at {log_time} ns")
             return False
         if recorded != (log_time, payload):
-            raise _message_difference(topic.message, topic.name, recorded, (log_time, payload))
+            raise _message_difference(topic, recorded, (log_time, payload))
         return True
 
     def check_new(self, topic: Topic, records: NDArray[np.void]) -> None:
-        """Say that records came that the recording does not hold.
+        """Refuse records that the recording does not hold if it should be complete.
 
         Raises:
-            Diverged: the recording should be complete.
+            Diverged: it should.
         """
         if self.complete and topic not in self._unrecorded and len(records):
-            place = _place(records[0])
-            raise Diverged(topic.name, "message", "none", "one more", **place)
+            raise Diverged(topic.name, "message", "none", "one more", **_place(records[0]))
 
     def check_over(self) -> None:
-        """Say that the run is over.
+        """Refuse a recording that holds more than the run gave, which is over.
 
         Raises:
-            Diverged: the recording holds more.
+            Diverged: it does.
         """
         for topic, remaining in self._remaining.items():
             if remaining:
@@ -121,51 +117,45 @@ class Past:
                 raise Diverged(topic.name, "messages", "more", "none")
 
 
-def _difference(topic: Topic, found: NDArray[np.void], expected: NDArray[np.void]) -> Diverged:
+def _block_difference(topic: Topic, found: NDArray[np.void], expected: NDArray[np.void]) -> Diverged:
     """Return the error that names the first record and field in which two blocks differ."""
-    names = [name for name in (found.dtype.names or ()) if not name.startswith("tag_")]
-    tags = [name for name in (found.dtype.names or ()) if name.startswith("tag_")]
-    differs = {name: _rows_differ(found[name], expected[name]) for name in names + tags}
+    rows = len(found)
+    differs = {}
+    for name in sorted(found.dtype.names or (), key=lambda name: name.startswith("tag_")):
+        left, right = (
+            np.ascontiguousarray(block[name]).view(np.uint8).reshape(rows, -1) for block in (found, expected)
+        )
+        differs[name] = (left != right).any(axis=1)
     first = min(int(np.argmax(rows)) for rows in differs.values() if rows.any())
     name = next(name for name, rows in differs.items() if rows[first])
-    return Diverged(
-        topic.name, name, _plain(found[first][name]), _plain(expected[first][name]), **_place(expected[first])
-    )
+    was, should = (np.asarray(block[first][name]).tolist() for block in (found, expected))
+    return Diverged(topic.name, name, was, should, **_place(expected[first]))
 
 
-def _rows_differ(found: NDArray[Any], expected: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return which rows differ in any byte."""
-    rows = len(found)
-    left = np.ascontiguousarray(found).view(np.uint8).reshape(rows, -1)
-    right = np.ascontiguousarray(expected).view(np.uint8).reshape(rows, -1)
-    return np.asarray((left != right).any(axis=1))
-
-
-def _message_difference(
-    message: MessageType, topic: str, found: tuple[int, bytes], expected: tuple[int, bytes]
-) -> Diverged:
-    was, should = decode(message, found[1]), decode(message, expected[1])
-    place: dict[str, int] = {key: should[key] for key in PLACES if key in should}
+def _message_difference(topic: Topic, found: tuple[int, bytes], expected: tuple[int, bytes]) -> Diverged:
+    """Return the error that names the first field in which two messages differ."""
+    was, should = decode(topic.message, found[1]), decode(topic.message, expected[1])
+    place: dict[str, int] = {key: should[key] for key in ("step", "episode") if key in should}
     if found[0] != expected[0]:
-        return Diverged(topic, "log_time", found[0], expected[0], **place)
+        return Diverged(topic.name, "log_time", found[0], expected[0], **place)
     for name in should:
         if was[name] != should[name] and not _both_nan(was[name], should[name]):
-            if name == "data":
-                return _cell_difference(topic, was, should, place)
-            return Diverged(topic, name, was[name], should[name], **place)
-    return Diverged(topic, "bytes", f"{len(found[1])} bytes", "other bytes of the same meaning", **place)
+            field, left, right = (
+                _cell_difference(was, should) if name == "data" else (name, was[name], should[name])
+            )
+            return Diverged(topic.name, field, left, right, **place)
+    other = "other bytes of the same meaning"
+    return Diverged(topic.name, "bytes", f"{len(found[1])} bytes", other, **place)
 
 
-def _cell_difference(
-    topic: str, found: dict[str, Any], expected: dict[str, Any], place: dict[str, int]
-) -> Diverged:
-    """Return the error that names the first cell in which two Q-tables differ."""
+def _cell_difference(found: Mapping[str, Any], expected: Mapping[str, Any]) -> tuple[str, object, object]:
+    """Return the first cell in which two Q-tables differ, and its values."""
     left, right = (np.frombuffer(values["data"], "<f8") for values in (found, expected))
     if left.shape != right.shape:
-        return Diverged(topic, "data", f"{len(left)} cells", f"{len(right)} cells", **place)
+        return "data", f"{len(left)} cells", f"{len(right)} cells"
     cell = int(np.argmax(left.view("<i8") != right.view("<i8")))
     state, action = divmod(cell, int(expected["shape"][-1]))
-    return Diverged(topic, f"data[{state}, {action}]", float(left[cell]), float(right[cell]), **place)
+    return f"data[{state}, {action}]", float(left[cell]), float(right[cell])
 
 
 def _both_nan(left: Any, right: Any) -> bool:
@@ -174,10 +164,5 @@ def _both_nan(left: Any, right: Any) -> bool:
 
 def _place(record: np.void) -> dict[str, int]:
     """Return the episode and step of a step or episode record."""
-    names = record.dtype.names or ()
-    step = "step" if "step" in names else "last_step"
+    step = "step" if "step" in (record.dtype.names or ()) else "last_step"
     return {"episode": int(record["episode"]), "step": int(record[step])}
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -37,7 +37,7 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import StorageError
 from runner.recording.chunks import Chunk
 from runner.recording.index import checksum
-from runner.recording.protobuf import file_descriptor_set
+from runner.recording.messages import file_descriptor_set
 from runner.recording.records import Contents
 from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPICS, Topic
 from runner.util.version import __version__

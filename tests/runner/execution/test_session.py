@@ -19,7 +19,7 @@ from runner.errors import EnvironmentNotUsable, RunnerError, RunNotFound
 from runner.execution.session import run_job
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
-from runner.recording.protobuf import message_class
+from runner.recording.messages import message_class
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs

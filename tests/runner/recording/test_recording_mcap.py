@@ -19,7 +19,7 @@ from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap_protobuf.decoder import DecoderFactory
 
 from runner.recording import schema
-from runner.recording.protobuf import message_class
+from runner.recording.messages import message_class
 from runner.recording.reader import open_recording
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 

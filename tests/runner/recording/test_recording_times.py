@@ -9,7 +9,7 @@ import pytest
 from mcap.reader import make_reader
 
 from runner.recording import schema
-from runner.recording.protobuf import message_class
+from runner.recording.messages import message_class
 from runner.recording.reader import open_recording
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
