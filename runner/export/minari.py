@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.export.contents import whole_ranges
-from runner.export.minari_loops import Episode, loop_episodes, space_of
+from runner.export.minari_loops import Episode, loop_episodes
 from runner.recording import schema
+from runner.recording.gym_spaces import restore_space
 from runner.recording.reader import Recording
 from runner.recording.run_file import run_title
 from runner.util.extras import require
@@ -211,7 +212,9 @@ def _spaces(recording: Recording) -> tuple[Any, Any, Any, list[str]]:
         actions: Any = Discrete(recording.mdp.joint_actions)
     else:
         try:
-            observations, actions = (space_of(recording.spaces[name]) for name in ("observation", "action"))
+            observations, actions = (
+                restore_space(recording.spaces[name]) for name in ("observation", "action")
+            )
         except (AssertionError, KeyError, TypeError, ValueError, OverflowError) as error:
             raise RecordingError(
                 f"{recording.path}: describes spaces that Gymnasium has not ({error})."

@@ -5,15 +5,12 @@ Steps are read a block at a time, and split by environment and episode; an episo
 
 from __future__ import annotations
 
-import string
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, Final
 
-import gymnasium
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
@@ -44,52 +41,6 @@ class Episode:
     def abandoned(self) -> bool:
         """Whether it was reset before its end."""
         return not (self.terminated[-1] or self.truncated[-1])
-
-
-def space_of(description: Mapping[str, Any]) -> gymnasium.Space[Any]:
-    """Return the space that a recording describes; bounds and letters that it does not tell are the widest.
-
-    Raises:
-        AssertionError, KeyError, TypeError, ValueError, OverflowError: Gymnasium has no such space.
-    """
-    kind = description["type"]
-    if kind == "Dict":
-        return spaces.Dict({name: space_of(part) for name, part in description["spaces"].items()})
-    if kind == "Tuple":
-        return spaces.Tuple([space_of(part) for part in description["spaces"]])
-    if kind == "Text":
-        return spaces.Text(max(int(description["max_length"]), 1), min_length=0, charset=string.printable)
-    return _array_space(description)
-
-
-def _array_space(description: Mapping[str, Any]) -> gymnasium.Space[Any]:
-    kind = description["type"]
-    dtype, shape = np.dtype(description["dtype"]).newbyteorder("="), tuple(description["shape"])
-    if kind == "Discrete":
-        return spaces.Discrete(int(description["n"]), start=int(description["start"]))
-    if kind == "MultiDiscrete":
-        return spaces.MultiDiscrete(np.array(description["nvec"]), dtype=dtype.type)
-    if kind == "MultiBinary":
-        return spaces.MultiBinary(shape[0] if len(shape) == 1 else shape)
-    least, most = (-np.inf, np.inf) if dtype.kind == "f" else _range_of(dtype)
-    low, high = (
-        np.broadcast_to(np.array(least if bound is None else _numbers(bound), dtype), shape)
-        for bound, least in ((description["low"], least), (description["high"], most))
-    )
-    return spaces.Box(low, high, shape, dtype.type)
-
-
-def _range_of(dtype: np.dtype[Any]) -> tuple[int, int]:
-    if dtype.kind == "b":
-        return 0, 1
-    return np.iinfo(dtype).min, np.iinfo(dtype).max
-
-
-def _numbers(bound: Any) -> Any:
-    """Return a bound in numbers; infinities are told as text."""
-    if isinstance(bound, list):
-        return [_numbers(part) for part in bound]
-    return float(bound) if isinstance(bound, str) else bound
 
 
 def loop_episodes(

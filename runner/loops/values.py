@@ -1,11 +1,11 @@
-"""Values of spaces on their way into a recording: checked for shape and for rounding."""
+"""Values on their way into a recording, checked: values of spaces, logged numbers, arrays."""
 
 from __future__ import annotations
 
 import math
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,29 +13,31 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
-from runner.errors import RecordingError
-from runner.loops.spaces import Part
+from runner.errors import ConfigError, RecordingError
+from runner.recording.chunks import MAX_CHUNK_BYTES
+from runner.recording.gym_spaces import Part, Space, parts_of
 from runner.recording.spaces import MAX_VALUE_BYTES, encode_text
+from runner.util.jsonable import as_mapping
+from runner.util.values import is_utf8
 
+MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
 _HERE: Final = str(Path(__file__).parent)
 _SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
 
 
 class Leaf:
-    """One part of a space, with the checks that its values pass before they are recorded.
+    """A part of a space, with the checks that its values pass before they are recorded.
 
     Args:
         part: where the part is in a value, and its dtype.
         what: `observation` or `action`. An action may have another shape with as many numbers, because
-            only the environment knows which shapes it takes.
+            only the environment knows which shapes it accepts.
     """
 
     def __init__(self, part: Part, what: str) -> None:
         self.part = part
-        self.keys = part.keys
         self.name = what + "".join(f"[{key!r}]" for key in part.keys)
-        self.text = part.text
-        self._is_action = what == "action"
+        self._what = what
         if part.dtype is None:
             return
         self.base = np.dtype(part.dtype.base.str)
@@ -43,83 +45,79 @@ class Leaf:
         scalars = {kind for kind in _SCALARS if np.can_cast(kind, self.base)}
         scalars |= {bool} | ({int} if self.base.kind in "iu" else {float} if self.base.char == "d" else set())
         self.exact_scalars = frozenset(() if self.shape else scalars)
-        """Classes of which every value is recorded exactly, or refused by NumPy."""
+        """Classes whose values are all recorded exactly, or refused by NumPy."""
         self._is_rounded = False
 
     def fit(self, value: Any, batch: tuple[int, ...] = ()) -> NDArray[Any]:
         """Return a value as an array that can be recorded; warn the first time that one is rounded.
 
         Args:
-            value: of this part alone.
+            value: the value of this part alone.
             batch: the shape of the batch that it is, if it is one.
 
         Raises:
             RecordingError: it has another shape, holds no numbers, or numbers out of the dtype's range.
         """
-        found = np.asarray(value)
-        if found.dtype.kind not in "biuf":
-            raise self.refused(f"found {found.dtype}, expected {self.base}")
-        if found.shape != batch + self.shape:
-            if not self._is_action or found.size != math.prod(batch + self.shape):
+        array = np.asarray(value)
+        shape = batch + self.shape
+        if array.dtype.kind not in "biuf":
+            raise self.refused(f"found {array.dtype}, expected {self.base}")
+        if array.shape != shape:
+            if self._what != "action" or array.size != math.prod(shape):
                 raise RecordingError(
-                    f"found {self.name} of shape {found.shape}, expected {batch + self.shape} by its space."
+                    f"found {self.name} of shape {array.shape}, expected {shape} by its space."
                 )
-            found = found.reshape(batch + self.shape)
-        if found.dtype is self.base or np.can_cast(found.dtype, self.base):
-            return found
+            array = array.reshape(shape)
+        if array.dtype is self.base or np.can_cast(array.dtype, self.base):
+            return array
         with np.errstate(all="ignore"):
-            kept = found.astype(self.base)
-        if not np.array_equal(kept, found, equal_nan=found.dtype.kind == "f"):
-            self._check_range(found)
+            rounded = array.astype(self.base)
+        if not np.array_equal(rounded, array, equal_nan=array.dtype.kind == "f"):
+            if self.base.kind in "iu":
+                limits = np.iinfo(self.base)
+                if not ((array >= limits.min) & (array <= limits.max)).all():
+                    raise self.refused(f"{self.base} holds {limits.min} to {limits.max}")
             if not self._is_rounded:
                 self._is_rounded = True
                 warn_user(
-                    f"{self.name} comes as {found.dtype} and is recorded, rounded, as the {self.base} of its "
-                    "space. This is warned of once."
+                    f"{self.name} comes as {array.dtype} and is recorded, rounded, as the {self.base} of its "
+                    "space. This warning is given once."
                 )
-        return kept
-
-    def _check_range(self, found: NDArray[Any]) -> None:
-        """Refuse numbers that an integer dtype cannot hold at all."""
-        if self.base.kind not in "iu":
-            return
-        limits = np.iinfo(self.base)
-        if not ((found >= limits.min) & (found <= limits.max)).all():
-            raise self.refused(f"{self.base} holds {limits.min} to {limits.max}")
+        return rounded
 
     def refused(self, reason: object) -> RecordingError:
         """Return the error for a value that is not of the space."""
-        what = "action" if self._is_action else "observation"
+        what = self._what
         return RecordingError(f"found an {what} that is not of the environment's {what} space ({reason}).")
 
 
-def leaves(parts: Sequence[Part], what: str) -> list[Leaf]:
-    """Return the leaves for the parts of a space; `what` is `observation` or `action`."""
-    return [Leaf(part, what) for part in parts]
+def leaves_of(space: Space, what: str, where: str = "") -> list[Leaf]:
+    """Return the leaves of a space; `what` is `observation` or `action`."""
+    return [Leaf(part, what) for part in parts_of(space, where or f"the {what} space")]
 
 
 def filler(
-    own: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] = ()
+    leaves: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] = ()
 ) -> Callable[[int, Any], None]:
     """Return a function that puts a value of a space into a row of a column.
 
     Args:
-        own: the leaves of the space.
+        leaves: the leaves of the space.
         column: [rows, *batch] values of the space.
         batch: the shape of the batch that each value is, if it is one.
 
     Raises:
         RecordingError: (from the returned function) a value is not of its space.
     """
-    if len(own) == 1 and not own[0].keys:
-        return _single_filler(own[0], column, batch)
-    fillers = [(leaf, _single_filler(leaf, _within(column, leaf.part), batch)) for leaf in own]
+    if len(leaves) == 1 and not leaves[0].part.keys:
+        return _leaf_filler(leaves[0], column, batch)
+    fillers = [(leaf, leaf.part.keys, _leaf_filler(leaf, _column_of(leaf, column), batch)) for leaf in leaves]
 
     def put(row: int, value: Any) -> None:
-        for leaf, put_leaf in fillers:
+        for leaf, keys, put_leaf in fillers:
             inside = value
             try:
-                for key in leaf.keys:
+                for key in keys:
                     inside = inside[key]
             except (TypeError, LookupError) as error:
                 raise leaf.refused(error) from error
@@ -128,7 +126,7 @@ def filler(
     return put
 
 
-def _single_filler(leaf: Leaf, column: NDArray[Any], batch: tuple[int, ...]) -> Callable[[int, Any], None]:
+def _leaf_filler(leaf: Leaf, column: NDArray[Any], batch: tuple[int, ...]) -> Callable[[int, Any], None]:
     base, shape, array = leaf.base, batch + leaf.shape, np.ndarray
     scalars = frozenset() if batch else leaf.exact_scalars
 
@@ -147,73 +145,50 @@ def _single_filler(leaf: Leaf, column: NDArray[Any], batch: tuple[int, ...]) -> 
     return put
 
 
-def _within(column: NDArray[Any], part: Part) -> NDArray[Any]:
-    for name in part.fields:
+def _column_of(leaf: Leaf, column: NDArray[Any]) -> NDArray[Any]:
+    for name in leaf.part.fields:
         column = column[name]
     return column
 
 
-def value_bytes(own: Sequence[Leaf], value: Any) -> bytes:
-    """Return a value of a space as the bytes that a recording holds.
+def value_bytes(leaves: Sequence[Leaf], value: Any) -> bytes:
+    """Return a value of a space as its bytes in a recording.
 
     Raises:
         RecordingError: it is not of the space, or too large.
     """
     pieces = []
-    for leaf in own:
+    for leaf in leaves:
         try:
             inside = leaf.part.of(value)
-            if leaf.text is not None:
-                pieces.append(encode_text(leaf.text(inside)))
+            if leaf.part.text is not None:
+                pieces.append(encode_text(leaf.part.text(inside)))
             else:
                 pieces.append(np.asarray(leaf.fit(inside), leaf.base, order="C").tobytes())
         except (TypeError, ValueError, LookupError, AttributeError, OverflowError, RecursionError) as error:
             raise leaf.refused(error) from error
     if (size := sum(map(len, pieces))) > MAX_VALUE_BYTES:
-        raise own[0].refused(f"it takes {size:,} bytes, expected at most {MAX_VALUE_BYTES:,}")
+        raise leaves[0].refused(f"it takes {size:,} bytes, expected at most {MAX_VALUE_BYTES:,}")
     return b"".join(pieces)
 
 
-def put_batch(own: Sequence[Leaf], value: Any, into: NDArray[Any], batch: tuple[int, ...] = ()) -> None:
-    """Put batched values of a space into a column, all rows at once.
-
-    Args:
-        own: the leaves of the space.
-        value: batched, as a vector environment has it; a single value for an empty batch.
-        into: the column.
-        batch: the shape of the batch.
-
-    Raises:
-        RecordingError: they are not of the space.
-    """
-    for leaf in own:
-        try:
-            inside = leaf.part.of(value)
-            if inside.__class__ is not np.ndarray or (
-                inside.dtype is not leaf.base or inside.shape != batch + leaf.shape
-            ):
-                inside = leaf.fit(inside, batch)
-            _within(into, leaf.part)[...] = inside
-        except (TypeError, ValueError, LookupError, OverflowError) as error:
-            raise leaf.refused(error) from error
-
-
-def put_chosen(own: Sequence[Leaf], values: Any, into: NDArray[Any], which: NDArray[np.intp]) -> None:
+def put_chosen(leaves: Sequence[Leaf], values: Any, into: NDArray[Any], which: NDArray[np.intp]) -> None:
     """Put values of single environments into their rows, as a vector's info holds them.
 
     Raises:
         RecordingError: they are not of the space.
     """
+    put = filler(leaves, into)
     for i in which.tolist():
-        put_batch(own, _picked(values, i), into[i : i + 1])
+        put(i, _element(values, i))
 
 
-def _picked(values: Any, i: int) -> Any:
-    """Return the value of one environment out of a mapping of batches."""
+def _element(values: Any, i: int) -> Any:
+    """Return the value of one environment in a batch of a `Dict` or `Tuple` space."""
     if isinstance(values, Mapping):
-        return {key: _picked(part, i) for key, part in values.items() if not str(key).startswith("_")}
+        return {key: _element(part, i) for key, part in values.items() if not str(key).startswith("_")}
     if isinstance(values, tuple):
-        return tuple(_picked(part, i) for part in values)
+        return tuple(_element(part, i) for part in values)
     return values[i]
 
 
@@ -221,7 +196,7 @@ def lone_number(value: Any, what: str) -> float:
     """Return a number that may stand in an array of one.
 
     Raises:
-        RecordingError: it is none.
+        RecordingError: it is not a number.
     """
     return float(_lone(value, what, "iubf", "a number"))
 
@@ -230,7 +205,7 @@ def whole_number(value: Any, what: str) -> int:
     """Return a whole number that may stand in an array of one.
 
     Raises:
-        RecordingError: it is none.
+        RecordingError: it is not a whole number.
     """
     return int(_lone(value, what, "iub", "a whole number of its Discrete space"))
 
@@ -240,6 +215,73 @@ def _lone(value: Any, what: str, kinds: str, expected: str) -> Any:
     if array.size != 1 or array.dtype.kind not in kinds:
         raise RecordingError(f"found the {what} {value!r}, expected {expected}.")
     return array.reshape(())
+
+
+def logged_number(name: str, value: Any) -> float:
+    """Return a logged number, which may stand in an array of one.
+
+    Raises:
+        ConfigError: it is not a number.
+    """
+    try:
+        if callable(detach := getattr(value, "detach", None)):  # a tensor of PyTorch
+            value = detach()
+        return lone_number(value, name) if np.size(value) == 1 and np.ndim(value) else float(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError, RecordingError) as error:
+        raise ConfigError(
+            f"log: found {type(value).__name__} for {name!r}, expected a number that a float64 holds, or "
+            "text; an array is recorded by snapshot()."
+        ) from error
+
+
+def check_log_name(name: Any, value: Any) -> None:
+    """Refuse a name that a logged value cannot have.
+
+    Raises:
+        ConfigError: it is empty, or not text.
+    """
+    if not isinstance(name, str) or not name or not is_utf8(name):
+        raise ConfigError(f"log: found the name {name!r} for {value!r}, expected text that is valid Unicode")
+
+
+def arrays_of(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the arrays of a snapshot: the value itself, or those of a mapping as `name/key`.
+
+    Raises:
+        ConfigError: a value holds something else than numbers, or too many.
+    """
+    if not isinstance(name, str) or not is_utf8(name):
+        raise ConfigError(f"snapshot: found the name {name!r}, expected an array of numbers and a name.")
+    if (inside := as_mapping(value)) is not None:
+        for key, part in inside.items():
+            yield from arrays_of(f"{name}/{key}", part)
+        return
+    try:
+        values = _as_array(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"snapshot: found no array of numbers for {name!r} ({error})") from error
+    if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
+        raise ConfigError(
+            f"snapshot: found {values.dtype} for {name!r}, expected an array of numbers and a name."
+        )
+    if values.nbytes > MAX_ARRAY_BYTES:
+        raise ConfigError(
+            f"snapshot: found {values.nbytes:,} bytes for {name!r}, expected at most "
+            f"{MAX_ARRAY_BYTES:,}; record it in parts."
+        )
+    yield name, values.astype(values.dtype.newbyteorder("<"), copy=False)
+
+
+def _as_array(value: Any) -> NDArray[Any]:
+    """Return an array or tensor as NumPy's; the short floats that NumPy lacks become float32, exactly."""
+    if callable(detach := getattr(value, "detach", None)):
+        value = detach().cpu()
+        if "bfloat16" in str(value.dtype) or "float8" in str(value.dtype):
+            value = value.float()
+    values = np.asarray(value, order="C")
+    if values.dtype.name.startswith(("bfloat16", "float8")):
+        return values.astype(np.float32)
+    return values
 
 
 def require_reset(resets: int, phase: str) -> None:

@@ -17,12 +17,12 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWra
 
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
+from runner.loops.description import Described, describe, kind_of
 from runner.loops.env import Recorded, given
 from runner.loops.loop import Loop
-from runner.loops.options import plan_of
-from runner.loops.spaces import Described, describe, kind_of
-from runner.loops.staging import AgentRows
-from runner.loops.vector_buffer import VectorRows
+from runner.loops.options import options_of
+from runner.loops.single_rows import AgentRows
+from runner.loops.vector_rows import VectorRows
 
 
 class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any]):
@@ -33,7 +33,7 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
     def __init__(self, env: VectorEnv[Any, Any, Any], loop: Loop[VectorRows], mode: AutoresetMode) -> None:
         VectorWrapper.__init__(self, env)
         self._has_finals = mode == AutoresetMode.SAME_STEP
-        self._own(loop)
+        self._record_into(loop)
         self._phase, self._rows = "train", loop.rows("train")
 
     def _enter(self, phase: str) -> None:
@@ -51,23 +51,23 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
             if self._loop.active is not self._rows:
                 self._loop.activate(self._rows)
             self._rows.take(actions, observations, rewards, terminated, truncated, final)
-        if self._loop.plan.info:
-            self._loop.info(self._phase, _by_environment(infos))
+        if self._options.info:
+            self._messages.info(self._phase, _by_environment(infos))
         return result
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Reset all environments, or those of `options["reset_mask"]`, and record it."""
-        n, asked = self.env.num_envs, dict(options) if options else {}
-        mask = asked.pop("reset_mask", None)
+        n, others = self.env.num_envs, dict(options) if options else {}
+        mask = others.pop("reset_mask", None)
         which = np.ones(n, np.bool_) if mask is None else np.array(mask, np.bool_)
         result = self.env.reset(**given(seed=seed, options=options))
         seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
         with self._loop.lock:
             self._loop.activate(self._rows)
             self._rows.reset(result[0], seeds, which)
-        self._loop.reset_info(self._phase, _by_environment(result[1]), asked, None)
+        self._messages.reset_info(self._phase, _by_environment(result[1]), others, None)
         return result
 
 
@@ -82,23 +82,23 @@ def record_vector(
     autoreset_mode: AutoresetMode | str | None = None,
     **packing: Any,
 ) -> RecordedVector:
-    """Return a vector environment, recording whatever any loop does with it.
+    """Return a vector environment, with everything that a loop does with it recorded.
 
         with runner.record_vector(gymnasium.make_vec("CartPole-v1", 8), config={"lr": 3e-4}) as envs:
             observations, infos = envs.reset(seed=0)
 
-    All environments are recorded into one run; step number n of it was taken in environment n modulo
-    their number. Each way of resetting by itself (`AutoresetMode`) is recorded as what it is.
+    All environments are recorded into one run, whose step number n was taken in environment n modulo their
+    number. Resets that the environments do by themselves (`AutoresetMode`) are recorded as resets.
 
     Args:
         envs: a vector environment.
-        recordings: as for `record`, like what follows.
-        name: what the run is called.
-        seed: what the run is listed with.
-        config: your own settings.
-        info: fields of the vector's infos to record.
-        autoreset_mode: how the environments reset themselves, where their metadata does not state it:
-            "NextStep", "SameStep" or "Disabled". SuperSuit's reset in the "SameStep".
+        recordings: as for `record`.
+        name: as for `record`.
+        seed: as for `record`.
+        config: as for `record`.
+        info: names of fields of the vector's infos to record.
+        autoreset_mode: how the environments reset themselves, if their metadata does not state it:
+            "NextStep", "SameStep" or "Disabled"; "SameStep" for SuperSuit.
         packing: as for `record`.
 
     Raises:
@@ -113,13 +113,13 @@ def record_vector(
     mode = _autoreset_mode(envs, autoreset_mode)
     described = _described_vector(envs)
     _require_fixed(described)
-    plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
+    options = options_of(recordings, name, seed, config, info, packing)
     rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
-    return RecordedVector(envs, Loop(described, plan, rows), mode)
+    return RecordedVector(envs, Loop(described, options, rows), mode)
 
 
 def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str | None) -> AutoresetMode:
-    """Return the way in which environments reset themselves: the chosen one, else the stated one.
+    """Return how environments reset themselves: as chosen, else as their metadata states.
 
     Raises:
         ConfigError: there is no such mode.
@@ -135,7 +135,7 @@ def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str 
     if not isinstance(stated, AutoresetMode):
         raise EnvironmentNotUsable(
             f'found metadata["autoreset_mode"] {stated!r}, expected one of gymnasium.vector.AutoresetMode: '
-            "without it, resets cannot be told from steps. State it: record_vector(envs, "
+            "without it, resets cannot be distinguished from steps. State it: record_vector(envs, "
             'autoreset_mode="NextStep"), or "SameStep" (SuperSuit) or "Disabled".'
         )
     return stated
@@ -158,7 +158,7 @@ def _one_of(envs: VectorEnv[Any, Any, Any]) -> Iterator[Any]:
     """Yield what has the registration of the environments: the vector, or one of its environments.
 
     Those of an AsyncVectorEnv are in other processes, which end if a registration cannot be sent; so one is
-    made here, as AsyncVectorEnv itself does, without moving the global random generators.
+    made here, as AsyncVectorEnv itself does, without changing the state of the global random generators.
     """
     unwrapped = envs.unwrapped
     if getattr(envs, "spec", None) is not None:
@@ -186,7 +186,7 @@ def _final_observations(infos: Any) -> Any:
 
 
 def _by_environment(infos: Any) -> Mapping[str, Any]:
-    """Return infos by field; SuperSuit gives a list of them, one for each environment."""
+    """Return infos by field; SuperSuit returns a list of them, one for each environment."""
     if isinstance(infos, Mapping):
         return infos
     return _by_field({str(i): info for i, info in enumerate(infos)})
@@ -195,12 +195,12 @@ def _by_environment(infos: Any) -> Mapping[str, Any]:
 class RecordedParallel(Recorded[AgentRows]):
     """A PettingZoo parallel environment whose every reset and step is recorded; made by `record_parallel`.
 
-    What it does not have itself it has of the environment: `agents`, `action_space`, ...
+    Its other attributes are those of the environment: `agents`, `action_space`, ...
     """
 
     def __init__(self, env: Any, loop: Loop[AgentRows]) -> None:
         self.env = env
-        self._own(loop)
+        self._record_into(loop)
         self._enter("train")
 
     def __getattr__(self, name: str) -> Any:
@@ -220,9 +220,9 @@ class RecordedParallel(Recorded[AgentRows]):
         with self._loop.lock:
             self._loop.activate(self._rows)
             over = not self.env.agents
-            self._rows.take(actions, observations, rewards, terminated, truncated, over)
-        if self._loop.plan.info:
-            self._loop.info(self._phase, _by_field(infos))
+            self._rows.take_game(actions, observations, rewards, terminated, truncated, over)
+        if self._options.info:
+            self._messages.info(self._phase, _by_field(infos))
         return result  # type: ignore[no-any-return]
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
@@ -231,7 +231,7 @@ class RecordedParallel(Recorded[AgentRows]):
         with self._loop.lock:
             self._loop.activate(self._rows)
             self._rows.reset(result[0], seed)
-        self._loop.reset_info(self._phase, _by_field(result[1]), options, seed)
+        self._messages.reset_info(self._phase, _by_field(result[1]), options, seed)
         return result  # type: ignore[no-any-return]
 
 
@@ -245,18 +245,18 @@ def record_parallel(
     info: Sequence[str] = (),
     **packing: Any,
 ) -> RecordedParallel:
-    """Return a PettingZoo parallel environment, recording whatever any loop does with it.
+    """Return a PettingZoo parallel environment, with everything that a loop does with it recorded.
 
-    Each agent of `possible_agents` has its own reward column and its own part of observation and action;
-    a step says which agents acted and for which it was the last.
+    Each agent of `possible_agents` has its own reward column and its own part of observation and action. A
+    step records which agents acted and for which it was the last.
 
     Args:
         env: a `pettingzoo.ParallelEnv`; `pettingzoo.utils.aec_to_parallel` makes one of a game in turns.
-        recordings: as for `record`, like what follows.
-        name: what the run is called.
-        seed: what the run is listed with.
-        config: your own settings.
-        info: fields of the agents' infos to record, where they come.
+        recordings: as for `record`.
+        name: as for `record`.
+        seed: as for `record`.
+        config: as for `record`.
+        info: names of fields of the agents' infos to record, where they occur.
         packing: as for `record`.
 
     Raises:
@@ -275,16 +275,12 @@ def record_parallel(
         )
     described = _game(env)
     _require_fixed(described)
-    plan = plan_of(recordings, name, seed, config, info, 0, "png", packing)
-    return RecordedParallel(env, Loop(described, plan, AgentRows))
+    options = options_of(recordings, name, seed, config, info, packing)
+    return RecordedParallel(env, Loop(described, options, AgentRows))
 
 
 def _require_fixed(described: Described) -> None:
-    """Refuse spaces whose values vary in size, before there is a run.
-
-    Raises:
-        EnvironmentNotUsable: there is one.
-    """
+    """Refuse spaces whose values vary in size, before a run is created."""
     if described.kind == "variable":
         raise EnvironmentNotUsable(
             "found a Text space, whose values vary in size; of several environments or agents at once "
@@ -293,7 +289,7 @@ def _require_fixed(described: Described) -> None:
 
 
 def _game(env: Any) -> Described:
-    """Return what is to be said of a PettingZoo parallel environment."""
+    """Return the description of a PettingZoo parallel environment."""
     agents = tuple(env.possible_agents)
     if not 1 <= len(agents) <= MAX_AGENTS:
         raise EnvironmentNotUsable(f"found {len(agents)} possible agents, expected 1 to {MAX_AGENTS}.")
@@ -308,8 +304,6 @@ def _game(env: Any) -> Described:
         observation=observation,
         action=action,
         env_id=str(name or type(env).__name__),
-        kwargs={},
-        step_limit=0,
         agents=agents,
     )
 

@@ -14,8 +14,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
 from runner.cli import cli
-from runner.export.minari_loops import space_of
-from runner.loops.spaces import describe_space
+from runner.recording.gym_spaces import describe_space, restore_space
 from tests.runner.loops.making import NAMES, Rooms, make, play
 
 pytest.importorskip("minari")
@@ -173,4 +172,4 @@ def test_a_phase_without_an_episode_is_refused(tmp_path):
     ids=str,
 )
 def test_a_space_is_made_again_from_its_description(space):
-    assert space_of(describe_space(space, "here")) == space
+    assert restore_space(describe_space(space)) == space

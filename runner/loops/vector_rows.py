@@ -1,30 +1,31 @@
 """The steps of a vector environment: whole batches copied as they come, records made for many steps at once.
 
-A step copies five arrays. What follows from the order of steps (their numbers, the lengths and returns of
+A vector environment steps N environments at once: record number n of a phase belongs to environment n modulo
+N. A step copies five arrays. What follows from the order of steps (their numbers, the lengths and returns of
 episodes, the resets that environments do by themselves) is computed for a block of steps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.loops.spaces import Described, parts_of
-from runner.loops.staging import Flags, StagedRows
-from runner.loops.values import filler, leaves, put_batch, put_chosen, require_reset
+from runner.loops.description import Described
+from runner.loops.rows import MAX_SEED
+from runner.loops.values import filler, leaves_of, put_chosen, require_reset
 from runner.recording import schema
 from runner.recording.recorder import Recorder
+from runner.recording.schema import Topic
 
-_MOST_STEPS: Final = 2048
-"""Steps of the vector environment in a block; fewer if the recorder's blocks hold fewer records."""
+Flags = NDArray[np.bool_]
+_MAX_STEPS: Final = 2048
+"""The most steps of the vector environment in a block; fewer if the recorder's blocks hold fewer records."""
 
 
-@dataclass(frozen=True)
-class _Reset:
+class _Reset(NamedTuple):
     """A reset, called by the user, of environments whose episodes had ended."""
 
     row: int
@@ -34,8 +35,7 @@ class _Reset:
     seeds: Sequence[int | None]
 
 
-@dataclass(frozen=True)
-class _Final:
+class _Final(NamedTuple):
     """The last observations of episodes that ended in a step whose observations are of the next ones."""
 
     row: int
@@ -43,8 +43,7 @@ class _Final:
     observation: NDArray[Any]
 
 
-@dataclass(frozen=True)
-class _Counts:
+class _Counts(NamedTuple):
     """What follows from the ends of episodes in a block; arrays are [rows, N] or [rows + 1, N]."""
 
     over: Flags
@@ -54,13 +53,15 @@ class _Counts:
     """Episodes that ended in the block before each row, and before its end."""
     t: NDArray[np.int64]
     length: NDArray[np.int64]
-    """Steps of the episode up to and with each row."""
+    """Steps of the episode up to and including each row."""
     returns: NDArray[np.float64]
-    """Sums of the episode's rewards up to and with each row."""
+    """Sums of the episode's rewards up to and including each row."""
 
 
-class VectorRows(StagedRows):
+class VectorRows:
     """The steps of one phase of a vector environment that are not committed yet.
+
+    Not thread-safe: the caller holds the loop's lock.
 
     Args:
         recorder: takes their records.
@@ -70,6 +71,8 @@ class VectorRows(StagedRows):
         next_step: whether an environment whose episode is over ignores its next action and is reset.
     """
 
+    off_table = 0
+
     def __init__(
         self,
         recorder: Recorder,
@@ -78,35 +81,49 @@ class VectorRows(StagedRows):
         first_action: Callable[[Any], None],
         next_step: bool,
     ) -> None:
-        super().__init__(recorder, described, phase, first_action)
+        self._recorder, self._phase, self._first_action = recorder, phase, first_action
+        topics = {topic.name: topic for topic in schema.KINDS[described.kind]}
+        self._steps = topics[f"/{phase}/step"]
+        self._episodes = topics[f"/{phase}/episode"]
+        self._resets = topics[f"/{phase}/reset"]
         self._discrete = described.kind == "step"
         self._next_step = next_step
         self._state_start, self._action_start = (
             int(space.start) if self._discrete else 0  # type: ignore[attr-defined]
             for space in (described.observation, described.action)
         )
+        self._n = n = described.environments
+        self._episode = np.zeros(n, np.int64)
+        """The number of the episode in progress, or of the next one, in each environment."""
+        self._length = np.zeros(n, np.int64)
+        self._return = np.zeros(n)
+        self._ended = 0
+        self._reset_count = 0
         self._observation_dtype = recorder.blank(self._resets, 1).dtype["observation"]
         self._room = 0
         self._filled = 0
         """Rows of the block that are in use, of `_room`."""
-        self._over = np.zeros(self._n, np.bool_)
-        self._state = np.full(self._n, -self._state_start)
+        self._over = np.zeros(n, np.bool_)
+        self._state = np.full(n, -self._state_start)
         """The states before the first row, where both spaces are discrete."""
         self._user_resets: list[_Reset] = []
         self._finals: list[_Final] = []
         self._counted, self._ended_here = 0, 0
         """Rows of the block of which `place` has counted the ends of episodes, and those ends."""
+        self.reshape(described)
 
-    def _set_leaves(self, described: Described) -> None:
-        self._observation_leaves = leaves(
-            parts_of(described.observation, "the observation space"), "observation"
-        )
-        self._action_leaves = leaves(parts_of(described.recorded_action, "the action space"), "action")
+    def open(self) -> None:
+        """Do nothing: blocks are taken from the recorder when records are complete."""
+
+    def reshape(self, described: Described) -> None:
+        """Prepare for actions of another dtype, before the first step."""
+        self._observation_leaves = leaves_of(described.observation, "observation")
+        self._action_leaves = leaves_of(described.recorded_action, "action")
 
     def _make_room(self) -> None:
         """Allocate the block; the dtype of actions is known."""
         n = self._n
-        self._room = rows = max(1, min(_MOST_STEPS, self._recorder.capacity(self._steps) // n))
+        self._room = rows = max(1, min(_MAX_STEPS, self._recorder.capacity(self._steps) // n))
         records = self._recorder.blank(self._steps, 1).dtype
         action = self._action_leaves[0].base if self._discrete else records["action"]
         self._actions = np.empty((rows, n), action)
@@ -164,12 +181,12 @@ class VectorRows(StagedRows):
                 next ones; None where they are not.
         """
         if not self._room:
-            self._settle(actions)
+            self._first_action(actions)
             self._make_room()
         row = self._filled
         if not row:
-            require_reset(self._were_reset, self._phase)
-            # Only where they ended among the steps of another phase, and nobody reset them since.
+            require_reset(self._reset_count, self._phase)
+            # They ended among the steps of another phase, and were not reset since.
             self._abandon(np.flatnonzero(self._over))
         self._put_action(row, actions)
         self._put_observation(row, observations)
@@ -192,11 +209,11 @@ class VectorRows(StagedRows):
             self._finals.append(_Final(row, which, last[which]))
 
     def reset(self, observation: Any, seeds: Sequence[int | None], which: Flags) -> None:
-        """Record a reset of some environments; episodes under way in them end by it."""
+        """Record a reset of some environments; it ends episodes in progress in them."""
         chosen = np.flatnonzero(which)
         own = [seeds[i] if len(seeds) else None for i in chosen.tolist()]
         now = np.zeros(self._n, self._observation_dtype)
-        put_batch(self._observation_leaves, observation, now, (self._n,))
+        filler(self._observation_leaves, now[np.newaxis], (self._n,))(0, observation)
         over = self.over
         if self._filled and over[chosen].all():
             self._user_resets.append(_Reset(self._filled, chosen, now[chosen], own))
@@ -206,7 +223,18 @@ class VectorRows(StagedRows):
         self._over = self._over & ~which
         if self._discrete:
             self._state[chosen] = now[chosen].astype(np.int64) - self._state_start
-        self._begin(chosen, now[chosen], own)
+        steps = np.full(len(chosen), self._recorder.steps[self._phase])
+        self._put_resets(chosen, now[chosen], own, self._episode[chosen], steps)
+
+    def _abandon(self, which: NDArray[np.intp]) -> None:
+        """End the episodes in progress of these environments, neither terminated nor truncated."""
+        which = which[self._length[which] > 0]
+        if len(which):
+            last = self._recorder.steps[self._phase] - self._n + which
+            self._put_ends(last, self._length[which], self._return[which], False, False)
+            self._episode[which] += 1
+            self._length[which] = 0
+            self._return[which] = 0.0
 
     # --- blocks ---------------------------------------------------------------------------------------
 
@@ -228,7 +256,7 @@ class VectorRows(StagedRows):
             self._put_ends(
                 first + row * n + which,
                 counts.length[row, which],
-                counts.returns[row, which, np.newaxis],
+                counts.returns[row, which],
                 self._terminated[row, which],
                 self._truncated[row, which],
             )
@@ -236,7 +264,7 @@ class VectorRows(StagedRows):
         ended = counts.over[-1]
         self._episode += counts.ended_before[-1]
         self._length = np.where(ended, 0, counts.length[-1])
-        self._return = np.where(ended, 0.0, counts.returns[-1])[:, np.newaxis]
+        self._return = np.where(ended, 0.0, counts.returns[-1])
         self._over = over_after
         self._filled = self._counted = self._ended_here = 0
         self._user_resets, self._finals = [], []
@@ -263,7 +291,7 @@ class VectorRows(StagedRows):
     def _returns(self, over: Flags, only_reset: Flags) -> NDArray[np.float64]:
         """Return each episode's rewards, added one after the other: other orders round otherwise."""
         sums = np.where(only_reset, 0.0, self._rewards[: len(over)])
-        carried = np.where(only_reset[0], 0.0, self._return[:, 0])
+        carried = np.where(only_reset[0], 0.0, self._return)
         begin = 0
         for end in [*np.flatnonzero(over[:-1].any(axis=1)).tolist(), len(over) - 1]:
             part = sums[begin : end + 1]
@@ -344,3 +372,56 @@ class VectorRows(StagedRows):
             self._episode[which] + counts.ended_before[rows[order], which],
             first + rows[order] * self._n,
         )
+
+    # --- records --------------------------------------------------------------------------------------
+
+    def _put_ends(
+        self,
+        last: NDArray[Any],
+        length: NDArray[Any],
+        returns: NDArray[Any],
+        terminated: Flags | bool,
+        truncated: Flags | bool,
+    ) -> None:
+        """Record the ends of episodes, in the order in which they ended; `last` are their last steps."""
+        block = self._recorder.blank(self._episodes, len(last))
+        block["episode"] = self._ended + np.arange(len(last))
+        block["last_step"] = last
+        block["length"] = length
+        block["returns"] = returns[:, np.newaxis]
+        block["terminated"], block["truncated"] = terminated, truncated
+        self._put(self._episodes, block, last + 1)
+        self._ended += len(last)
+
+    def _put_resets(
+        self,
+        which: NDArray[np.intp],
+        observation: NDArray[Any],
+        seeds: Sequence[int | None],
+        episode: NDArray[Any],
+        steps: NDArray[Any],
+    ) -> None:
+        """Record resets in their order; `steps` are the steps of the phase before each."""
+        block = self._recorder.blank(self._resets, len(which))
+        valid = [seed if seed is not None and 0 <= seed <= MAX_SEED else None for seed in seeds]
+        block["observation"] = observation
+        block["reset"] = self._reset_count + np.arange(len(which))
+        block["episode"] = episode
+        block["step"] = steps
+        block["environment"] = which
+        block["seed"] = [seed or 0 for seed in valid]
+        block["seeded"] = [seed is not None for seed in valid]
+        self._put(self._resets, block, steps)
+        self._reset_count += len(which)
+
+    def _put(self, topic: Topic, records: NDArray[Any], steps: NDArray[Any]) -> None:
+        """Copy records into the recorder's blocks; `steps` are the steps of the phase before each."""
+        other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
+        positions = (steps + other).astype(np.uint64)
+        raw, size, done = records.view(np.uint8), records.itemsize, 0
+        while done < len(records):
+            block = self._recorder.block(topic)
+            n = min(len(block), len(records) - done)
+            block[:n].view(np.uint8)[:] = raw[done * size : (done + n) * size]
+            self._recorder.take(topic, positions[done : done + n])
+            done += n

@@ -1,0 +1,134 @@
+"""An environment and its spaces, as a recording describes them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from gymnasium import spaces
+
+from runner.environments.loading import mdp_of
+from runner.environments.mdp import Mdp
+from runner.errors import EnvironmentNotUsable
+from runner.recording.gym_spaces import Space, describe_space, parts_of
+from runner.recording.metadata import Attachments, environment_attachments
+from runner.util.jsonable import as_json
+
+_MAX_STATES: Final = 2**32
+"""Larger `Discrete` spaces are recorded as `Transition`: the numbers of `Step` have 32 bits."""
+_NOT_SETTINGS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "wrappers", "base_path"})
+"""What `gymnasium.make_vec` and EnvPool add to an environment's own settings."""
+
+
+@dataclass(frozen=True)
+class Described:
+    """An environment and its spaces."""
+
+    kind: str
+    """The kind of recording, a key of `schema.KINDS`."""
+    observation: Space
+    action: Space
+    env_id: str
+    kwargs: dict[str, Any] = field(default_factory=dict)
+    step_limit: int = 0
+    agents: tuple[str, ...] = ("agent",)
+    """The agents: one reward column each."""
+    environments: int = 1
+    mdp: Mdp | None = None
+    """The environment's arrays, if it is tabular."""
+    wide_action: Space | None = None
+    """The action space in the dtype of the recorded actions, if that is wider than its own."""
+
+    @property
+    def recorded_action(self) -> Space:
+        """The action space in the dtype in which actions are recorded."""
+        return self.action if self.wide_action is None else self.wide_action
+
+    @property
+    def spaces_json(self) -> str:
+        """The descriptions of both spaces."""
+        described = {"observation": self.observation, "action": self.recorded_action}
+        return json.dumps({name: describe_space(space) for name, space in described.items()})
+
+    def attachments(self) -> Attachments:
+        """Return the attachments that describe the environment, with its arrays if it is tabular."""
+        if self.mdp is not None:
+            return environment_attachments(self.mdp.description(), self.mdp.arrays())
+        description = {
+            "env_id": self.env_id,
+            "kwargs": self.kwargs,
+            "step_limit": self.step_limit,
+            "agents": list(self.agents),
+            "action_counts": [],
+            "event_names": [],
+            "success_events": [],
+            "penalty_below": None,
+            "scene": None,
+        }
+        return environment_attachments(description, {})
+
+
+def describe(env: Any, observation: Space, action: Space) -> Described:
+    """Return the description of a Gymnasium environment with these spaces.
+
+    Raises:
+        EnvironmentNotUsable: one of its spaces cannot be recorded.
+    """
+    env_id, kwargs, step_limit = _registration(env)
+    kind = kind_of(observation, action)
+    mdp = _tabular(env, kwargs, observation, action) if kind == "step" else None
+    agents: tuple[str, ...] = ("agent",)
+    if mdp is not None:
+        agents = mdp.agents if len(mdp.agents) == 1 else ("agency",)
+    return Described(kind, observation, action, env_id, kwargs, step_limit, agents, mdp=mdp)
+
+
+def _registration(env: Any) -> tuple[str, dict[str, Any], int]:
+    """Return an environment's id, keyword arguments and step limit, as far as they are registered.
+
+    EnvPool's specification has a `config` and no id.
+    """
+    spec = getattr(env, "spec", None)
+    given = getattr(spec, "kwargs", None)
+    if not isinstance(given, Mapping):
+        given = getattr(spec, "config", None)
+        if callable(as_dict := getattr(given, "_asdict", None)):
+            given = as_dict()
+    try:
+        kwargs = as_json({key: value for key, value in dict(given or {}).items() if key not in _NOT_SETTINGS})
+    except (TypeError, ValueError, RecursionError):
+        kwargs = {}
+    name = getattr(spec, "id", None)
+    limit = getattr(spec, "max_episode_steps", None) or kwargs.get("max_episode_steps")
+    return (
+        name if isinstance(name, str) else type(getattr(env, "unwrapped", env)).__qualname__,
+        kwargs,
+        limit if isinstance(limit, int) and limit > 0 else 0,
+    )
+
+
+def kind_of(observation: Space, action: Space) -> str:
+    """Return the kind of recording of these spaces.
+
+    Raises:
+        EnvironmentNotUsable: one of them cannot be recorded.
+    """
+    parts = [*parts_of(observation, "the observation space"), *parts_of(action, "the action space")]
+    if type(observation) is type(action) is spaces.Discrete:
+        return "step" if max(int(observation.n), int(action.n)) <= _MAX_STATES else "transition"
+    return "variable" if any(part.dtype is None for part in parts) else "transition"
+
+
+def _tabular(env: Any, kwargs: dict[str, Any], observation: Any, action: Any) -> Mdp | None:
+    """Return the arrays of an environment if it is tabular and its observations are its states."""
+    base = getattr(env, "unwrapped", env)
+    if not hasattr(base, "transitions") and not hasattr(base, "P"):
+        return None
+    try:
+        mdp = mdp_of(env, kwargs)
+    except EnvironmentNotUsable:
+        return None  # an attribute of that name that means something else
+    same = (int(observation.n), int(action.n)) == (mdp.states, mdp.joint_actions)
+    return mdp if same and not observation.start and not action.start else None

@@ -1,0 +1,231 @@
+"""What a loop records besides its steps: logged numbers and texts, arrays, infos and pictures."""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import ConfigError
+from runner.loops.options import ALL_INFO, Options, pillow
+from runner.loops.outcomes import Outcomes
+from runner.loops.rows import MAX_SEED, PhaseRows
+from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number
+from runner.recording import schema
+from runner.recording.messages import encode, encode_image, encode_log, scalar_encoder
+from runner.recording.recorder import Recorder
+from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.util.jsonable import as_json
+from runner.util.values import is_utf8
+
+MAX_INFO_BYTES: Final = 1 << 20
+"""The most bytes of JSON for the info of one step."""
+_MAX_WAITING: Final = 1024
+"""Logged numbers that wait for the recorder; they are handed over twice a second at the latest."""
+_LONG_NAME: Final = 200
+"""Numbers under longer names do not wait, because together they would be large."""
+_JPEG_QUALITY: Final = 90
+
+
+class LoopState(Protocol):
+    """The loop that messages belong to."""
+
+    lock: threading.RLock
+
+    @property
+    def position(self) -> int:
+        """The number of steps executed so far; raises `RunnerError` if the loop is closed."""
+
+    def rows(self, phase: str) -> PhaseRows:
+        """Return the steps of a phase; raises `ConfigError` if there is no such phase."""
+
+    def records(self) -> bool:
+        """Return whether this process records, and warn if it was forked from the one that does."""
+
+    def warn_once(self, message: str) -> None:
+        """Warn the user of something once."""
+
+
+class _Series(NamedTuple):
+    """The numbers that are logged under one name in one phase."""
+
+    name: str
+    rows: PhaseRows
+    encode: Callable[[float, int, int], bytes]
+    """Returns the message for a value, step and episode."""
+
+
+class Messages:
+    """Records the messages of a loop; its methods may be called from any thread."""
+
+    def __init__(
+        self,
+        loop: LoopState,
+        recorder: Recorder,
+        outcomes: Outcomes,
+        options: Options,
+        topics: Mapping[str, Topic],
+    ) -> None:
+        self._loop, self._recorder, self._outcomes = loop, recorder, outcomes
+        self._options, self._topics = options, topics
+        self.has_logged = False
+        """Whether anything was logged."""
+        self._series: dict[tuple[str, str], _Series] = {}
+        self._numbers: list[tuple[_Series, float, int, int, int]] = []
+        """Logged numbers that the recorder does not have yet: series, value, position, step, episode."""
+
+    def log(self, phase: str, name: str, value: Any) -> None:
+        """Record a number or a text under a name, at this moment.
+
+        Raises:
+            ConfigError: it is neither, or the name is not valid.
+        """
+        series = self._series.get((phase, name))
+        if value.__class__ is not float or series is None:
+            if isinstance(value, str):
+                self._log_text(name, value)
+                return
+            value = logged_number(name, value)
+            if series is None:
+                check_log_name(name, value)
+                self.has_logged = True
+                series = _Series(name, self._loop.rows(phase), scalar_encoder(name, phase))
+                self._series[phase, name] = series
+        with self._loop.lock:
+            if not self._loop.records():
+                return
+            position = self._loop.position
+            step, episode = series.rows.place
+            self._numbers.append((series, value, position, step, episode))
+            if len(self._numbers) == _MAX_WAITING or len(name) > _LONG_NAME:
+                self.commit()
+
+    def commit(self) -> None:
+        """Hand the logged numbers to the recorder. The caller holds the lock."""
+        numbers, self._numbers = self._numbers, []
+        if numbers:
+            payloads = [series.encode(value, step, episode) for series, value, _, step, episode in numbers]
+            self._recorder.extend(
+                schema.SCALAR_TOPIC, payloads, [position for _, _, position, _, _ in numbers]
+            )
+            for series, value, _, _, _ in numbers:
+                self._outcomes.take_logged(series.name, value)
+
+    def _log_text(self, name: str, text: str) -> None:
+        check_log_name(name, text)
+        if not is_utf8(text):
+            raise ConfigError(f"log: found {text!r} for {name!r}, expected text that is valid Unicode")
+        if len(text) > MAX_ARRAY_BYTES // 4:
+            raise ConfigError(
+                f"log: found a text of {len(text):,} characters for {name!r}, "
+                f"expected at most {MAX_ARRAY_BYTES // 4:,}"
+            )
+        with self._loop.lock:
+            if self._loop.records():
+                position = self._loop.position
+                payload = encode_log(text, position * STEP_NANOSECONDS / 1e9, name=name)
+                self._recorder.append(schema.LOG_TOPIC, payload, position)
+                self.has_logged = True
+
+    def snapshot(self, phase: str, name: str, array: Any) -> None:
+        """Record an array of numbers, or all arrays of a mapping, as they are now.
+
+        Raises:
+            ConfigError: it holds something else, or is too large; nothing is recorded then.
+        """
+        arrays = dict(arrays_of(name, array))
+        with self._loop.lock:
+            if not self._loop.records():
+                return
+            position = self._loop.position
+            step, episode = self._loop.rows(phase).place
+            for own_name, values in arrays.items():
+                fields = {"name": own_name, "phase": phase, "step": step, "episode": episode}
+                fields |= {"shape": list(values.shape), "dtype": values.dtype.str, "data": values.tobytes()}
+                self._recorder.append(schema.ARRAY_TOPIC, encode(schema.ARRAY, fields), position)
+                self.has_logged = True
+
+    def info(self, phase: str, info: Mapping[str, Any], reset: Mapping[str, Any] | None = None) -> None:
+        """Record the chosen fields of an info, of the step or reset that was just put down.
+
+        Args:
+            phase: `train` or `eval`.
+            info: as the environment returned it.
+            reset: options and seed of the reset, if it is a reset.
+        """
+        names = self._options.info
+        chosen = info if ALL_INFO in names else {key: info[key] for key in names if key in info}
+        if not chosen and not reset:
+            return
+        text = '{"info": ' + self._json_of("info", chosen)
+        text += ', "reset": ' + self._json_of("reset", reset) + "}" if reset else "}"
+        with self._loop.lock:
+            if not self._loop.records():
+                return
+            step, _ = self._loop.rows(phase).place
+            is_reset = reset is not None
+            fields = {"step": step if is_reset else step - 1, "reset": is_reset, "json": text}
+            topic = self._topics[f"/{phase}/info"]
+            self._recorder.append(topic, encode(schema.INFO, fields), self._loop.position)
+
+    def reset_info(
+        self, phase: str, info: Mapping[str, Any], options: Mapping[str, Any] | None, seed: Any
+    ) -> None:
+        """Record the chosen fields of a reset's info, its options, and a seed too large for its record."""
+        reset: dict[str, Any] = {"options": options} if options else {}
+        if isinstance(seed, int) and seed > MAX_SEED:
+            reset["seed"] = {"value": str(seed)}
+        if reset or self._options.info:
+            self.info(phase, info, reset)
+
+    def _json_of(self, what: str, fields: Mapping[str, Any]) -> str:
+        """Return fields as a JSON object; a field that cannot be recorded is replaced by the reason."""
+        pieces, size = [], 0
+        for key, value in fields.items():
+            try:
+                text = json.dumps(as_json(value))
+                if size + len(text) > MAX_INFO_BYTES:
+                    raise ValueError(f"{what} takes more than {MAX_INFO_BYTES:,} bytes of JSON")
+            except (ValueError, RecursionError) as error:
+                text = json.dumps(f"not recorded: {error}")
+                self._loop.warn_once(
+                    f"{what}[{key!r}] is not recorded where {error}. This warning is given once."
+                )
+            size += len(text)
+            pieces.append(f"{json.dumps(str(key))}: {text}")
+        return "{" + ", ".join(pieces) + "}"
+
+    def frame(self, phase: str, image: Any) -> None:
+        """Record a picture, [height, width, 3] of uint8; another thread encodes it.
+
+        Raises:
+            ConfigError: it is something else.
+        """
+        with self._loop.lock:
+            if not self._loop.records():
+                return
+            pixels = np.array(image)
+            if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+                raise ConfigError(
+                    f"frames: found {pixels.dtype} of shape {list(pixels.shape)} from render(), expected "
+                    "uint8 of [height, width, 3]."
+                )
+            kind, position = self._options.frame_format, self._loop.position
+
+            def make() -> bytes:
+                return encode_image(_image_bytes(pixels, kind), kind, position, phase)
+
+            self._recorder.submit(self._topics[f"/{phase}/frame"], make, position)
+
+
+def _image_bytes(pixels: NDArray[np.uint8], kind: str) -> bytes:
+    """Return a picture, [height, width, 3], as `png` (exact) or `jpeg` (smaller, and not exact)."""
+    buffer = io.BytesIO()
+    options: dict[str, Any] = {"compress_level": 1} if kind == "png" else {"quality": _JPEG_QUALITY}
+    pillow().fromarray(pixels).save(buffer, kind, **options)
+    return buffer.getvalue()

@@ -1,0 +1,344 @@
+"""The rows of one environment, by the kind of its spaces, and of a game of several agents."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.loops.description import Described
+from runner.loops.rows import Rows
+from runner.loops.values import (
+    Leaf,
+    filler,
+    leaves_of,
+    lone_number,
+    require_reset,
+    value_bytes,
+    whole_number,
+)
+from runner.recording import schema
+from runner.recording.gym_spaces import Space
+from runner.recording.messages import encode
+from runner.recording.recorder import Recorder
+
+_DISCRETE: Final = struct.Struct("<qqd??")
+_DISCRETE_DTYPE: Final = np.dtype(
+    [("action", "<i8"), ("next_state", "<i8"), ("reward", "<f8"), ("terminated", "?"), ("truncated", "?")]
+)
+_ENDING: Final = struct.Struct("<d??")
+_ENDING_DTYPE: Final = np.dtype([("reward", "<f8"), ("terminated", "?"), ("truncated", "?")])
+_VARIABLE_ROWS: Final = 4096
+_MAX_STATE: Final = 2**32 - 1
+
+
+class BlockRows(Rows):
+    """Rows whose steps have one size: put down in place."""
+
+    _scratch_dtype: np.dtype[np.void]
+    """What a step brings that waits until its block is completed."""
+
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
+        self._scratch = np.zeros(0, self._scratch_dtype)
+        super().__init__(recorder, described, phase, first_action)
+
+    def _open_steps(self) -> tuple[int, int]:
+        self._block = self._recorder.block(self._steps)
+        self._reset_block = self._recorder.block(self._resets)
+        room = len(self._block)
+        if len(self._scratch) < room:
+            self._scratch = np.zeros(room, self._scratch_dtype)
+            self._bytes = self._scratch.view(np.uint8).data
+        return room, len(self._reset_block)
+
+    def _rewards(self, n: int) -> NDArray[np.float64]:
+        return self._scratch["reward"][:n]
+
+    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+        block, rows = self._block[:n], self._scratch[:n]
+        block["rewards"] = rows["reward"].reshape(n, -1)
+        block["terminated"], block["truncated"] = rows["terminated"], rows["truncated"]
+        block["step"] = self._recorder.steps[self._phase] + np.arange(n)
+        block["episode"] = episode
+        block["t"] = t
+        self._recorder.take(self._steps, np.arange(before + 1, before + n + 1, dtype=np.uint64))
+
+
+class DiscreteRows(BlockRows):
+    """Rows of `dualtaxi.Step`: both spaces are `Discrete`."""
+
+    _scratch_dtype = _DISCRETE_DTYPE
+
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
+        self._state_start = int(described.observation.start)  # type: ignore[attr-defined]
+        self._action_start = int(described.action.start)  # type: ignore[attr-defined]
+        self._state: int | None = None
+        """The state before the first row; None before any reset."""
+        super().__init__(recorder, described, phase, first_action)
+
+    def _open_steps(self) -> tuple[int, int]:
+        rooms = super()._open_steps()
+        self._reset_column = self._reset_block["observation"]
+        return rooms
+
+    def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
+        """Put down a step."""
+        if self._state is None:
+            require_reset(len(self._reset_rows), self._phase)
+        try:
+            reward = float(reward)
+        except (TypeError, ValueError):
+            reward = lone_number(reward, "reward")
+        at = self.filled * 26
+        try:
+            _DISCRETE.pack_into(self._bytes, at, action, observation, reward, terminated, truncated)
+        except (struct.error, TypeError):
+            action, observation = whole_number(action, "action"), whole_number(observation, "observation")
+            _DISCRETE.pack_into(self._bytes, at, action, observation, reward, terminated, truncated)
+        self._count(reward, terminated, truncated)
+
+    def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
+        self._reset_column[len(self._reset_rows)] = whole_number(observation, "observation")
+
+    def _transitions(self, n: int) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+        rows = self._scratch[:n]
+        next_state = rows["next_state"] - self._state_start
+        state = np.empty(n + 1, np.int64)
+        state[0] = -1 if self._state is None else self._state
+        state[1:] = next_state
+        if self._reset_rows:
+            state[self._reset_rows] = self._reset_column[: len(self._reset_rows)] - self._state_start
+        self._state = int(state[n])
+        self._columns = {
+            "state": state[:n],
+            "action": rows["action"] - self._action_start,
+            "next_state": next_state,
+        }
+        return self._columns["state"], self._columns["action"], next_state
+
+    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+        for name, values in self._columns.items():
+            if not 0 <= values.min() <= values.max() <= _MAX_STATE:
+                raise RecordingError(
+                    f"found {name} {values.min()} to {values.max()}, outside of its Discrete space."
+                )
+            self._block[name][:n] = values
+        super()._finish_steps(n, episode, t, before)
+
+
+class ArrayRows(BlockRows):
+    """Rows of `dualtaxi.Transition` in spaces of fixed width."""
+
+    _scratch_dtype = _ENDING_DTYPE
+    _is_settled = False
+    """Whether the dtype of actions is known: an action was put down."""
+
+    def _open_steps(self) -> tuple[int, int]:
+        rooms = super()._open_steps()
+        put_action = filler(self._action_leaves, self._block["action"])
+        self._action = put_action if self._is_settled else self._settle
+        self._next = filler(self._observation_leaves, self._block["next_observation"])
+        self._first = filler(self._observation_leaves, self._reset_block["observation"])
+        return rooms
+
+    def _settle(self, row: int, action: Any) -> None:
+        """Put down the first action, whose dtype is the one that all are recorded in."""
+        self._is_settled = True
+        self._first_action(action)
+        self._action = filler(self._action_leaves, self._block["action"])
+        self._action(row, action)
+
+    def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
+        """Put down a step."""
+        row = self.filled
+        if not row:
+            require_reset(self._reset_count + len(self._reset_rows), self._phase)
+        try:
+            reward = float(reward)
+        except (TypeError, ValueError):
+            reward = lone_number(reward, "reward")
+        self._action(row, action)
+        self._next(row, observation)
+        _ENDING.pack_into(self._bytes, row * 10, reward, terminated, truncated)
+        self._count(reward, terminated, truncated)
+
+    def _put_reset(self, observation: Any, seed: int | None) -> None:  # noqa: ARG002
+        self._first(len(self._reset_rows), observation)
+
+    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+        block, rows = self._block[:n], self._scratch[:n]
+        block["acted"] = 1
+        block["agents_terminated"], block["agents_truncated"] = rows["terminated"], rows["truncated"]
+        super()._finish_steps(n, episode, t, before)
+
+
+class AgentRows(BlockRows):
+    """Rows of `dualtaxi.Transition` of all agents of a PettingZoo parallel environment."""
+
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
+        self._agents = described.agents
+        self._is_settled = False
+        self._scratch_dtype = np.dtype(
+            [("reward", "<f8", (len(self._agents),)), ("terminated", "?"), ("truncated", "?")]
+        )
+        super().__init__(recorder, described, phase, first_action)
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """The steps of the phase so far, and the number of episodes that have ended."""
+        return super().place[0], self._ended + len(self._ends)
+
+    def _set_leaves(self, described: Described) -> None:
+        self._own_observations = _leaves_by_agent(described.observation, "observation")
+        self._own_actions = _leaves_by_agent(described.recorded_action, "action")
+
+    def _open_steps(self) -> tuple[int, int]:
+        rooms = super()._open_steps()
+        self._action = self._filler(self._own_actions, self._block["action"])
+        self._next = self._filler(self._own_observations, self._block["next_observation"])
+        self._first = self._filler(self._own_observations, self._reset_block["observation"])
+        return rooms
+
+    def _filler(
+        self, leaves: Mapping[str, list[Leaf]], column: NDArray[Any]
+    ) -> Callable[[int, Mapping[str, Any]], None]:
+        """Return a function that puts the values of some agents into a row, and zeros for the others."""
+        fillers = {agent: filler(own, column) for agent, own in leaves.items()}
+        zeros = np.zeros((), column.dtype)
+
+        def put(row: int, values: Mapping[str, Any]) -> None:
+            column[row] = zeros
+            for agent, value in values.items():
+                if agent not in fillers:
+                    names = ", ".join(self._agents)
+                    raise RecordingError(
+                        f"found the agent {agent!r}, expected one of possible_agents: {names}"
+                    )
+                fillers[agent](row, {agent: value})
+
+        return put
+
+    def take_game(
+        self,
+        actions: Mapping[str, Any],
+        observations: Mapping[str, Any],
+        rewards: Mapping[str, float],
+        terminated: Mapping[str, bool],
+        truncated: Mapping[str, bool],
+        over: bool,
+    ) -> None:
+        """Put down a step; agents that are missing took no part in it."""
+        require_reset(self._reset_count + len(self._reset_rows), self._phase)
+        if not self._is_settled:
+            self._is_settled = True
+            self._first_action(actions)
+        row = self.filled
+        self._action(row, actions)
+        self._next(row, observations)
+        self._block["acted"][row] = self._mask(dict.fromkeys(actions, True))
+        self._block["agents_terminated"][row] = self._mask(terminated)
+        self._block["agents_truncated"][row] = self._mask(truncated)
+        paid = np.array([float(rewards.get(agent, 0.0)) for agent in self._agents])
+        endings = [over and any(flags.values()) for flags in (terminated, truncated)]
+        self._scratch[row] = (paid, *endings)
+        self._count(paid, *endings)
+        if over and not self._fresh:  # no agent is left, and none was terminated or truncated
+            self._end(self.filled - 1, False, False)
+
+    def _put_reset(self, observation: Mapping[str, Any], seed: int | None) -> None:  # noqa: ARG002
+        self._first(len(self._reset_rows), observation)
+
+    def _mask(self, flags: Mapping[str, bool]) -> int:
+        return sum(bool(flags.get(agent)) << i for i, agent in enumerate(self._agents))
+
+
+def _leaves_by_agent(space: Space, what: str) -> dict[str, list[Leaf]]:
+    assert isinstance(space, spaces.Dict)
+    leaves = leaves_of(space, what, "the agents' spaces")
+    return {agent: [leaf for leaf in leaves if leaf.part.keys[0] == agent] for agent in space.spaces}
+
+
+class VariableRows(Rows):
+    """Rows of `dualtaxi.Transition` where a space has texts: each message is made when it comes."""
+
+    def __init__(
+        self, recorder: Recorder, described: Described, phase: str, first_action: Callable[[Any], None]
+    ) -> None:
+        self._paid = np.zeros(_VARIABLE_ROWS)
+        self._is_settled = False
+        super().__init__(recorder, described, phase, first_action)
+
+    def _open_steps(self) -> tuple[int, int]:
+        return _VARIABLE_ROWS, _VARIABLE_ROWS
+
+    @property
+    def _coming_episode(self) -> int:
+        """The number of the episode that the next step belongs to."""
+        return self._episode + len(self._begins) + self._fresh
+
+    def take(self, action: Any, observation: Any, reward: Any, terminated: Any, truncated: Any) -> None:
+        """Put down a step."""
+        row, reward = self.filled, lone_number(reward, "reward")
+        require_reset(self._reset_count, self._phase)
+        if not self._is_settled:
+            self._is_settled = True
+            self._first_action(action)
+        began = row if self._fresh else self._begins[-1] if self._begins else -self._t
+        fields = {
+            "action": value_bytes(self._action_leaves, action),
+            "next_observation": value_bytes(self._observation_leaves, observation),
+            "rewards": [reward],
+            "step": self.place[0],
+            "episode": self._coming_episode,
+            "t": row - began,
+            "terminated": bool(terminated),
+            "truncated": bool(truncated),
+            "acted": 1,
+            "agents_terminated": int(bool(terminated)),
+            "agents_truncated": int(bool(truncated)),
+        }
+        position = sum(self._recorder.steps.values()) + row + 1
+        self._recorder.append(self._steps, encode(schema.TRANSITION, fields), position)
+        self._paid[row] = reward
+        self._count(reward, terminated, truncated)
+
+    def _put_reset(self, observation: Any, seed: int | None) -> None:
+        fields = {
+            "observation": value_bytes(self._observation_leaves, observation),
+            "reset": self._reset_count,
+            "episode": self._coming_episode,
+            "step": self.place[0],
+            "seed": seed or 0,
+            "seeded": seed is not None,
+        }
+        position = sum(self._recorder.steps.values()) + self.filled
+        self._recorder.append(self._resets, encode(schema.RESET, fields), position)
+        self._reset_count += 1
+
+    def _rewards(self, n: int) -> NDArray[np.float64]:
+        return self._paid[:n]
+
+    def _finish_steps(self, n: int, episode: NDArray[Any], t: NDArray[Any], before: int) -> None:
+        """Do nothing: the messages are complete."""
+
+    def _finish_resets(self, begins: NDArray[Any], before: int) -> None:
+        """Do nothing: the messages are complete."""
+
+
+ROWS: Final[dict[str, type[Rows]]] = {
+    "step": DiscreteRows,
+    "transition": ArrayRows,
+    "variable": VariableRows,
+}
+"""The rows of one environment by the kind of recording."""

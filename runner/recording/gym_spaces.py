@@ -1,0 +1,315 @@
+"""Gymnasium's spaces in a recording: one class each, which describes, encodes and restores the space.
+
+A new kind of space is a class here and an entry in `_KINDS`. Values are decoded in `spaces`, from the layout
+of their bytes, which needs no Gymnasium.
+"""
+
+from __future__ import annotations
+
+import json
+import string
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+
+from runner.errors import EnvironmentNotUsable
+from runner.recording.spaces import MAX_VALUE_BYTES
+from runner.util.jsonable import as_json
+from runner.util.values import is_text
+
+Space = spaces.Space[Any]
+Description = Mapping[str, Any]
+Keys = tuple[str | int, ...]
+_MAX_TEXT: Final = 4096
+"""Declared length of the values of spaces that have no length of their own."""
+_MAX_BOUNDS: Final = 64
+"""The most different bounds of a box that are listed."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A space inside of others that has no parts itself: how to get its value, and how to encode it."""
+
+    keys: Keys
+    """Keys of the `Dict`s and `Tuple`s around it, from the outermost in."""
+    dtype: np.dtype[Any] | None
+    """The dtype of an array with its shape; None for values that are recorded as text."""
+    text: Callable[[Any], str] | None = None
+    """Returns the text of a value; None for an array."""
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The keys as names of NumPy's fields."""
+        return tuple(map(str, self.keys))
+
+    def of(self, value: Any) -> Any:
+        """Return the value of this part in a value of the whole space."""
+        for key in self.keys:
+            value = value[key]
+        return value
+
+
+def parts_of(space: Space, where: str) -> list[Part]:
+    """Return the parts of a space in the order of its description.
+
+    Raises:
+        EnvironmentNotUsable: one of them cannot be recorded; the message names `where`.
+    """
+    parts = list(_kind(space).parts(space, where, ()))
+    size = sum(part.dtype.itemsize for part in parts if part.dtype is not None)
+    if size > MAX_VALUE_BYTES:
+        raise EnvironmentNotUsable(
+            f"{where} has values of {size:,} bytes, expected {MAX_VALUE_BYTES:,} at most: record a smaller "
+            "observation by wrapping outside of the wrapper that makes it small."
+        )
+    return parts
+
+
+def describe_space(space: Space) -> dict[str, Any]:
+    """Return a space as JSON, which `runner.recording.spaces` reads; `parts_of` has accepted the space."""
+    return _kind(space).describe(space)
+
+
+def restore_space(description: Description) -> Space:
+    """Return the space that a recording describes; bounds and letters that are not listed are the widest.
+
+    Raises:
+        AssertionError, KeyError, TypeError, ValueError, OverflowError: Gymnasium has no such space.
+    """
+    return _BY_NAME[description["type"]].restore(description)
+
+
+def widened(space: Space, value: Any) -> Space:
+    """Return an action space in whose dtypes an action, or a batch of actions, is exact.
+
+    Only floating-point actions widen a space: whole numbers that it cannot hold are a mistake.
+    """
+    wide: Space = _kind(space).widened(space, value)
+    return wide
+
+
+def can_widen(space: Space) -> bool:
+    """Return whether there are actions for which `widened` returns another space."""
+    return _kind(space).can_widen(space)
+
+
+class _Kind:
+    """A space whose values have no layout; they are recorded as JSON text."""
+
+    def parts(self, space: Space, where: str, keys: Keys) -> Iterator[Part]:  # noqa: ARG002
+        yield Part(keys, None, lambda value: value if isinstance(value, str) else self.text(value))
+
+    def text(self, value: Any) -> str:
+        return json.dumps(as_json(value))
+
+    def describe(self, space: Space) -> dict[str, Any]:
+        return {"type": "Text", "max_length": _MAX_TEXT, "holds": repr(space)[:1000]}
+
+    def restore(self, description: Description) -> Space:
+        raise KeyError(description["type"])
+
+    def widened(self, space: Any, value: Any) -> Any:  # noqa: ARG002
+        return space
+
+    def can_widen(self, space: Space) -> bool:  # noqa: ARG002
+        return False
+
+
+class _Graph(_Kind):
+    def text(self, value: Any) -> str:
+        return super().text({"nodes": value.nodes, "edges": value.edges, "edge_links": value.edge_links})
+
+
+class _Text(_Kind):
+    def parts(self, space: Space, where: str, keys: Keys) -> Iterator[Part]:  # noqa: ARG002
+        yield Part(keys, None, _checked_text)
+
+    def describe(self, space: Any) -> dict[str, Any]:
+        return {"type": "Text", "max_length": int(space.max_length)}
+
+    def restore(self, description: Description) -> Space:
+        length = max(int(description["max_length"]), 1)
+        return spaces.Text(length, min_length=0, charset=string.printable)
+
+
+def _checked_text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{type(value).__name__} is not a text")
+    return value
+
+
+class _Dict(_Kind):
+    def parts(self, space: Any, where: str, keys: Keys) -> Iterator[Part]:
+        for key, part in space.spaces.items():
+            if not is_text(str(key)):
+                raise EnvironmentNotUsable(
+                    f"{where}: found a part called {str(key)[:40]!r}, expected a short, printable name."
+                )
+            yield from _kind(part).parts(part, where, (*keys, key))
+
+    def describe(self, space: Any) -> dict[str, Any]:
+        parts = {str(key): describe_space(part) for key, part in space.spaces.items()}
+        return {"type": "Dict", "spaces": parts}
+
+    def restore(self, description: Description) -> Space:
+        return spaces.Dict({name: restore_space(part) for name, part in description["spaces"].items()})
+
+    def widened(self, space: Any, value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return space
+        parts = {
+            key: widened(part, value[key]) if key in value else part for key, part in space.spaces.items()
+        }
+        is_same = all(parts[key] is space.spaces[key] for key in parts)
+        return space if is_same else spaces.Dict(parts)
+
+    def can_widen(self, space: Any) -> bool:
+        return any(map(can_widen, space.spaces.values()))
+
+
+class _Tuple(_Kind):
+    def parts(self, space: Any, where: str, keys: Keys) -> Iterator[Part]:
+        for i, part in enumerate(space.spaces):
+            yield from _kind(part).parts(part, where, (*keys, i))
+
+    def describe(self, space: Any) -> dict[str, Any]:
+        return {"type": "Tuple", "spaces": [describe_space(part) for part in space.spaces]}
+
+    def restore(self, description: Description) -> Space:
+        return spaces.Tuple([restore_space(part) for part in description["spaces"]])
+
+    def widened(self, space: Any, value: Any) -> Any:
+        if not isinstance(value, Sequence):
+            return space
+        parts = tuple(widened(part, own) for part, own in zip(space.spaces, value, strict=False))
+        return space if all(map(lambda a, b: a is b, parts, space.spaces)) else spaces.Tuple(parts)
+
+    def can_widen(self, space: Any) -> bool:
+        return any(map(can_widen, space.spaces))
+
+
+class _Box(_Kind):
+    """A box, and any space of another library whose values are arrays of one shape and dtype."""
+
+    name = "Box"
+
+    def parts(self, space: Space, where: str, keys: Keys) -> Iterator[Part]:
+        dtype = np.dtype(space.dtype)
+        if dtype.kind not in "biuf" or dtype.itemsize > 8:
+            raise EnvironmentNotUsable(
+                f"{where}: found {space} of dtype {dtype}, expected numbers of at most 64 bits."
+            )
+        yield Part(keys, np.dtype((dtype.newbyteorder("<"), space.shape or ())))
+
+    def describe(self, space: Any) -> dict[str, Any]:
+        dtype = np.dtype(space.dtype).newbyteorder("<").str
+        shape = [int(n) for n in space.shape or ()]
+        return {"type": self.name, "dtype": dtype, "shape": shape, **self.details(space)}
+
+    def details(self, space: Any) -> dict[str, Any]:
+        return {name: _bound(getattr(space, name, None)) for name in ("low", "high")}
+
+    def restore(self, description: Description) -> Space:
+        dtype, shape = _dtype(description), tuple(description["shape"])
+        if dtype.kind == "f":
+            least, most = -np.inf, np.inf
+        else:
+            least, most = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+        low, high = (
+            np.broadcast_to(np.array(widest if bound is None else _numbers(bound), dtype), shape)
+            for bound, widest in ((description["low"], least), (description["high"], most))
+        )
+        return spaces.Box(low, high, shape, dtype.type)
+
+    def widened(self, space: Any, value: Any) -> Any:
+        try:
+            found = np.asarray(value).dtype
+        except (TypeError, ValueError):
+            return space
+        if not self.can_widen(space) or found.kind != "f" or found.itemsize > 8:
+            return space
+        if np.can_cast(found, space.dtype):
+            return space
+        return spaces.Box(space.low.astype(found), space.high.astype(found), dtype=found.type)
+
+    def can_widen(self, space: Any) -> bool:
+        return isinstance(space, spaces.Box) and not np.can_cast(np.float64, space.dtype)
+
+
+class _Discrete(_Box):
+    name = "Discrete"
+
+    def details(self, space: Any) -> dict[str, Any]:
+        return {"n": int(space.n), "start": int(space.start)}
+
+    def restore(self, description: Description) -> Space:
+        return spaces.Discrete(int(description["n"]), start=int(description["start"]))
+
+
+class _MultiDiscrete(_Box):
+    name = "MultiDiscrete"
+
+    def details(self, space: Any) -> dict[str, Any]:
+        return {"nvec": np.asarray(space.nvec).tolist()}
+
+    def restore(self, description: Description) -> Space:
+        return spaces.MultiDiscrete(np.array(description["nvec"]), dtype=_dtype(description).type)
+
+
+class _MultiBinary(_Box):
+    name = "MultiBinary"
+
+    def details(self, space: Any) -> dict[str, Any]:  # noqa: ARG002
+        return {}
+
+    def restore(self, description: Description) -> Space:
+        shape = tuple(description["shape"])
+        return spaces.MultiBinary(shape[0] if len(shape) == 1 else shape)
+
+
+_JSON: Final = _Kind()
+_KINDS: Final[dict[type[Space], _Kind]] = {
+    spaces.Dict: _Dict(),
+    spaces.Tuple: _Tuple(),
+    spaces.Text: _Text(),
+    spaces.Graph: _Graph(),
+    spaces.Sequence: _JSON,
+    spaces.OneOf: _JSON,
+    spaces.Discrete: _Discrete(),
+    spaces.MultiDiscrete: _MultiDiscrete(),
+    spaces.MultiBinary: _MultiBinary(),
+    spaces.Box: _Box(),
+}
+_BY_NAME: Final = {kind.__name__: own for kind, own in _KINDS.items()}
+
+
+def _kind(space: Space) -> _Kind:
+    for kind, own in _KINDS.items():
+        if isinstance(space, kind):
+            return own
+    has_layout = space.shape is not None and space.dtype is not None
+    return _KINDS[spaces.Box] if has_layout and np.dtype(space.dtype).kind in "biuf" else _JSON
+
+
+def _dtype(description: Description) -> np.dtype[Any]:
+    return np.dtype(description["dtype"]).newbyteorder("=")
+
+
+def _bound(bound: Any) -> Any:
+    """Return a bound of a box: one number if it is the same everywhere; None for too many."""
+    values = np.asarray(bound)
+    if not values.size or values.dtype.kind not in "biuf":
+        return None
+    if (values == values.flat[0]).all():
+        return as_json(values.flat[0].item())
+    return as_json(values.tolist()) if values.size <= _MAX_BOUNDS else None
+
+
+def _numbers(bound: Any) -> Any:
+    """Return a bound as numbers; in JSON, infinities are text."""
+    if isinstance(bound, list):
+        return [_numbers(part) for part in bound]
+    return float(bound) if isinstance(bound, str) else bound

@@ -1,0 +1,88 @@
+"""Any Python value as JSON can hold it: arrays, dataclasses, namespaces and other settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from argparse import Namespace
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from types import SimpleNamespace
+from typing import Any, Final
+
+import numpy as np
+
+MAX_VALUES: Final = 4_000_000
+_MAX_REPR: Final = 10_000
+
+
+def as_json(value: Any) -> Any:
+    """Return a value as JSON can hold it; what it cannot hold as its `repr`.
+
+    Arrays become lists, dataclasses and namespaces mappings, paths text; NaN and infinities become text.
+
+    Raises:
+        ValueError: the value contains itself, or more than 4,000,000 values.
+        RecursionError: it is nested too deeply.
+    """
+    return _Conversion().of(value)
+
+
+def as_mapping(value: Any) -> Mapping[Any, Any] | None:
+    """Return the fields of a mapping, dataclass, namespace or Pydantic model; None for anything else."""
+    if isinstance(value, Mapping):
+        return value
+    if isinstance(value, Namespace | SimpleNamespace):
+        return vars(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if callable(dump := getattr(value, "model_dump", None)) and not isinstance(value, type):
+        dumped = dump()
+        return dumped if isinstance(dumped, Mapping) else None
+    return None
+
+
+class _Conversion:
+    """One conversion, bounded: a graph of few objects can stand for endless JSON."""
+
+    def __init__(self) -> None:
+        self._left = MAX_VALUES
+        self._path: set[int] = set()
+
+    def of(self, value: Any) -> Any:
+        self._count(1)
+        if isinstance(value, Enum):
+            value = value.value
+        elif isinstance(value, np.generic | np.ndarray) and value.dtype.kind in "biufU":
+            self._count(value.size)
+            value = value.tolist()
+        elif isinstance(value, os.PathLike):
+            value = os.fspath(value)
+        if value is None or isinstance(value, int | str):
+            return value
+        if isinstance(value, float):
+            return value if math.isfinite(value) else repr(value)
+        if id(value) in self._path:
+            raise ValueError(f"a {type(value).__name__} contains itself")
+        self._path.add(id(value))
+        try:
+            if (fields := as_mapping(value)) is not None:
+                return {str(key): self.of(part) for key, part in fields.items()}
+            if isinstance(value, Sequence) and not isinstance(value, bytes | bytearray | memoryview):
+                return [self.of(part) for part in value]
+            return _repr(value)
+        finally:
+            self._path.discard(id(value))
+
+    def _count(self, values: int) -> None:
+        self._left -= values
+        if self._left < 0:
+            raise ValueError(f"it holds more than {MAX_VALUES:,} values")
+
+
+def _repr(value: Any) -> str:
+    try:
+        return repr(value)[:_MAX_REPR]
+    except Exception:  # a repr is foreign code, and no reason to fail
+        return f"<{type(value).__name__}>"
