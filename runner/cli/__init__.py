@@ -1,7 +1,7 @@
-"""The command line: parse, call one function, render, exit.
+"""The command line: parse, call one function, print, exit.
 
-A command is imported when it is invoked, and imports what is heavy when it needs it, so that help and
-completion are there at once. `COMMANDS` says where each one is and what it is for.
+A command's module is imported when it is invoked, and imports heavy packages inside its functions, so that
+help and completion are quick. `COMMANDS` says where each command is and what it is for.
 """
 
 from __future__ import annotations
@@ -9,8 +9,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib
+import inspect
 import json
 import os
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any, Final
@@ -20,55 +22,55 @@ import click
 from runner.errors import ConfigError, ExitCode, Located, RunnerError, StorageError, nearest
 from runner.util.version import __version__
 
-COMMANDS: Final[dict[str, dict[str, str]]] = {
+COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Run": {
-        "run": "Train, evaluate and record an experiment.",
-        "sweep": "Run an experiment with many values, and rank them.",
-        "resume": "Resume an interrupted run, to the same content as an undisturbed one.",
-        "evaluate": "Evaluate a run's Q-table at any step in new episodes.",
-        "rerecord": "Record the steps of a run that was recorded without them.",
+        "run": ("run", "Train, evaluate and record an experiment."),
+        "sweep": ("sweep", "Run an experiment with many values, and rank them."),
+        "resume": ("resume", "Resume an interrupted run, to the same content as an undisturbed one."),
+        "evaluate": ("evaluate", "Evaluate a run's Q-table at any step in new episodes."),
+        "rerecord": ("resume", "Record the steps of a run that was recorded without them."),
     },
     "Inspect": {
-        "ls": "List the recorded runs.",
-        "show": "Show a run: evaluations, tables, configuration.",
-        "play": "Replay a recorded episode in the terminal.",
-        "view": "Open runs in the Rerun viewer.",
-        "plot": "Draw every metric of one or several runs over episodes.",
-        "report": "Write one self-contained page about one or several runs.",
-        "diff": "Show what differs between two runs, and where they diverge.",
-        "compare": "Compare groups of runs, with statistics over seeds.",
-        "verify": "Check every step of a run by training it again.",
-        "qtable": "Show the exact Q-table of a run at any step.",
-        "table": "Print an environment's transition table with names.",
+        "ls": ("ls", "List the recorded runs."),
+        "show": ("show", "Show a run: evaluations, tables, configuration."),
+        "play": ("play", "Replay a recorded episode in the terminal."),
+        "view": ("view", "Open runs in the Rerun viewer."),
+        "plot": ("report", "Draw every metric of one or several runs over episodes."),
+        "report": ("report", "Write one self-contained page about one or several runs."),
+        "diff": ("compare", "Show what differs between two runs, and where they diverge."),
+        "compare": ("compare", "Compare groups of runs, with statistics over seeds."),
+        "verify": ("verify", "Check every step of a run by training it again."),
+        "qtable": ("tables", "Show the exact Q-table of a run at any step."),
+        "table": ("tables", "Print an environment's transition table with names."),
     },
     "Manage": {
-        "label": "Change the name, note and tags of a run.",
-        "rm": "Remove runs.",
-        "prune": "Remove old, unfinished or unwanted runs.",
-        "du": "Show what uses disk space, and what could be freed.",
-        "repair": "Repair a damaged recording, and report what was lost.",
-        "index": "Rebuild the index of runs.",
-        "init": "Create a folder to start in, with the shipped experiments.",
-        "config": "List, copy and check configurations; print their schema.",
-        "completion": "Print the completion script of a shell.",
+        "label": ("label", "Change the name, note and tags of a run."),
+        "rm": ("remove", "Remove runs."),
+        "prune": ("remove", "Remove old, unfinished or unwanted runs."),
+        "du": ("du", "Show what uses disk space, and what could be freed."),
+        "repair": ("repair", "Repair a damaged recording, and report what was lost."),
+        "index": ("index", "Rebuild the index of runs."),
+        "init": ("setup", "Create a folder to start in, with the shipped experiments."),
+        "config": ("setup", "List, copy and check configurations; print their schema."),
+        "completion": ("setup", "Print the completion script of a shell."),
     },
     "Archive": {
-        "archive": "Archive runs as Parquet files, losslessly.",
-        "restore": "Restore the recording of an archived run.",
+        "archive": ("archive", "Archive runs as Parquet files, losslessly."),
+        "restore": ("archive", "Restore the recording of an archived run."),
     },
     "Share": {
-        "export": "Export a run for other programs.",
-        "import": "Import a recording into the folder of runs.",
-        "remote": "Upload and download runs; submit and control jobs.",
-        "serve": "Serve the runs to browsers and programs over HTTP.",
-        "token": "Create, list and revoke access tokens of a server.",
+        "export": ("export", "Export a run for other programs."),
+        "import": ("archive", "Import a recording into the folder of runs."),
+        "remote": ("remote", "Upload and download runs; submit and control jobs."),
+        "serve": ("serve", "Serve the runs to browsers and programs over HTTP."),
+        "token": ("token", "Create, list and revoke access tokens of a server."),
     },
 }
-"""Section -> command -> its short help."""
+"""Section -> command -> its module in `runner.cli.commands`, and its short help."""
 
 _DISK_FULL: Final = tuple(getattr(errno, name) for name in ("ENOSPC", "EDQUOT") if hasattr(errno, name))
 
-_WRONG_PLACE: Final = (
+_WRONG_PATH: Final = (
     errno.ENOENT,
     errno.ENOTDIR,
     errno.EISDIR,
@@ -79,7 +81,7 @@ _WRONG_PLACE: Final = (
     errno.ENAMETOOLONG,
     errno.ELOOP,
 )
-"""Of errors in writing: the place was the wrong one, not the disk full or broken."""
+"""Errors in writing that mean a wrong path rather than a full or broken disk."""
 _AS_JSON: Final = "runner.as_json"
 
 _EPILOG = f"""\b
@@ -104,59 +106,63 @@ Exit codes:
 
 
 class Failure(click.ClickException):
-    """A `RunnerError`, printed without a traceback."""
+    """A `RunnerError` or usage error, printed without a traceback; with --json as a line of JSON."""
 
-    def __init__(self, error: RunnerError) -> None:
-        super().__init__("\n".join([str(error), *getattr(error, "__notes__", [])]))
-        self.exit_code = exit_code_of(error)  # type: ignore[misc]  # Click's own classes do so
+    def __init__(self, error: RunnerError | click.ClickException, as_json: bool) -> None:
+        if isinstance(error, click.ClickException):
+            super().__init__(error.format_message())
+            self.exit_code = error.exit_code  # type: ignore[misc]  # Click's own classes do so
+        else:
+            super().__init__("\n".join([str(error), *getattr(error, "__notes__", [])]))
+            self.exit_code = exit_code_of(error)  # type: ignore[misc]
         self.problems = error.problems if isinstance(error, ConfigError) else ()
+        self.as_json = as_json
 
     def show(self, file: Any = None) -> None:
-        """Print the message; of several problems each has a line, which begins with its place."""
+        """Print the message; each of several problems has a line, which begins with its place."""
         lines = self.message.count("\n") + 1
         head = f"{lines} problems\n" if self.problems and lines > 1 else ""
-        click.echo(f"Error: {head}{self.message}", file=file or sys.stderr)
+        text = f"Error: {head}{self.message}"
+        if self.as_json:
+            text = error_as_json(self.message, self.exit_code, self.problems)
+        click.echo(text, file=file or sys.stderr)
 
 
 def exit_code_of(error: RunnerError) -> int:
-    """Return the exit code for an error: 2 if a place that the user named cannot be written."""
+    """Return the exit code for an error: wrong usage if a path that the user named cannot be written."""
     cause = error.__cause__
-    if isinstance(error, StorageError) and isinstance(cause, OSError) and cause.errno in _WRONG_PLACE:
-        return RunnerError.exit_code
+    if isinstance(error, StorageError) and isinstance(cause, OSError) and cause.errno in _WRONG_PATH:
+        return ExitCode.USAGE
     return error.exit_code
 
 
-class JsonFailure(click.ClickException):
-    """An error of a command with --json: one line of JSON on stderr."""
-
-    def __init__(self, error: click.ClickException) -> None:
-        super().__init__(error.format_message())
-        self.exit_code = error.exit_code  # type: ignore[misc]  # Click's own classes do so
-        self.problems = getattr(error, "problems", ())
-
-    def show(self, file: Any = None) -> None:
-        """Print the object."""
-        click.echo(error_as_json(self.message, self.exit_code, self.problems), file=file or sys.stderr)
-
-
 def error_as_json(message: str, exit_code: int, problems: Sequence[Located] = (), **more: str) -> str:
-    """Return an error as a line of JSON, in the form of the service's API.
-
-    Args:
-        message: as it is printed without --json.
-        exit_code: of the command.
-        problems: of a configuration, one by one.
-        more: what else is known of it.
-    """
-    located = [
-        {"path": each.path, "line": each.line, "column": each.column, "message": each.message}
-        for each in problems
-    ]
+    """Return an error as a line of JSON, in the form of the service's API, with further keys."""
+    located = [problem._asdict() for problem in problems]
     return json.dumps({"error": {"message": message, "exit_code": exit_code, **more, "problems": located}})
 
 
+def _with_examples(text: str | None) -> str | None:
+    """Return a help text with Click's mark for preformatted text before its examples."""
+    return text and re.sub(r"\n\n(?=Examples?:\n)", "\n\n\b\n", inspect.cleandoc(text))
+
+
+class Command(click.Command):
+    """A command whose help keeps the lines of its examples."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.help = _with_examples(self.help)
+
+
 class Group(click.Group):
-    """A group of commands that suggests the nearest name for an unknown one."""
+    """A group of such commands, which suggests the nearest name for an unknown one."""
+
+    command_class = Command
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.help = _with_examples(self.help)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -169,65 +175,57 @@ class Group(click.Group):
 
 
 class LazyGroup(Group):
-    """The commands of `COMMANDS`, imported one by one when asked for."""
+    """The commands of `COMMANDS`, each imported when it is invoked."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """Return the names, section by section."""
         return [name for section in COMMANDS.values() for name in section]
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
         """Import a command."""
-        if cmd_name not in self.list_commands(ctx):
-            return None
-        module = "import_" if cmd_name == "import" else cmd_name
-        command: click.Command = importlib.import_module(f"runner.cli.commands.{module}").command
-        return command
+        for section in COMMANDS.values():
+            if cmd_name in section:
+                module = importlib.import_module(f"runner.cli.commands.{section[cmd_name][0]}")
+                command: click.Command = getattr(module, f"{cmd_name}_command")
+                return command
+        return None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the sections of commands, from their short help alone."""
+        """Write the sections from their short help, without an import."""
         width = max(len(name) for name in self.list_commands(ctx))
         for title, section in COMMANDS.items():
             with formatter.section(title):
-                formatter.write_dl([(f"{name:{width}}", text) for name, text in section.items()])
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; what a user can mend, or wanted, is no traceback."""
-        try:
-            result = self._invoke(ctx)
-            sys.stdout.flush()
-        except (KeyboardInterrupt, click.Abort):
-            raise click.exceptions.Exit(ExitCode.INTERRUPTED) from None
-        except BrokenPipeError:
-            _forget_stdout()
-            raise click.exceptions.Exit(ExitCode.OK) from None
-        except OSError as error:
-            if error.errno not in _DISK_FULL:
-                raise
-            raise Failure(StorageError(f"{error.filename or 'stdout'}: {error.strerror}.")) from error
-        return result
+                formatter.write_dl([(f"{name:{width}}", text) for name, (_, text) in section.items()])
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Remember whether the command is to print JSON, before anything of it is parsed."""
+        """Note whether the command prints JSON before it is parsed: a usage error is JSON too."""
         ctx.meta[_AS_JSON] = "--json" in args
         return super().parse_args(ctx, args)
 
-    def _invoke(self, ctx: click.Context) -> Any:
-        """Run the command; raise its errors as they are to be printed."""
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; errors that a user can correct have no traceback."""
+        as_json = ctx.meta[_AS_JSON]
         try:
-            try:
-                return super().invoke(ctx)
-            except RunnerError as error:
-                raise Failure(error) from error
+            result = super().invoke(ctx)
+            sys.stdout.flush()
+            return result
+        except (KeyboardInterrupt, click.Abort):
+            raise click.exceptions.Exit(ExitCode.INTERRUPTED) from None
+        except BrokenPipeError:
+            with contextlib.suppress(OSError, ValueError):  # else Python complains about stdout at exit
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise click.exceptions.Exit(ExitCode.OK) from None
+        except RunnerError as error:
+            raise Failure(error, as_json) from error
+        except OSError as error:
+            if error.errno not in _DISK_FULL:
+                raise
+            full = StorageError(f"{error.filename or 'stdout'}: {error.strerror}.")
+            raise Failure(full, as_json) from error
         except click.exceptions.NoArgsIsHelpError:
             raise
         except click.ClickException as error:
-            raise (JsonFailure(error) if ctx.meta[_AS_JSON] else error) from error
-
-
-def _forget_stdout() -> None:
-    """Point stdout at nothing: its reader has left, and Python would complain about it at exit."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise (Failure(error, as_json) if as_json else error) from error
 
 
 @click.group(

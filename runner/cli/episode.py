@@ -1,4 +1,4 @@
-"""A recorded episode, step by step: in words, and as frames to be drawn."""
+"""A recorded episode, step by step: as JSON, and as frames for the terminal."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class Episode:
     """One episode of a recording, read whole: it has at most as many steps as the step limit.
 
     Args:
-        recording: where it is; may be closed afterwards.
+        recording: the open recording; it may be closed afterwards.
         phase: `train` or `eval`.
-        number: which one of the phase, counted from 0.
-        title: what it is called in the frames.
+        number: the episode of the phase, counted from 0.
+        title: the first line of each frame.
 
     Raises:
         RecordingError: there is no such episode, or the recording holds no steps.
@@ -41,7 +41,7 @@ class Episode:
         self._states, self._actions = states_in_words(self._mdp), actions_in_words(self._mdp)
 
     def steps(self) -> Iterator[dict[str, Any]]:
-        """Yield each step as JSON can hold it, numbers and words."""
+        """Yield each step as JSON, with numbers and names."""
         for record, events in zip(self._records, self._events.tolist(), strict=True):
             state, action, next_state = (int(record[name]) for name in ("state", "action", "next_state"))
             yield {
@@ -63,14 +63,22 @@ class Episode:
 
     def frames(self) -> Iterator[Text]:
         """Yield a frame of the first state, and one after each step."""
-        first = int(self._records[0]["state"])
         totals = np.zeros(len(self._agents))
-        yield self._frame(0, first, ["", "the start", ""])
+        yield self._frame(0, int(self._records[0]["state"]), ["", "the start", ""])
         for i, step in enumerate(self.steps()):
             totals += self._records[i]["rewards"]
-            yield self._frame(i + 1, step["next_state"], self._said(step, totals))
+            explored = " (explored)" if step["explored"] else ""
+            rewards = _joined(list(step["rewards"].values()))
+            events = [event_in_words(name) for name in step["events"]]
+            events += ["the end"] if step["terminated"] else ["the step limit"] if step["truncated"] else []
+            lines = [
+                f"{step['action_in_words']}{explored}",
+                f"reward {rewards}, so far {_joined(totals.tolist())}",
+                ", ".join(events),
+            ]
+            yield self._frame(i + 1, step["next_state"], lines)
 
-    def _frame(self, count: int, state: int, said: list[str]) -> Text:
+    def _frame(self, count: int, state: int, lines: list[str]) -> Text:
         from rich.text import Text
 
         frame = Text.assemble((self._title, "bold"), f"\nstep {count:,} of {len(self._records):,}\n\n")
@@ -80,19 +88,10 @@ class Episode:
             carriers = np.full(len(cells), -1) if mdp.scene_carriers is None else mdp.scene_carriers[state]
             frame.append(self._drawing.draw(cells.tolist(), carriers.tolist()))
             frame.append(f"\n{self._drawing.legend}\n\n", style="dim")
-        frame.append("\n".join([self._states[state], *said]))
+        frame.append("\n".join([self._states[state], *lines]))
         return frame
 
-    def _said(self, step: dict[str, Any], totals: Any) -> list[str]:
-        """Return what is said of a step: action, rewards, and what happened."""
-        chosen = " (explored)" if step["explored"] else ""
-        rewards = list(step["rewards"].values())
-        paid = f"reward {_figures(rewards)}, so far {_figures(totals.tolist())}"
-        happened = [event_in_words(name) for name in step["events"]]
-        happened += ["the end"] if step["terminated"] else ["the step limit"] if step["truncated"] else []
-        return [f"{step['action_in_words']}{chosen}", paid, ", ".join(happened)]
 
-
-def _figures(values: list[float]) -> str:
-    """Return rewards: `-4`, or `-2 / -2` where each agent has its own."""
-    return " / ".join(number(value, 0 if value == round(value) else 2) for value in values)
+def _joined(rewards: list[float]) -> str:
+    """Return rewards as text: `-4`, or `-2 / -2` of several agents."""
+    return " / ".join(number(reward, 0 if reward == round(reward) else 2) for reward in rewards)

@@ -87,7 +87,7 @@ def find_run(
         candidates = matches(Depth.FOLDERS) or matches(Depth.FILES)
     if not candidates:
         raise look([folder], lambda index: not_found(name, index, folder), report, cached=True)
-    return choose(name, candidates).run()
+    return choose(name, candidates)._replace(root=os.fspath(folder)).run()  # the path as the user gave it
 
 
 def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> list[Run]:

@@ -1,28 +1,32 @@
-"""`dualtaxi archive`: runs as Parquet in a folder or in object storage."""
+"""`dualtaxi archive`, `restore` and `import`: runs to and from archives and files."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.options import json_option, recordings_option, runs_argument
+from runner.archive.places import default_target
+from runner.cli import Command
+from runner.cli.options import RunName, json_option, recordings_option, runs_argument
 from runner.cli.output import draw, facts, print_json, say
-from runner.cli.runs import find
+from runner.cli.progress import stage_line, steps_line
+from runner.cli.runs import compilation_notice, find, print_received, run_as_json, run_facts
+from runner.errors import RunnerError
+from runner.runs.run import recordings_folder
 from runner.util.humanize import size
 
 if TYPE_CHECKING:
     from runner.archive.runs import Archived
-    from runner.runs.run import Run
 
 
-@click.command("archive")
+@click.command("archive", cls=Command)
 @runs_argument
 @click.option(
     "--to",
     metavar="DIR|URL",
-    help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` by the recordings]",
+    help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` next to them]",
 )
 @click.option(
     "--remove", is_flag=True, help="Remove each recording once its archive has been read back and compared."
@@ -30,7 +34,7 @@ if TYPE_CHECKING:
 @click.option("--dry-run", is_flag=True, help="Report the sizes, but write and change nothing.")
 @recordings_option
 @json_option
-def command(
+def archive_command(
     run_names: tuple[str, ...],
     to: str | None,
     remove: bool,
@@ -42,70 +46,119 @@ def command(
 
     An archived run takes a tenth of the space. With --remove its recording is removed, but the run stays
     listed; commands that need the recording restore it into the cache, and `dualtaxi restore` brings it back.
+    With --json, one line for each run.
 
-    \b
     Examples:
       dualtaxi archive @latest
       dualtaxi archive k3v9m2xq p7 --to /mnt/archive --remove
       dualtaxi archive tutorial_cooperative --to s3://lab/runs --remove
-    """  # noqa: D301 - Click wants the backspace itself
-    from runner.archive.places import default_target
+    """
     from runner.archive.runs import archive_run
-    from runner.cli.progress import steps_line
-    from runner.cli.runs import compilation_notice
-    from runner.runs.run import recordings_folder
 
     target = to or default_target(recordings_folder(recordings))
-    for run in _to_do([find(name, recordings) for name in dict.fromkeys(run_names)]):
-        with compilation_notice(), steps_line(f"archiving {run.run_id}") as report:
-            done = archive_run(run, target, remove, report, dry_run)
-        if as_json:
-            print_json(_as_json(done, dry_run), indent=None)
-        else:
-            draw(facts(_in_words(done)))
-            if dry_run:
-                say("Nothing was kept: a dry run.")
-
-
-def _to_do(runs: list[Run]) -> list[Run]:
-    """Return the runs that are not in an archive alone; if all are, all, which is refused."""
+    runs = [find(name, recordings) for name in dict.fromkeys(run_names)]
     left = [run for run in runs if run.status != "archived"]
-    if not left:
-        return runs
     for run in runs:
-        if run not in left:
+        if left and run not in left:
             say(f"Run {run.run_id} is archived already, in {run.archive.target}.")
-    return left
+    for run in left or runs:
+        with compilation_notice(), steps_line(f"archiving {run.run_id}") as report:
+            archived = archive_run(run, target, remove, report, dry_run)
+        _print_archived(archived, dry_run, as_json)
 
 
-def _as_json(done: Archived, dry_run: bool) -> dict[str, Any]:
-    return {
-        "run_id": done.run.run_id,
-        "name": done.run.name,
-        "place": done.place,
-        "content_digest": done.manifest.digest,
-        "steps": _steps(done),
-        "bytes": done.manifest.size,
-        "recording_bytes": done.recording_bytes,
-        "new": done.new,
-        "removed": done.removed,
-        "dry_run": dry_run,
+def _print_archived(archived: Archived, dry_run: bool, as_json: bool) -> None:
+    run, manifest = archived.run, archived.manifest
+    topics = manifest.topics
+    steps = sum(topics[name].size for name in ("/train/step", "/eval/step") if name in topics)
+    if as_json:
+        print_json(
+            {
+                "run_id": run.run_id,
+                "name": run.name,
+                "place": archived.place,
+                "content_digest": manifest.digest,
+                "steps": steps,
+                "bytes": manifest.size,
+                "recording_bytes": archived.recording_bytes,
+                "new": archived.new,
+                "removed": archived.removed,
+                "dry_run": dry_run,
+            },
+            indent=None,
+        )
+        return
+    per_step = f", {manifest.size / steps:.2f} bytes per step" if steps else ""
+    kept = "removed" if archived.removed else "kept"
+    state = "" if archived.new else "  (existed already, undamaged)"
+    rows = {
+        "run": f"{run.run_id}  {run.title}",
+        "archive": archived.place + state,
+        "size": f"{size(manifest.size)}{per_step}; the recording: {size(archived.recording_bytes)}, {kept}",
+        "digest": manifest.digest,
     }
+    draw(facts(rows))
+    if dry_run:
+        say("Nothing was kept: a dry run.")
 
 
-def _in_words(done: Archived) -> dict[str, str]:
-    steps = _steps(done)
-    each = f", {done.manifest.size / steps:.2f} bytes a step" if steps else ""
-    kept = "removed" if done.removed else "kept"
-    state = "" if done.new else "  (it was there already, and is whole)"
-    return {
-        "run": f"{done.run.run_id}  {done.run.title}",
-        "archive": done.place + state,
-        "size": f"{size(done.manifest.size)}{each}; the recording: {size(done.recording_bytes)}, {kept}",
-        "digest": done.manifest.digest,
-    }
+@click.command("restore", cls=Command)
+@click.argument("run_name", metavar="RUN|ARCHIVE", type=RunName())
+@recordings_option
+@json_option
+def restore_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
+    """Restore the recording of an archived run, with the same content digest.
+
+    ARCHIVE is the folder or URL of one run's archive: it becomes a run of the recordings folder again, even
+    if nothing else is left of it. The archive stays where it is.
+
+    Examples:
+      dualtaxi restore k3v9m2xq
+      dualtaxi restore /mnt/archive/k3v9m2xq
+      dualtaxi restore s3://lab/runs/k3v9m2xq --recordings /data/runs
+    """
+    from runner.archive.layout import MANIFEST
+    from runner.archive.runs import restore_place, restore_run
+    from runner.archive.store import S3
+
+    is_url = run_name.startswith(S3)
+    with compilation_notice(), steps_line("restoring") as report:
+        if is_url or (Path(run_name) / MANIFEST).is_file():
+            place = run_name if is_url else str(Path(run_name).absolute())
+            run = restore_place(place, recordings_folder(recordings), report)
+        else:
+            run = restore_run(find(run_name, recordings), report)
+    if as_json:
+        print_json(run_as_json(run))
+    else:
+        draw(facts(run_facts(run)))
 
 
-def _steps(done: Archived) -> int:
-    topics = done.manifest.topics
-    return sum(topics[name].size for name in ("/train/step", "/eval/step") if name in topics)
+@click.command("import", cls=Command)
+@click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
+@click.option("--as-new", is_flag=True, help="Give the run a new id.")
+@recordings_option
+@json_option
+def import_command(file: Path, as_new: bool, recordings: Path | None, as_json: bool) -> None:
+    """Import FILE, a recording from elsewhere, into the folder of runs.
+
+    FILE was written by `dualtaxi export mcap`, or is any recording. Every byte is checked before the run
+    appears; a damaged or inconsistent file is refused, and nothing is written. A run that is there already
+    with the same content or more is left as it is; an interrupted one that FILE continues takes over its
+    content.
+
+    Examples:
+      dualtaxi import quick-k3v9m2xq.mcap
+      dualtaxi import quick-k3v9m2xq.mcap --as-new --recordings from_anna
+    """
+    from runner.runs.importing import Occupied, import_recording
+
+    try:
+        with stage_line(f"importing {file}"):
+            imported = import_recording(file, recordings_folder(recordings), as_new=as_new)
+    except Occupied as error:
+        raise RunnerError(f"{error} --as-new imports it under a new id.") from error
+    run, digest = imported.run, imported.content_digest
+    is_same = run.summary.get("content_digest", digest) == digest
+    existing = ("this content" if is_same else "this content and more") if imported.already else ""
+    print_received(run, digest, existing, as_json, anonymous=imported.anonymous)

@@ -1,30 +1,38 @@
-"""`dualtaxi compare`: groups of runs against each other, with statistics over seeds."""
+"""`dualtaxi compare` and `dualtaxi diff`: groups of runs, and two runs, against each other."""
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.options import json_option, markdown_option, recordings_option, runs_argument, target_option
+from runner.cli import Command
+from runner.cli.options import (
+    RunName,
+    all_option,
+    force_option,
+    html_option,
+    json_option,
+    markdown_option,
+    recordings_option,
+    runs_argument,
+    target_option,
+)
 from runner.cli.output import print_json, print_sections, require_one_form, require_page, say
-from runner.cli.runs import find_all_recorded
-
-if TYPE_CHECKING:
-    from runner.analysis.compare import Comparison
-    from runner.analysis.groups import Group
-    from runner.analysis.series import RunSeries
-    from runner.runs.run import Run
+from runner.cli.progress import stage_line
+from runner.cli.runs import find_all_recorded, find_recorded
+from runner.errors import ExitCode
+from runner.export.places import write_text_new
+from runner.util.humanize import size
 
 
-@click.command("compare")
+@click.command("compare", cls=Command)
 @runs_argument
 @click.option("--by", metavar="PATH", help="Group by a value of the configuration, such as discount.")
 @click.option(
     "--metric",
-    "chosen",
+    "metrics",
     multiple=True,
     metavar="METRIC",
     help="A metric; may be repeated.  [default: those of evaluations]",
@@ -39,13 +47,13 @@ if TYPE_CHECKING:
 @target_option(multiple=False)
 @json_option
 @markdown_option
-@click.option("--html", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML page instead.")
-@click.option("--force", is_flag=True, help="Replace the page if it exists.")
+@html_option
+@force_option
 @recordings_option
-def command(
+def compare_command(
     run_names: tuple[str, ...],
     by: str | None,
-    chosen: tuple[str, ...],
+    metrics: tuple[str, ...],
     at: str,
     target: str | None,
     as_json: bool,
@@ -63,38 +71,45 @@ def command(
 
     Exit code 0 when groups were compared, 2 when there is nothing to compare.
 
-    \b
     Examples:
       dualtaxi compare cooperative competitive
       dualtaxi compare first second third --metric mean_length --at 10000
       dualtaxi compare sweep --by discount --target success_percent=80
       dualtaxi compare cooperative competitive --html comparison.html
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.analysis.compare import compare
     from runner.analysis.compare.moments import moment_of
     from runner.analysis.compare.sections import sections
     from runner.analysis.compare.statistics import require_scipy
     from runner.analysis.groups import grouped, metrics_of, require_two
-    from runner.cli.progress import stage_line
+    from runner.analysis.series import read_series
+    from runner.recording.reader import open_recording
 
     require_one_form(as_json, as_markdown)
     require_scipy()
     if html is not None:
         require_page(html, force)
-    moment, metrics = moment_of(at, target, chosen)
+    moment, chosen = moment_of(at, target, metrics)
     runs = find_all_recorded(run_names, recordings)
-    page = ""
+    series = []
     with stage_line("reading runs") as stage:
-        groups, notes = grouped(_read(runs), by)
+        for run in runs:
+            with open_recording(run.recording) as recording:
+                series.append(read_series(recording))
+        groups, notes = grouped(series, by)
         require_two(groups, by)
         stage("computing intervals")
-        comparison = compare(groups, metrics_of(groups, metrics), moment, notes)
+        comparison = compare(groups, metrics_of(groups, chosen), moment, notes)
         if html is not None:
+            from runner.export.reports.compare import render_comparison
+
             stage("drawing the page")
-            page = _write_page(html, force, comparison, groups)
+            write_text_new(html, force, render_comparison(comparison, groups))
     if html is not None:
         for note in comparison.notes:
             say(f"Note: {note}.")
+        count = sum(len(group.runs) for group in groups)
+        page = f"{html}: {len(comparison.metrics)} metrics of {count} runs in {len(groups)} groups"
         (say if as_json else click.echo)(page)
     if as_json:
         print_json(dataclasses.asdict(comparison))
@@ -102,24 +117,75 @@ def command(
         print_sections(sections(comparison), as_markdown)
 
 
-def _read(runs: list[Run]) -> list[RunSeries]:
-    """Return the metrics of runs."""
-    from runner.analysis.series import read_series
+@click.command("diff", cls=Command)
+@click.argument("a", metavar="A", type=RunName())
+@click.argument("b", metavar="B", type=RunName())
+@recordings_option
+@json_option
+@markdown_option
+@html_option
+@force_option
+@click.option(
+    "--ignore",
+    multiple=True,
+    metavar="GLOB",
+    help="Ignore settings and provenance whose path matches this pattern.",
+)
+@all_option
+@click.option(
+    "--first",
+    is_flag=True,
+    help="Compare only settings and where training first diverges, not the tables.",
+)
+@target_option(multiple=True)
+@click.pass_context
+def diff_command(
+    ctx: click.Context,
+    a: str,
+    b: str,
+    recordings: Path | None,
+    as_json: bool,
+    as_markdown: bool,
+    html: Path | None,
+    force: bool,
+    ignore: tuple[str, ...],
+    everything: bool,
+    first: bool,
+    targets: tuple[str, ...],
+) -> None:
+    """Show what differs between the runs A and B, down to the first step at which they diverge, and why.
+
+    With --all also what is equal. Exit code 0 if both have the same content, 1 if not.
+
+    Examples:
+      dualtaxi diff k3v9m2xq p7 --ignore 'package.*'
+      dualtaxi diff tutorial_cooperative cooperative --target success_percent=80
+      dualtaxi diff first second --html difference.html
+    """
+    from runner.analysis import diff as differences
+    from runner.analysis.diff.sections import sections
+    from runner.analysis.series import parse_target
     from runner.recording.reader import open_recording
 
-    found = []
-    for run in runs:
-        with open_recording(run.recording) as recording:
-            found.append(read_series(recording))
-    return found
+    require_one_form(as_json, as_markdown)
+    levels = dict(parse_target(target) for target in targets)
+    if html is not None:
+        require_page(html, force)
+    left, right = find_recorded(a, recordings), find_recorded(b, recordings)
+    with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
+        with stage_line("comparing") as stage:
+            difference = differences.diff(recording_a, recording_b, levels, first)
+            difference = difference if first else differences.with_seconds(difference, left, right)
+            difference = differences.without_ignored(difference, ignore, everything)
+            if html is not None:
+                from runner.export.reports.diff import render_diff
 
-
-def _write_page(path: Path, force: bool, comparison: Comparison, groups: list[Group]) -> str:
-    """Write the page; return what there is to say of it."""
-    from runner.export.places import write_text_new
-    from runner.export.reports.compare import render_comparison
-
-    page = render_comparison(comparison, groups)
-    write_text_new(path, force, page)
-    runs = sum(len(group.runs) for group in groups)
-    return f"{path}: {len(comparison.metrics)} metrics of {runs} runs in {len(groups)} groups"
+                stage("drawing the page")
+                write_text_new(html, force, render_diff(difference, recording_a, recording_b))
+        if html is not None:
+            (say if as_json or as_markdown else click.echo)(f"{html}: {size(html.stat().st_size)}")
+    if as_json:
+        print_json(differences.as_json(difference))
+    elif html is None or as_markdown:
+        print_sections(sections(difference, everything), as_markdown)
+    ctx.exit(ExitCode.OK if difference.same_content else ExitCode.DIFFERENT)

@@ -46,10 +46,9 @@ class _Forms(click.Group):
 
 
 @click.group("export", cls=_Forms)
-def command() -> None:
+def export_command() -> None:
     """Export a run for other programs.
 
-    \b
     Example:
       dualtaxi export rerun @latest
-    """  # noqa: D301 - Click wants the backspace itself
+    """

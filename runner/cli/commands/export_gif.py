@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from runner.cli import Command
 from runner.cli.options import EXPORTS, episode_option, recordings_option, run_argument, trial_option
 from runner.cli.output import say
 from runner.cli.progress import count_line
@@ -13,7 +14,7 @@ from runner.cli.runs import find_recorded
 from runner.util.humanize import size
 
 
-@click.command("gif")
+@click.command("gif", cls=Command)
 @run_argument
 @episode_option
 @trial_option
@@ -69,12 +70,11 @@ def command(
     the last evaluation: the median by success, return and length; of your own loop the first trial of its
     last evaluation; of a run without a whole evaluation the last training episode.
 
-    \b
     Examples:
       dualtaxi export gif @latest
       dualtaxi export gif k3v9m2xq --eval 3000:7 -o trial.gif
       dualtaxi export gif k3v9m2xq --episode 0 --speed 8 --force
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     if episode is not None and trial is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
     from runner.export.contents import require_steps, shortcomings

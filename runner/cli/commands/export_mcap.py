@@ -6,13 +6,14 @@ from pathlib import Path
 
 import click
 
+from runner.cli import Command
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, say
 from runner.cli.runs import find_recorded
 from runner.util.humanize import size
 
 
-@click.command("mcap")
+@click.command("mcap", cls=Command)
 @run_argument
 @click.option(
     "-o",
@@ -33,11 +34,10 @@ def command(
     Every MCAP reader opens the file. The same run gives the same bytes. An interrupted run can be exported,
     and stays interrupted.
 
-    \b
     Examples:
       dualtaxi export mcap @latest
       dualtaxi export mcap k3v9m2xq --anonymous -o for_review.mcap
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.cli.progress import stage_line
     from runner.export.mcap import export_mcap
 

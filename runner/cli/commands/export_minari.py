@@ -6,13 +6,14 @@ from pathlib import Path
 
 import click
 
+from runner.cli import Command
 from runner.cli.options import EXPORTS, RANGES, recordings_option, run_argument
 from runner.cli.output import say
 from runner.cli.progress import count_line
 from runner.cli.runs import find_recorded
 
 
-@click.command("minari")
+@click.command("minari", cls=Command)
 @run_argument
 @click.option(
     "-o",
@@ -46,11 +47,10 @@ def command(
     An observation is a state, an action a joint action, a reward the sum over the learners; where there are
     several, the infos have theirs. Of your own loop, observations and actions are as they were.
 
-    \b
     Examples:
       dualtaxi export minari @latest --phase eval
       dualtaxi export minari k3v9m2xq --episodes 49000: -o datasets
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.export.contents import require_steps, shortcomings
     from runner.export.minari import OURS, dataset_id, require_packages, write_dataset
     from runner.export.places import new_folder

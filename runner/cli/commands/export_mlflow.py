@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
+from runner.cli import Command
 from runner.cli.options import recordings_option, run_argument
 from runner.cli.output import say
 from runner.cli.runs import find_recorded
 
 
-@click.command("mlflow")
+@click.command("mlflow", cls=Command)
 @run_argument
 @click.option(
     "--tracking-uri",
@@ -35,11 +36,10 @@ def command(
 
     A run that is already in the store, recognised by its id and content digest, is left as it is.
 
-    \b
     Examples:
       dualtaxi export mlflow @latest
       dualtaxi export mlflow k3v9m2xq --tracking-uri http://127.0.0.1:5000 --with-recording
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.cli.progress import stage_line
     from runner.export.contents import shortcomings
     from runner.export.mlflow import export, require_packages

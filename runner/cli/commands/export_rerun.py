@@ -6,13 +6,14 @@ from pathlib import Path
 
 import click
 
+from runner.cli import Command
 from runner.cli.choosing import request_of, tell
 from runner.cli.options import EXPORTS, recordings_option, run_argument, selection_options
 from runner.cli.runs import find_recorded
 from runner.util.humanize import duration, size
 
 
-@click.command("rerun")
+@click.command("rerun", cls=Command)
 @run_argument
 @click.option(
     "-o",
@@ -39,12 +40,11 @@ def command(
     All metrics are exported. By default the steps are those of 20 training episodes spread from the first to
     the last, and the trials of the last evaluation; what is left out is reported.
 
-    \b
     Examples:
       dualtaxi export rerun @latest
       dualtaxi export rerun k3v9m2xq -o look.rrd --episodes 0:20,49980: --evaluations 49000
       dualtaxi export rerun k3v9m2xq --all --force
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     import time
 
     from runner.cli.progress import stage_line

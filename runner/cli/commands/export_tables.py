@@ -101,7 +101,6 @@ csv: click.Command = _command(
     a row for each measure. Of a loop there are resets.csv and infos.csv too, and each number of an
     observation or action has a column. Numbers are written so that they read back as they were.
 
-    \b
     Examples:
       dualtaxi export csv @latest
       dualtaxi export csv k3v9m2xq --gz --phase eval -o trials
@@ -117,7 +116,6 @@ parquet: click.Command = _command(
     are resets.parquet and infos.parquet too, and each number of an observation or action has a column; an
     array of more than 64 is one column of bytes.
 
-    \b
     Examples:
       dualtaxi export parquet @latest
       dualtaxi export parquet k3v9m2xq --episodes 0:20 -o first

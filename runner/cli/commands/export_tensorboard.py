@@ -6,12 +6,13 @@ from pathlib import Path
 
 import click
 
+from runner.cli import Command
 from runner.cli.options import EXPORTS, recordings_option, run_argument
 from runner.cli.output import say
 from runner.cli.runs import find_recorded
 
 
-@click.command("tensorboard")
+@click.command("tensorboard", cls=Command)
 @run_argument
 @click.option(
     "-o",
@@ -28,11 +29,10 @@ def command(run_name: str, output: Path | None, force: bool, recordings: Path | 
     Each number stands at its training step. TensorBoard itself keeps them as 32-bit numbers, and shows a
     thousand of a curve unless told otherwise.
 
-    \b
     Examples:
       dualtaxi export tensorboard @latest
       dualtaxi export tensorboard k3v9m2xq -o logs/patient --force
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.cli.progress import stage_line
     from runner.export.contents import shortcomings
     from runner.export.places import new_folder

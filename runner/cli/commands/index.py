@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
 from runner.cli import Group
 from runner.cli.options import folders_option, json_option
-from runner.cli.output import facts, print_json, say
+from runner.cli.output import draw, facts, print_json, say
 from runner.errors import ExitCode
 from runner.util.humanize import duration
 
@@ -20,25 +19,24 @@ if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index
 
 
-@dataclass(frozen=True)
-class _Found:
-    runs: int
+class _Contents(NamedTuple):
+    """What the index holds."""
+
+    statuses: Counter[str]
     copies: int
-    statuses: dict[str, int]
     problems: list[str]
 
 
 @click.group("index", cls=Group)
-def command() -> None:
+def index_command() -> None:
     """Manage the index of runs, which makes listing them quick.
 
-    \b
     Example:
       dualtaxi index rebuild
-    """  # noqa: D301 - Click wants the backspace itself
+    """
 
 
-@command.command("rebuild")
+@index_command.command("rebuild")
 @folders_option
 @json_option
 @click.pass_context
@@ -48,26 +46,40 @@ def rebuild(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> 
     This is never required: commands notice changes by themselves, and the index holds nothing of its own.
     Exit code 1 if there are folders with files of a run that cannot be read.
 
-    \b
     Examples:
       dualtaxi index rebuild
       dualtaxi index rebuild --recordings /data/runs --recordings recordings
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.runs.catalogue.database import index_path
     from runner.runs.catalogue.index import look
 
     began = time.monotonic()
-    found = look(recordings, _found, say, rebuild=True)
-    took = time.monotonic() - began
+    statuses, copies, problems = look(recordings, _contents, say, rebuild=True)
+    took, runs = time.monotonic() - began, statuses.total()
+    counts = dict(sorted(statuses.items()))
     if as_json:
-        told = {"runs": found.runs, "same_content": found.copies, "statuses": found.statuses}
-        print_json(told | {"problems": found.problems, "seconds": round(took, 3), "index": str(index_path())})
+        print_json(
+            {
+                "runs": runs,
+                "same_content": copies,
+                "statuses": counts,
+                "problems": problems,
+                "seconds": round(took, 3),
+                "index": str(index_path()),
+            }
+        )
     else:
-        _print(found, took, str(index_path()))
-    ctx.exit(ExitCode.DIFFERENT if found.problems else ExitCode.OK)
+        listed = ", ".join(f"{count:,} {status}" for status, count in counts.items())
+        rows = {"runs": f"{runs:,}" + (f": {listed}" if listed else "")}
+        if copies:
+            rows["same"] = f"{copies:,} of them recorded the same content as an earlier run"
+        draw(facts(rows | {"took": duration(took), "index": str(index_path())}))
+        for problem in problems:
+            say(problem)
+    ctx.exit(ExitCode.DIFFERENT if problems else ExitCode.OK)
 
 
-def _found(index: Index) -> _Found:
+def _contents(index: Index) -> _Contents:
     from runner.runs.catalogue.columns import with_same_as
     from runner.runs.catalogue.filters import Filter
 
@@ -77,21 +89,4 @@ def _found(index: Index) -> _Found:
     for row in with_same_as(rows, index.originals()):
         statuses[row["status"]] += 1
         copies += row["same_as"] is not None
-    return _Found(
-        runs=statuses.total(),
-        copies=copies,
-        statuses=dict(sorted(statuses.items())),
-        problems=index.problems(),
-    )
-
-
-def _print(found: _Found, took: float, index: str) -> None:
-    from runner.cli.output import draw
-
-    standing = ", ".join(f"{count:,} {status}" for status, count in found.statuses.items())
-    told = {"runs": f"{found.runs:,}" + (f": {standing}" if standing else "")}
-    if found.copies:
-        told["same"] = f"{found.copies:,} of them recorded what another did before"
-    draw(facts(told | {"took": duration(took), "index": index}))
-    for problem in found.problems:
-        say(problem)
+    return _Contents(statuses, copies, index.problems())

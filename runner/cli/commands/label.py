@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from runner.cli import Command
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, say
 from runner.cli.runs import find
@@ -14,7 +15,7 @@ from runner.errors import RunnerError
 from runner.util.humanize import UNKNOWN
 
 
-@click.command("label")
+@click.command("label", cls=Command)
 @run_argument
 @click.option("--name", metavar="NAME", help="Rename the run; an empty NAME restores the original name.")
 @click.option(
@@ -24,7 +25,7 @@ from runner.util.humanize import UNKNOWN
 @click.option("--untag", "untags", multiple=True, metavar="TAG", help="Remove a tag; may be repeated.")
 @recordings_option
 @json_option
-def command(
+def label_command(
     run_name: str,
     name: str | None,
     note: str | None,
@@ -38,13 +39,12 @@ def command(
     They are stored in labels.json next to the recording, which stays as it is. A run tagged `keep` is never
     removed by rm or prune. `dualtaxi ls tag:TAG` and `dualtaxi ls note:WORD` find labelled runs.
 
-    \b
     Examples:
       dualtaxi label @latest --name patient --tag keep --tag figure-3
       dualtaxi label patient --note 'the step size of the paper'
       dualtaxi label k3v9m2xq --note - < observations.txt
       dualtaxi ls --quiet name:quick | xargs -I{} dualtaxi label {} --tag first-try
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.runs.run import label
 
     run = find(run_name, recordings)

@@ -1,18 +1,33 @@
-"""`dualtaxi ls`: the recorded runs."""
+"""`dualtaxi ls`: the recorded runs as a table, ids, CSV or JSON."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import sys
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import click
 
-from runner.cli.options import filter_argument, folders_option, json_option, limit_option
-from runner.cli.output import json_list, say
+from runner.cli import Command
+from runner.cli.options import INDEX, filter_argument, folders_option, json_option, limit_option
+from runner.cli.output import aligned, console, draw, json_list, printable, say, table
+from runner.runs.catalogue.columns import (
+    DEFAULT_JSON,
+    FIELDS,
+    HEADINGS,
+    Kind,
+    as_json,
+    as_text,
+    columns_of,
+    needed_for,
+    with_same_as,
+)
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.filters import Filter
@@ -20,16 +35,40 @@ if TYPE_CHECKING:
 
 MAX_PROBLEMS: Final = 5
 """Damaged runs whose problems are printed."""
-Render = Callable[[Iterable[dict[str, Any]], Sequence[str]], Iterator[str]]
-
 ON_A_TERMINAL: Final = 50
-"""Runs that are listed there unless it is said how many."""
-_PART: Final = 1 << 20
+"""Runs listed on a terminal by default."""
+_READ_BYTES: Final = 1 << 20
 _SPOOL_BYTES: Final = 8 << 20
 """Output up to this size is kept in memory, longer output in a temporary file."""
 
+_DEFAULT_COLUMNS: Final = (
+    *("id", "name", "config", "seed", "status", "tag", "episodes", "success_percent", "mean_return"),
+    *("logged", "bytes", "age", "same_as", "folder"),
+)
+"""Columns of the table, unless they hold nothing of interest."""
+_OPTIONAL: Final = ("config", "logged", "bytes", "episodes", "seed", "folder", "age")
+"""Columns left out where a terminal is narrow, in this order."""
+_LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
+_SHRINKING: Final = (
+    *("name", "config", "tags", "note", "logged", "environment", "host", "archive", "folder", "path"),
+)
+_MIN_WIDTH: Final = 14
+"""The width at which a shrinking column can still be read."""
 
-@click.command("ls")
+Row = dict[str, Any]
+Render = Callable[[Iterable[Row], Sequence[str]], Iterator[str]]
+
+
+class _Query(NamedTuple):
+    """Which runs are listed, in which order."""
+
+    filter: Filter
+    sort: str
+    limit: int | None
+    offset: int
+
+
+@click.command("ls", cls=Command)
 @filter_argument
 @folders_option
 @click.option(
@@ -37,11 +76,11 @@ _SPOOL_BYTES: Final = 8 << 20
 )
 @click.option("--columns", metavar="FIELD,...", help="Show these fields.")
 @limit_option(None, f"{ON_A_TERMINAL} in a terminal's table, else all")
-@click.option("--offset", type=click.IntRange(min=0), default=0, metavar="N", help="Skip the first N.")
+@click.option("--offset", type=INDEX, default=0, metavar="N", help="Skip the first N.")
 @click.option("-q", "--quiet", is_flag=True, help="Print ids only.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print CSV.")
 @json_option
-def command(
+def ls_command(
     words: tuple[str, ...],
     recordings: tuple[Path, ...],
     sort: str,
@@ -64,153 +103,199 @@ def command(
       environment host git archive folder, and config.PATH for any value of the
       configuration
 
-    Shown are the training episodes done (of those to do, where some are missing), how many percent of the
-    last evaluation's trials finished, the size of the recording, how long ago the run began, and which run
+    Shown are the training episodes done (and to do, if some are missing), the percentage of the last
+    evaluation's trials that finished, the size of the recording, how long ago the run began, and which run
     recorded the same content before; of a loop also the mean return in its last evaluation (in its last 100
-    training episodes, if it has none) and the last values it logged. Some of that is left out where a
+    training episodes, if it has none) and the last values it logged. Some columns are left out where a
     terminal is narrow.
 
-    \b
     Examples:
       dualtaxi ls
       dualtaxi ls tutorial NOT tag:keep
       dualtaxi ls 'status:finished config.discount:>0.9' --sort -success_percent --limit 5
       dualtaxi ls 'created:[2026-01-01 TO *] (seed:<3 OR age:<12h)' --columns id,seed,config,digest
       dualtaxi ls --quiet name:quick
-    """  # noqa: D301 - Click wants the backspace itself
-    from runner.cli import listing
-    from runner.runs.catalogue.columns import DEFAULT_JSON, columns_of
+    """  # noqa: D301 - Click's mark for preformatted text
     from runner.runs.catalogue.filters import parse
 
     if sum((quiet, as_csv, as_json)) > 1:
-        raise click.UsageError("--quiet, --csv and --json are three ways to print; choose one.")
+        raise click.UsageError("--quiet, --csv and --json exclude each other: choose one.")
     chosen = parse(" ".join(words))
     shown = columns_of(columns) if columns else None
-    if limit is None and not (quiet or as_csv or as_json) and sys.stdout.isatty():
+    render: Render | None = _ids if quiet else _csv_lines if as_csv else _objects if as_json else None
+    if limit is None and render is None and sys.stdout.isatty():
         limit = ON_A_TERMINAL
-    wanted = _Wanted(chosen, sort, limit or None, offset)
-    if quiet or as_csv or as_json:
+    query = _Query(chosen, sort, limit or None, offset)
+    if render is not None:
         columns_shown = ["id"] if quiet else shown or list(DEFAULT_JSON)
-        render: Render = listing.csv_lines if as_csv else _ids if quiet else _objects
-        listed, total, problems = _stream(recordings, wanted, columns_shown, render)
+        listed, total, problems = _stream(recordings, query, columns_shown, render)
     else:
-        rows, total = _found(recordings, wanted, shown or listing.USUAL)
+        rows, total = _page(recordings, query, shown or _DEFAULT_COLUMNS)
         listed, problems = len(rows), [row["problem"] for row in rows if row["problem"]]
         if rows:
-            shown = shown or listing.fitting(rows, listing.usual_columns(rows, len(recordings)))
-            listing.print_table(rows, shown)
-    _report_damage(problems)
-    _tell_the_rest(listed, total, offset, chosen, recordings)
+            _print_table(rows, shown or _fitting(rows, _informative(rows, len(recordings))))
+    for problem in problems[:MAX_PROBLEMS]:
+        say(f"{problem[:1].upper()}{problem[1:]}")
+    if len(problems) > MAX_PROBLEMS:
+        say(f"{len(problems) - MAX_PROBLEMS:,} more runs are damaged: `dualtaxi ls status:damaged`.")
+    _say_what_is_missing(listed, total, offset, chosen, recordings)
 
 
-@dataclass(frozen=True)
-class _Wanted:
-    """Which runs are listed, in which order."""
-
-    filter: Filter
-    sort: str
-    limit: int | None
-    offset: int
-
-
-def _ids(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> Iterator[str]:  # noqa: ARG001
-    return (f"{row['id']}\n" for row in rows)
-
-
-def _objects(rows: Iterable[dict[str, Any]], columns: Sequence[str]) -> Iterator[str]:
-    from runner.runs.catalogue.columns import as_json
-
-    return json_list("runs", (as_json(row, columns) for row in rows))
+# --- reading ----------------------------------------------------------------------------------------------
 
 
 def _stream(
-    recordings: tuple[Path, ...],
-    wanted: _Wanted,
-    columns: Sequence[str],
-    render: Render,
+    recordings: tuple[Path, ...], query: _Query, columns: Sequence[str], render: Render
 ) -> tuple[int, int, list[str]]:
-    """Print the runs in bounded memory; return how many, how many fit the filter, and what is damaged.
+    """Print runs in bounded memory; return how many, how many match, and the problems of damaged ones.
 
-    A file takes the text up first: the index is locked while it is read, and whoever reads the output may
-    take their time.
+    The text goes to a temporary file first: the index is locked while it is read, and the reader of the
+    output may be slow.
     """
-    import tempfile
-
-    from runner.runs.catalogue.columns import needed_for, with_same_as
     from runner.runs.catalogue.index import look, order_of
 
-    order = order_of(wanted.sort)
+    order = order_of(query.sort)
     needed = needed_for([*columns, "same_as"] if "same_as" in columns else columns)
+    problems: list[str] = []
+
+    def with_problems(rows: Iterable[Row]) -> Iterator[Row]:
+        for row in rows:
+            problems.extend([row["problem"]] if row["problem"] else [])
+            yield row
 
     def work(index: Index) -> int:
         spool.seek(0)
         spool.truncate()
         problems.clear()
-        rows: Iterable[dict[str, Any]]
-        if wanted.limit is None:
-            total = index.count(wanted.filter)
-            rows = islice(index.rows(wanted.filter, *order, columns=needed), wanted.offset, None)
+        rows: Iterable[Row]
+        if query.limit is None:
+            total = index.count(query.filter)
+            rows = islice(index.rows(query.filter, *order, columns=needed), query.offset, None)
         else:
-            rows, total = index.page(wanted.filter, *order, limit=wanted.limit, offset=wanted.offset)
+            rows, total = index.page(query.filter, *order, limit=query.limit, offset=query.offset)
         if "same_as" in columns:
             rows = with_same_as(rows, index.originals())
-        spool.writelines(render(_noting_problems(rows, problems), columns))
+        spool.writelines(render(with_problems(rows), columns))
         return total
 
-    problems: list[str] = []
     with tempfile.SpooledTemporaryFile(_SPOOL_BYTES, "w+", encoding="utf-8", newline="") as spool:
         total = look(recordings, work, say)
         spool.seek(0)
-        while part := spool.read(_PART):
+        while part := spool.read(_READ_BYTES):
             click.echo(part, nl=False)
-    left = max(total - wanted.offset, 0)
-    return left if wanted.limit is None else min(left, wanted.limit), total, problems
+    left = max(total - query.offset, 0)
+    return left if query.limit is None else min(left, query.limit), total, problems
 
 
-def _noting_problems(rows: Iterable[dict[str, Any]], problems: list[str]) -> Iterator[dict[str, Any]]:
-    """Yield the rows, and add what is wrong with damaged ones to a list."""
-    for row in rows:
-        if row["problem"]:
-            problems.append(row["problem"])
-        yield row
-
-
-def _found(
-    recordings: tuple[Path, ...], wanted: _Wanted, columns: Sequence[str]
-) -> tuple[list[dict[str, Any]], int]:
-    """Return the rows to show, and how many fit the filter."""
-    from runner.runs.catalogue.columns import needed_for
+def _page(recordings: tuple[Path, ...], query: _Query, columns: Sequence[str]) -> tuple[list[Row], int]:
+    """Return the rows to show, and how many match."""
     from runner.runs.catalogue.index import look, order_of
 
-    order, needed = order_of(wanted.sort), needed_for([*columns, "same_as"])
+    order, needed = order_of(query.sort), needed_for([*columns, "same_as"])
 
-    def work(index: Index) -> tuple[list[dict[str, Any]], int]:
-        rows, total = index.page(
-            wanted.filter, *order, limit=wanted.limit, offset=wanted.offset, columns=needed
-        )
+    def work(index: Index) -> tuple[list[Row], int]:
+        rows, total = index.page(query.filter, *order, limit=query.limit, offset=query.offset, columns=needed)
         return index.with_same_as(rows), total
 
     return look(recordings, work, say)
 
 
-def _report_damage(problems: Sequence[str]) -> None:
-    """Print what is wrong with the damaged runs among those that are shown."""
-    for problem in problems[:MAX_PROBLEMS]:
-        say(f"{problem[:1].upper()}{problem[1:]}")
-    if len(problems) > MAX_PROBLEMS:
-        say(f"{len(problems) - MAX_PROBLEMS:,} more runs are damaged: `dualtaxi ls status:damaged`.")
+# --- printing ---------------------------------------------------------------------------------------------
 
 
-def _tell_the_rest(
+def _ids(rows: Iterable[Row], _columns: Sequence[str]) -> Iterator[str]:
+    return (f"{row['id']}\n" for row in rows)
+
+
+def _objects(rows: Iterable[Row], columns: Sequence[str]) -> Iterator[str]:
+    return json_list("runs", (as_json(row, columns) for row in rows))
+
+
+def _csv_lines(rows: Iterable[Row], columns: Sequence[str]) -> Iterator[str]:
+    """Yield lines of CSV after a heading; tags are separated by blanks, logged values are a JSON object."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+
+    def line(cells: Iterable[Any]) -> str:
+        text.seek(0)
+        text.truncate()
+        writer.writerow(cells)
+        return text.getvalue()
+
+    def cell(value: Any) -> Any:
+        return (
+            " ".join(value)
+            if isinstance(value, list)
+            else json.dumps(value)
+            if isinstance(value, dict)
+            else value
+        )
+
+    yield line(columns)
+    for row in rows:
+        yield line(map(cell, as_json(row, columns).values()))
+
+
+def _informative(rows: Sequence[Row], folders: int) -> list[str]:
+    """Return the default columns without those that hold nothing of interest here."""
+    has_success = any(row["success_percent"] is not None for row in rows)
+    has_return = any(row["mean_return"] is not None for row in rows)
+    is_informative = {
+        "config": any(row["name"] != row["config"] for row in rows),
+        "tag": any(row["tags"] for row in rows),
+        "same_as": any(row["same_as"] for row in rows),
+        "folder": folders > 1,
+        "success_percent": has_success or not has_return,
+        "mean_return": has_return,
+        "logged": any(row["logged"] != "{}" for row in rows),
+    }
+    return [column for column in _DEFAULT_COLUMNS if is_informative.get(column, True)]
+
+
+def _fitting(rows: Sequence[Row], columns: Sequence[str]) -> list[str]:
+    """Return the columns that fit the terminal."""
+    kept, terminal = list(columns), console()
+    widths = {
+        column: 2 + max(len(HEADINGS.get(column, column)), *(len(_cell(row, column)) for row in rows))
+        for column in columns
+    }
+    for column in _SHRINKING:
+        widths[column] = min(widths.get(column, 0), _MIN_WIDTH)
+    for column in _OPTIONAL:
+        if terminal.is_terminal and column in kept and sum(map(widths.__getitem__, kept)) > terminal.width:
+            kept.remove(column)
+    return kept
+
+
+def _print_table(rows: Sequence[Row], columns: Sequence[str]) -> None:
+    """Print a table, fitted to the terminal if there is one; ids are never truncated."""
+    headings = [HEADINGS.get(column, column) for column in columns]
+    left = [column not in FIELDS or FIELDS[column].kind in _LEFT for column in columns]
+    cells = [[_cell(row, column) for column in columns] for row in rows]
+    if not console().is_terminal:
+        click.echo("\n".join(aligned([headings, *cells], left)))
+        return
+    left_headings = tuple(heading for heading, is_left in zip(headings, left, strict=True) if is_left)
+    grid = table(*headings, left=left_headings, shrinking=_SHRINKING)
+    for line in cells:
+        grid.add_row(*line)
+    draw(grid)
+
+
+def _cell(row: Row, column: str) -> str:
+    return printable(as_text(row, column))
+
+
+def _say_what_is_missing(
     listed: int, total: int, offset: int, chosen: Filter, recordings: tuple[Path, ...]
 ) -> None:
-    """Say what is not shown, and why nothing is."""
+    """Print how many matching runs are not listed, or why none is."""
     folders = ", ".join(map(str, recordings))
     if listed < total:
-        behind = offset + listed
-        more = f", --offset {behind} the next" if listed > 0 and behind < total else ""
+        end = offset + listed
+        more = f", --offset {end} the next" if listed > 0 and end < total else ""
         say(f"Shown are {listed:,} of {total:,} runs; --limit 0 shows all{more}.")
     elif not listed and chosen.condition is not None:
-        say(f"No run in {folders} fits.")
+        say(f"No run in {folders} matches.")
     elif not listed:
         say(f"No runs in {folders} yet. `dualtaxi run CONFIG` makes one.")

@@ -84,21 +84,20 @@ _job_argument = click.argument("number", metavar="JOB", type=click.IntRange(1))
 
 
 @click.group("remote", cls=Group)
-def command() -> None:
+def remote_command() -> None:
     """Upload and download runs, and submit and control jobs on a server (`dualtaxi serve`).
 
-    \b
     Examples:
       dualtaxi remote push @latest --server http://localhost:8000
       dualtaxi remote submit quick --server http://localhost:8000 --watch
       dualtaxi remote jobs --server http://localhost:8000
-    """  # noqa: D301 - Click wants the backspace itself
+    """
 
 
 # --- runs -------------------------------------------------------------------------------------------------
 
 
-@command.command("push")
+@remote_command.command("push")
 @click.argument("names", metavar="[RUN]...", nargs=-1, type=RunName())
 @click.option(
     "--outbox",
@@ -117,12 +116,11 @@ def push(
     server already has is left as it is. With --outbox, the runs that `runner.record(env, "http://...")` could
     not send are sent now.
 
-    \b
     Examples:
       dualtaxi remote push @latest --server http://localhost:8000
       dualtaxi remote push k3v9m2xq 7wd2qhmz --server https://runs.example.org --token-file ~/.dualtaxi-token
       dualtaxi remote push --outbox
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     if bool(names) == outbox:
         raise click.UsageError("expected either runs or --outbox.")
     runs: list[dict[str, Any]] = []
@@ -183,7 +181,7 @@ def _pushed(name: str, push_run: Push) -> dict[str, Any]:
     return {"run_id": sent.run_id, "name": run_name, "bytes": run_bytes, "already": sent.already}
 
 
-@command.command("pull")
+@remote_command.command("pull")
 @click.argument("run_name", metavar="RUN")
 @_server_options
 @recordings_option
@@ -194,11 +192,10 @@ def pull(run_name: str, server: Server, recordings: Path | None, as_json: bool) 
     RUN is named as the server knows it: its id, the beginning of one, its name, or @latest. Every byte is
     checked before the run appears; a run that is here already with the same content is left as it is.
 
-    \b
     Examples:
       dualtaxi remote pull @latest --server http://localhost:8000
       dualtaxi remote pull k3v9m2xq --server https://runs.example.org --token-file ~/.dualtaxi-token
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.cli.progress import bytes_line
     from runner.cli.runs import print_received
     from runner.runs.run import recordings_folder
@@ -212,7 +209,7 @@ def pull(run_name: str, server: Server, recordings: Path | None, as_json: bool) 
 # --- jobs -------------------------------------------------------------------------------------------------
 
 
-@command.command("submit")
+@remote_command.command("submit")
 @click.argument("file", metavar="FILE", type=ConfigName())
 @click.option(
     "--watch", "is_watched", is_flag=True, help="Wait until the job is over, and show its progress."
@@ -228,11 +225,10 @@ def submit(ctx: click.Context, file: Path, is_watched: bool, server: Server, as_
 
     Exit code 0 when it is queued, or with --watch finished; 1 when it failed or was cancelled.
 
-    \b
     Examples:
       dualtaxi remote submit quick --server http://localhost:8000
       dualtaxi remote submit hyperparameters --server http://localhost:8000 --watch
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.config.shipped import config_path
     from runner.sweep.loading import self_contained_text
 
@@ -248,17 +244,16 @@ def submit(ctx: click.Context, file: Path, is_watched: bool, server: Server, as_
         ctx.exit(ExitCode.DIFFERENT)
 
 
-@command.command("jobs")
+@remote_command.command("jobs")
 @limit_option(20)
 @_server_options
 @json_option
 def jobs(limit: int, server: Server, as_json: bool) -> None:
     """List the jobs of a server, newest first.
 
-    \b
     Example:
       dualtaxi remote jobs --server http://localhost:8000
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     with server.client() as client:
         found = client.jobs(limit or 1000)
     if as_json:
@@ -274,7 +269,7 @@ def jobs(limit: int, server: Server, as_json: bool) -> None:
         say("No jobs yet. `dualtaxi remote submit FILE` submits one.")
 
 
-@command.command("watch")
+@remote_command.command("watch")
 @_job_argument
 @_server_options
 @json_option
@@ -284,10 +279,9 @@ def watch(ctx: click.Context, number: int, server: Server, as_json: bool) -> Non
 
     A broken connection is restored. Exit code 0 when the job finished, 1 when it failed or was cancelled.
 
-    \b
     Example:
       dualtaxi remote watch 12 --server http://localhost:8000
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     with server.client() as client:
         job = _watched(client, number)
     _print_job(job, as_json)
@@ -295,22 +289,21 @@ def watch(ctx: click.Context, number: int, server: Server, as_json: bool) -> Non
         ctx.exit(ExitCode.DIFFERENT)
 
 
-@command.command("cancel")
+@remote_command.command("cancel")
 @_job_argument
 @_server_options
 @json_option
 def cancel(number: int, server: Server, as_json: bool) -> None:
     """Cancel JOB, whether queued or running; what it has recorded is kept.
 
-    \b
     Example:
       dualtaxi remote cancel 12 --server http://localhost:8000
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     with server.client() as client:
         _print_job(client.cancel(number), as_json)
 
 
-@command.command("resume")
+@remote_command.command("resume")
 @_job_argument
 @click.option("--accept-changes", is_flag=True, help="Resume although the code has changed.")
 @_server_options
@@ -318,10 +311,9 @@ def cancel(number: int, server: Server, as_json: bool) -> None:
 def resume(number: int, accept_changes: bool, server: Server, as_json: bool) -> None:
     """Resume JOB, which failed or was cancelled, as if it had never stopped.
 
-    \b
     Example:
       dualtaxi remote resume 12 --server http://localhost:8000
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     with server.client() as client:
         _print_job(client.resume(number, accept_changes), as_json)
 

@@ -1,4 +1,4 @@
-"""`dualtaxi report`: one self-contained page about runs."""
+"""`dualtaxi plot` and `dualtaxi report`: a figure or a page about runs, or about a sweep."""
 
 from __future__ import annotations
 
@@ -6,31 +6,106 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import EXPORTS, TRIAL, recordings_option, runs_argument
+from runner.cli import Command
+from runner.cli.options import (
+    EXPORTS,
+    INDEX,
+    TRIAL,
+    force_option,
+    output_option,
+    recordings_option,
+    runs_argument,
+)
 from runner.cli.output import say
-from runner.cli.progress import stage_line
+from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import find_all_recorded
+from runner.export.places import write_new, write_text_new
+from runner.runs.run import recordings_folder
+from runner.sweep import is_sweep
 from runner.util.humanize import size
 
 
-@click.command("report")
+@click.command("plot", cls=Command)
 @runs_argument
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    default=EXPORTS / "report.html",
-    show_default=True,
-    metavar="FILE",
-    help="The file to write.",
-)
+@output_option(EXPORTS / "plot.png", "FILE.png|svg|pdf")
+@force_option
+@recordings_option
+def plot_command(run_names: tuple[str, ...], output: Path, force: bool, recordings: Path | None) -> None:
+    """Draw every metric of one or several runs over episodes, in one figure; or a sweep.
+
+    Runs that differ in nothing but the seed are drawn as one line, their median, with a band from the lowest
+    to the highest; a run that was recorded twice counts once, with a message. A name shared by several runs
+    stands for all of them.
+
+    Of a sweep, given by its name, the objective is drawn against each parameter and in parallel coordinates,
+    and over episodes for the best and the median trial.
+
+    Examples:
+      dualtaxi plot @latest
+      dualtaxi plot cooperative competitive -o comparison.pdf
+      dualtaxi plot hyperparameters -o hyperparameters.png
+    """
+    from runner.analysis.groups import duplicates, groups_of
+    from runner.analysis.series import read_series, values_left_out
+    from runner.export.contents import shortcomings
+    from runner.export.plots.curves import curves_sheet
+    from runner.export.plots.image import check_suffix, save
+    from runner.export.plots.metrics import panels_of
+    from runner.recording.reader import open_recording
+
+    check_suffix(output)
+    folder = recordings_folder(recordings)
+    if is_sweep(run_names, folder):
+        _plot_sweep(run_names[0], folder, output, force)
+        return
+    series = []
+    runs = find_all_recorded(run_names, folder)
+    with count_line("runs read", len(runs)) as progress:
+        for run in runs:
+            with open_recording(run.recording) as recording:
+                series.append(read_series(recording))
+                for shortcoming in shortcomings(recording):
+                    say(shortcoming)
+            progress(len(series))
+    groups = groups_of(series)
+    for note in duplicates(groups):
+        say(f"{note[0].upper()}{note[1:]}.")
+    for sentence in values_left_out(series):
+        say(sentence)
+    panels = panels_of(groups)
+    with stage_line("drawing"):
+        write_new(output, force, lambda path: save(curves_sheet(groups, panels), path))
+    count = sum(len(group.runs) for group in groups)
+    click.echo(f"{output}: {len(panels)} metrics of {_runs(count)}")
+
+
+def _plot_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
+    from runner.export.plots.image import save
+    from runner.sweep.charts import sweep_sheet
+    from runner.sweep.plots import learning, panel_of, picture_of
+    from runner.sweep.results import results_of
+    from runner.sweep.state import read_sweep
+
+    results = results_of(read_sweep(name, recordings), recordings)
+    picture = picture_of(results)
+    groups, panels = learning(results, recordings)
+    panel = panel_of(results.sweep.objective.metric, panels)
+    with stage_line("drawing"):
+        sheet = sweep_sheet(f"Sweep {name}", picture, groups, panel)
+        write_new(output, force, lambda path: save(sheet, path))
+    click.echo(f"{output}: the sweep {name}, {len(picture.trials)} trials")
+
+
+@click.command("report", cls=Command)
+@runs_argument
+@output_option(EXPORTS / "report.html")
 @click.option(
     "--episode",
     "episodes",
-    type=click.IntRange(0),
+    type=INDEX,
     multiple=True,
     metavar="N",
-    help="Show this training episode too, counted from 0; may be repeated.",
+    help="Also show this training episode, counted from 0; may be repeated.",
 )
 @click.option(
     "--eval",
@@ -38,11 +113,11 @@ from runner.util.humanize import size
     type=TRIAL,
     multiple=True,
     metavar="N:TRIAL",
-    help="Show this trial of the evaluation after N training episodes too; may be repeated.",
+    help="Also show this trial of the evaluation after N training episodes; may be repeated.",
 )
-@click.option("--force", is_flag=True, help="Replace the file if it exists.")
+@force_option
 @recordings_option
-def command(
+def report_command(
     run_names: tuple[str, ...],
     output: Path,
     episodes: tuple[int, ...],
@@ -56,41 +131,35 @@ def command(
     configuration and provenance, and a replay of the best and the worst trial of the last evaluation and
     of the first and the last training episode. It needs no network.
 
-    The page of a sweep, which its name stands for, has the objective against each parameter, parallel
-    coordinates, the ranking, what mattered, and the learning curves of the best and the median trial.
+    The page of a sweep, given by its name, has the objective against each parameter, parallel coordinates,
+    the ranking, what mattered, and the learning curves of the best and the median trial.
 
-    \b
     Examples:
       dualtaxi report @latest
       dualtaxi report cooperative competitive -o comparison.html
       dualtaxi report hyperparameters -o hyperparameters.html
       dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
-    """  # noqa: D301 - Click wants the backspace itself
-    from runner.export.places import write_new
+    """
     from runner.export.reports.report import require_packages, write_report
-    from runner.runs.run import recordings_folder
-    from runner.sweep import is_sweep
 
     require_packages()
     folder = recordings_folder(recordings)
     if is_sweep(run_names, folder):
         if episodes or trials:
-            raise click.UsageError("a sweep's page shows no episode: leave out --episode and --eval.")
+            raise click.UsageError("the page of a sweep shows no episode: leave out --episode and --eval.")
         _report_sweep(run_names[0], folder, output, force)
         return
-    chosen = [("train", number, 0) for number in episodes]
-    chosen += [("eval", *trial) for trial in trials]
+    replays = [*(("train", number, 0) for number in episodes), *(("eval", *trial) for trial in trials)]
     paths = [run.recording for run in find_all_recorded(run_names, folder)]
-    said: list[str] = []
+    notes: list[str] = []
     with stage_line("reading") as progress:
-        write_new(output, force, lambda path: said.extend(write_report(path, paths, chosen, progress)))
-    for sentence in said:
-        say(sentence)
-    click.echo(f"{output}: {size(output.stat().st_size)}, {len(paths)} run{'s' if len(paths) > 1 else ''}")
+        write_new(output, force, lambda path: notes.extend(write_report(path, paths, replays, progress)))
+    for note in notes:
+        say(note)
+    click.echo(f"{output}: {size(output.stat().st_size)}, {_runs(len(paths))}")
 
 
 def _report_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
-    from runner.export.places import write_text_new
     from runner.sweep.page import render_sweep
     from runner.sweep.results import results_of
     from runner.sweep.state import read_sweep
@@ -99,3 +168,7 @@ def _report_sweep(name: str, recordings: Path, output: Path, force: bool) -> Non
     with stage_line("drawing"):
         write_text_new(output, force, render_sweep(results, recordings))
     click.echo(f"{output}: {size(output.stat().st_size)}, the sweep {name}")
+
+
+def _runs(count: int) -> str:
+    return "1 run" if count == 1 else f"{count} runs"

@@ -11,13 +11,25 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.cli.options import config_argument, json_option, recordings_option, set_option, workers_option
-from runner.cli.output import print_json, say
+from runner.cli import Command
+from runner.cli.options import (
+    COUNT,
+    INDEX,
+    config_argument,
+    json_option,
+    recordings_option,
+    set_option,
+    workers_option,
+)
+from runner.cli.output import console, draw, facts, print_json, say
+from runner.cli.progress import count_line, progress_line
 from runner.cli.runs import command_for, compilation_notice, run_as_json, run_facts
 from runner.errors import ExitCode
+from runner.runs.run import create_run, recordings_folder, unless_empty
 from runner.util.humanize import amount, size
+from runner.util.values import checked_name
 
-if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
+if TYPE_CHECKING:  # a run is written to disk before heavy packages are imported
     from rich.console import RenderableType
 
     from runner.config import ExperimentConfig
@@ -28,31 +40,29 @@ if TYPE_CHECKING:  # a run is to stand on disk before anything heavy is imported
     Watch = Callable[[Run], LiveView]
 
 LIVE_EPISODES: Final = 200
-"""About so many training episodes are shown live, unless asked otherwise."""
+"""Training episodes shown live by default, about."""
 
 
-@click.command("run")
+@click.command("run", cls=Command)
 @config_argument
-@click.option("--seed", type=click.IntRange(0), metavar="N", help="The seed, instead of the configuration's.")
+@click.option("--seed", type=INDEX, metavar="N", help="The seed, instead of the configuration's.")
 @set_option
 @click.option("--name", help="Name of the run.  [default: the configuration's name]")
 @click.option("--live", is_flag=True, help="Open the Rerun viewer and watch the training in it.")
 @click.option(
     "--live-every",
-    type=click.IntRange(1),
+    type=COUNT,
     metavar="N",
-    help="Show every Nth episode, step by step.  [default: about 200 of them]",
+    help=f"Show every Nth episode, step by step.  [default: about {LIVE_EPISODES} of them]",
 )
 @click.option(
-    "--live-url",
-    metavar="URL",
-    help="Connect to a running viewer at this URL instead of starting one.",
+    "--live-url", metavar="URL", help="Connect to a running viewer at this URL instead of starting one."
 )
 @workers_option(1)
 @recordings_option
 @json_option
 @click.pass_context
-def command(
+def run_command(
     ctx: click.Context,
     config: Path,
     seed: int | None,
@@ -78,7 +88,6 @@ def command(
 
     With --json, one line for each run.
 
-    \b
     Examples:
       dualtaxi run quick
       dualtaxi run mine.yaml
@@ -86,90 +95,40 @@ def command(
       dualtaxi run quick --set 'seeds={count: 3}' --json
       dualtaxi run quick --set 'seeds={count: 100}' --set recording.steps=none --workers 2
       dualtaxi run cooperative --live --live-every 100
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.api import experiment_of, jobs_in
-    from runner.runs.run import recordings_folder
-    from runner.util.values import checked_name
 
     experiment = experiment_of(config, overrides, seed)
-    called, folder = checked_name(name), recordings_folder(recordings)
+    run_name, folder = checked_name(name), recordings_folder(recordings)
     if workers > 1:
         if live or live_every or live_url:
             raise click.UsageError("--live shows one run at a time: leave out --workers.")
-        _run_parallel(ctx, experiment, folder, called, workers, as_json)
+        _run_parallel(ctx, experiment, folder, run_name, workers, as_json)
         return
     watch = _watcher(experiment, live, live_every, live_url)
     for number, job in enumerate(jobs_in(experiment, folder)):
-        run, interrupted = _run_one(job, folder, called, number, watch)
-        _tell(run, number, as_json)
-        if interrupted:
-            _tell_interrupted(run, experiment, begun=number + 1)
-            ctx.exit(ExitCode.INTERRUPTED)
-
-
-def _tell(run: Run, number: int, as_json: bool) -> None:
-    if as_json:
-        print_json(run_as_json(run), indent=None)
-    else:
-        _summarise(run, blank=number > 0)
-    sys.stdout.flush()
-
-
-def _run_parallel(
-    ctx: click.Context, config: ExperimentConfig, folder: Path, name: str | None, workers: int, as_json: bool
-) -> None:
-    """Run an experiment's seeds side by side, and tell of each run."""
-    from runner.api import interruptible, jobs_in, run_parallel
-    from runner.cli.progress import count_line
-    from runner.environments.loading import load_mdp
-
-    load_mdp(config.env.id, config.env.kwargs, config.rewards)  # refused before all else
-    _announce(config, folder)
-    runs: list[Run] = []
-    with (
-        interruptible(second=signal.SIG_DFL) as interrupt,
-        compilation_notice(),
-        count_line("runs", len(config.seeds)) as done,
-    ):
-        for run in run_parallel(jobs_in(config, folder), folder, name, workers, interrupt):
-            runs.append(run)
-            done(len(runs))
-            _tell(run, len(runs) - 1, as_json)
-    if interrupt.came:
-        for run in runs:
+        run, is_interrupted = _run_one(job, folder, run_name, number, watch)
+        _print_run(run, number, as_json)
+        if is_interrupted:
+            episodes = f"{run.summary['episodes']:,} of {experiment.episodes:,} episodes"
+            say(f"Interrupted: {episodes} are kept in {run.recording}.")
             if run.status == "interrupted":
-                say(f"Interrupted: {run.recording}; `{command_for(run, 'resume')}` goes on from there.")
-        _tell_left(config, len(runs))
-        ctx.exit(ExitCode.INTERRUPTED)
-
-
-def _watcher(config: ExperimentConfig, live: bool, every: int | None, url: str | None) -> Watch | None:
-    """Return what makes a live view of a run; None if none is asked for. A viewer is opened if need be."""
-    if not (live or every or url):
-        return None
-    from runner.export.rerun import viewer
-    from runner.export.rerun.live import LiveView
-
-    viewer.require_rerun("run --live")
-    address = viewer.check_address(url) if url else viewer.live_window(viewer.free_port())
-    one_in = every or max(1, config.episodes // LIVE_EPISODES)
-    say(f"Live: every metric, and the steps of one episode in {one_in:,}, at {address}")
-    return lambda run: LiveView(f"{run.title} ({run.run_id})", run.run_id, one_in, address)
+                say(f"`{command_for(run, 'resume')}` continues from there.")
+            _say_left(experiment, number + 1)
+            ctx.exit(ExitCode.INTERRUPTED)
 
 
 def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch | None) -> tuple[Run, bool]:
     """Run a job; return its run, and whether it was interrupted."""
     from runner.api import interruptible
-    from runner.cli.progress import progress_line
-    from runner.runs.run import create_run, unless_empty
 
     run = create_run(folder, job.config, job.seed, name)
-    from runner.environments.loading import load_mdp
+    from runner.environments.loading import load_mdp  # the run is on disk before NumPy is imported
 
     label = f"seed {run.seed}" if len(job.config.seeds) > 1 else ""
     with unless_empty(run):
         if number == 0:
-            load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)  # refused before all else
+            load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)  # refuse it first of all
             _announce(job.config, folder)
         with (
             interruptible(second=signal.SIG_DFL) as interrupt,
@@ -185,32 +144,57 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int, watch: Watch
     return run, interrupt.came
 
 
-def _tell_interrupted(run: Run, config: ExperimentConfig, begun: int) -> None:
-    """Say what is kept, and what was not begun."""
-    done = run.summary["episodes"]
-    say(f"Interrupted: {done:,} of {config.episodes:,} episodes are kept in {run.recording}.")
-    if run.status == "interrupted":
-        say(f"`{command_for(run, 'resume')}` goes on from there.")
-    _tell_left(config, begun)
+def _run_parallel(
+    ctx: click.Context, config: ExperimentConfig, folder: Path, name: str | None, workers: int, as_json: bool
+) -> None:
+    """Run the seeds of an experiment in parallel, and print each run."""
+    from runner.api import interruptible, jobs_in, run_parallel
+    from runner.environments.loading import load_mdp
+
+    load_mdp(config.env.id, config.env.kwargs, config.rewards)  # refuse it first of all
+    _announce(config, folder)
+    runs: list[Run] = []
+    with (
+        interruptible(second=signal.SIG_DFL) as interrupt,
+        compilation_notice(),
+        count_line("runs", len(config.seeds)) as report,
+    ):
+        for run in run_parallel(jobs_in(config, folder), folder, name, workers, interrupt):
+            runs.append(run)
+            report(len(runs))
+            _print_run(run, len(runs) - 1, as_json)
+    if interrupt.came:
+        for run in runs:
+            if run.status == "interrupted":
+                say(f"Interrupted: {run.recording}; `{command_for(run, 'resume')}` continues from there.")
+        _say_left(config, len(runs))
+        ctx.exit(ExitCode.INTERRUPTED)
 
 
-def _tell_left(config: ExperimentConfig, begun: int) -> None:
-    """Say which seeds were not begun, if any."""
-    if left := len(config.seeds) - begun:
-        say(f"Not begun: {left} of {len(config.seeds)} seeds, from {config.seeds[begun]} on.")
+def _watcher(config: ExperimentConfig, live: bool, every: int | None, url: str | None) -> Watch | None:
+    """Return the function that makes a live view of a run, if there is one; open a viewer if necessary."""
+    if not (live or every or url):
+        return None
+    from runner.export.rerun import viewer
+    from runner.export.rerun.live import LiveView
+
+    viewer.require_rerun("run --live")
+    address = viewer.check_address(url) if url else viewer.live_window(viewer.free_port())
+    one_in = every or max(1, config.episodes // LIVE_EPISODES)
+    say(f"Live: every metric, and the steps of one episode in {one_in:,}, at {address}")
+    return lambda run: LiveView(f"{run.title} ({run.run_id})", run.run_id, one_in, address)
 
 
 def _announce(config: ExperimentConfig, folder: Path) -> None:
-    """Tell what is to come; ask, where someone can answer, when the disk would not hold it."""
+    """Print the estimate; if the disk may be too small and there is a terminal, ask whether to continue."""
     from runner.execution.estimate import estimate, free_bytes, step_limit
 
-    limit, seeds = step_limit(config), len(config.seeds)
-    free = free_bytes(folder)
+    limit, seeds, free = step_limit(config), len(config.seeds), free_bytes(folder)
     runs = f"{seeds} runs of {config.episodes:,} episodes" if seeds > 1 else f"{config.episodes:,} episodes"
     if limit is None:
         return
     if limit == 0:
-        say(f"{runs} without a step limit: nobody knows how long; {size(free)} of disk are free.")
+        say(f"{runs} without a step limit, so the size is unknown; {size(free)} of disk are free.")
         return
     one = estimate(config, limit)
     say(
@@ -220,47 +204,57 @@ def _announce(config: ExperimentConfig, folder: Path) -> None:
     if free >= one.typical_bytes * seeds:
         return
     say(f"The disk of {folder} has {size(free)} left, which may be too little.")
-    if _someone_answers() and not click.confirm("Go on?", err=True):
+    if _is_interactive() and not click.confirm("Continue?", err=True):
         raise click.exceptions.Exit(ExitCode.DIFFERENT)
 
 
-def _someone_answers() -> bool:
-    """Return whether there is a terminal to ask on."""
+def _is_interactive() -> bool:
     return sys.stdin.isatty() and sys.stderr.isatty()
 
 
-def _summarise(run: Run, blank: bool) -> None:
-    """Print what came of a run and what to type next."""
+def _say_left(config: ExperimentConfig, begun: int) -> None:
+    """Print which seeds were not begun, if any."""
+    if left := len(config.seeds) - begun:
+        say(f"Not begun: {left} of {len(config.seeds)} seeds, from {config.seeds[begun]} on.")
+
+
+def _print_run(run: Run, number: int, as_json: bool) -> None:
+    """Print a run that is over: its evaluations, facts and what to type next."""
     from runner.analysis.evaluations import evaluation_records
     from runner.cli.evaluations import evaluation_table, spread
-    from runner.cli.output import console, draw, facts
     from runner.recording.reader import open_recording
 
+    if as_json:
+        print_json(run_as_json(run), indent=None)
+        sys.stdout.flush()
+        return
     with open_recording(run.recording) as recording:
         records = evaluation_records(recording)
         successes = recording.environment["success_events"]
-    parts: list[RenderableType] = [""] if blank else []
+    parts: list[RenderableType] = [""] if number > 0 else []
     if records:
         shown = spread(records)
         parts.append(evaluation_table(shown, successes, console()))
         if len(shown) < len(records):
-            parts.append(f"{len(shown)} of {len(records)} evaluations; `{command_for(run, 'show')}` has all.")
+            show = command_for(run, "show")
+            parts.append(f"{len(shown)} of {len(records)} evaluations; `{show}` has all.")
         parts.append("")
     draw(*parts, facts(_result(run, records[-1]["episode"] if records else None)))
+    sys.stdout.flush()
 
 
 def _result(run: Run, evaluated: int | None) -> dict[str, str]:
-    """Return what there is to say of a run at its end; `evaluated` is when it was last evaluated."""
+    """Return the facts of a run at its end; `evaluated` is the episode of its last evaluation."""
     summary = run.summary
-    more = [command_for(run, "show")]
+    following = [command_for(run, "show")]
     if not summary["steps_recorded"]:
-        more += [command_for(run, "rerecord")] * (run.status == "finished")
+        following += [command_for(run, "rerecord")] * (run.status == "finished")
     elif evaluated is not None:
-        more.append(command_for(run, "play", f"--eval {evaluated}:0"))
+        following.append(command_for(run, "play", f"--eval {evaluated}:0"))
     elif summary["train_steps"]:
-        more.append(command_for(run, "play", "--episode 0"))
-    told = run_facts(run)
+        following.append(command_for(run, "play", "--episode 0"))
+    rows = run_facts(run)
     steps = (summary["train_steps"] + summary["eval_steps"]) * summary["steps_recorded"]
     if steps:
-        told["file"] += f", {summary['bytes'] / steps:.0f} bytes a step"
-    return told | {"next": "\n".join(more)}
+        rows["file"] += f", {summary['bytes'] / steps:.0f} bytes per step"
+    return rows | {"next": "\n".join(following)}

@@ -1,4 +1,4 @@
-"""`dualtaxi serve`: the runs, opened to browsers and programs."""
+"""`dualtaxi serve`: serve the runs over HTTP."""
 
 from __future__ import annotations
 
@@ -7,11 +7,15 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import folders_option, workers_option
+from runner.cli import Command
+from runner.cli.options import FILE, folders_option, workers_option
 from runner.cli.output import say
+from runner.service.settings import Settings
+from runner.util.extras import require
+from runner.util.files import storage_errors
 
 
-@click.command("serve")
+@click.command("serve", cls=Command)
 @folders_option
 @click.option(
     "--host", default="127.0.0.1", show_default=True, metavar="HOST", help="The address to listen on."
@@ -47,11 +51,11 @@ from runner.cli.output import say
 )
 @click.option(
     "--log",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=FILE,
     metavar="FILE",
     help="Append the log to this file, as JSON lines.  [default: stderr]",
 )
-def command(
+def serve_command(
     recordings: tuple[Path, ...],
     host: str,
     port: int,
@@ -70,21 +74,16 @@ def command(
     Other hosts than loopback ones need a token (`dualtaxi token create NAME`), and a proxy for TLS in front:
     see docs/deploy.md.
 
-    \b
     Examples:
       dualtaxi serve
       dualtaxi serve --port 8080 --recordings /data/runs
       dualtaxi serve --host 0.0.0.0 --allow-host runs.example.org --proxy 10.0.0.2
-    """  # noqa: D301 - Click wants the backspace itself
-    from runner.errors import StorageError
-    from runner.util.extras import require
-
+    """
     require("fastapi", "uvicorn", "httptools", "httpx2", "jinja2", extra="service", purpose="the service")
     from runner.service import logs
     from runner.service.app import create_app
     from runner.service.jobs.store import LOCK_FILE, lock_folder
     from runner.service.server import bind, serve, url_of
-    from runner.service.settings import Settings
 
     settings = Settings(
         recordings=recordings,
@@ -100,12 +99,10 @@ def command(
         from runner.sweep.cluster import require_ray
 
         require_ray()
-    try:
+    with storage_errors(log or settings.recordings[0]):
         settings.recordings[0].mkdir(parents=True, exist_ok=True)
         stream = log.open("a", encoding="utf-8") if log else sys.stderr
-    except OSError as error:
-        raise StorageError(f"{error.filename}: cannot be written ({error.strerror}).") from error
-    lock_folder(settings.recordings[0], LOCK_FILE).release()  # refused before anybody can ask for anything
+    lock_folder(settings.recordings[0], LOCK_FILE).release()  # fail before requests are accepted
     app = create_app(settings)
     listening = bind(settings)
     click.echo(url_of(listening))

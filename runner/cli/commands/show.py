@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from runner.cli import Command
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import console, draw, facts, print_json, say, title
 from runner.cli.progress import stage_line
@@ -17,17 +18,18 @@ from runner.util.humanize import UNKNOWN, age, duration, number, size
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from runner.recording.reader import Recording
     from runner.runs.run import Run
 
-MOST_CYCLES: Final = 8
-"""So many of the cycles that time-outs are stuck in are told."""
+MAX_CYCLES: Final = 8
+"""Cycles of states shown, in which episodes reach the step limit."""
 
 
-@click.command("show")
+@click.command("show", cls=Command)
 @run_argument
 @recordings_option
 @json_option
-def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
+def show_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     """Show a run: its evaluations, tables, configuration and provenance.
 
     With --json also the whole series: under `eval` an object for each evaluation, with the training episodes
@@ -36,100 +38,93 @@ def command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     last results of a loop: its last evaluation, the means of its last 100 training episodes and the last
     values it logged.
 
-    \b
     Examples:
       dualtaxi show @latest
       dualtaxi show k3v9m2xq --json
-    """  # noqa: D301 - Click wants the backspace itself
-    run = restored(find(run_name, recordings))
+    """
     from runner.analysis.summary import described
 
-    told = described(run, say)
+    run = restored(find(run_name, recordings))
+    values = described(run, say)
     if as_json:
-        print_json(told)
+        print_json(values)
     else:
-        _draw(run, told)
+        draw(*_parts(run, values))
 
 
-def _draw(run: Run, told: dict[str, Any]) -> None:
-    from runner.cli.evaluations import evaluation_table
-
-    parts: list[RenderableType] = [facts(_head(run, told))]
-    if told["eval"]:
-        parts += [title("Evaluations"), evaluation_table(told["eval"], told["success_events"], console())]
-        random = _random_policy(run)
-        parts += [random] if random else []
-    if told["loop"]:
-        parts += [title("Last results"), facts(_loop_results(told["loop"]))]
-    if told["optimality"]:
-        parts += [title("Greedy policy, exactly"), facts(_exactly(run, told["optimality"][-1]))]
-    if told["tables"]:
-        fill = {table["agent"]: _fill_in_words(table) for table in told["tables"]}
-        parts += [title("Tables"), facts(fill)]
-    parts += [title("Configuration"), facts({key: _yaml(value) for key, value in told["config"].items()})]
-    if told["provenance"]:
-        parts += [title("Provenance"), facts(told["provenance"])]
-    draw(*parts)
-
-
-def _head(run: Run, told: dict[str, Any]) -> dict[str, str]:
-    ago = age((datetime.now(UTC) - run.created).total_seconds())
-    head = {
-        "run": f"{run.run_id}  {run.title}",
-        "status": f"{told['status']}, begun {ago} ago"
-        + (f", took {duration(told['seconds'])}" if told["seconds"] is not None else ""),
-    }
-    if "damage" in told:
-        head["damage"] = told["damage"]
-    if run.summary.error:
-        head["error"] = run.summary.error
-    if None not in (told["train_steps"], told["episodes"], told["eval_steps"]):
-        head["steps"] = (
-            f"{told['train_steps']:,} of training in {told['episodes']:,} episodes, "
-            f"{told['eval_steps']:,} of evaluation"
-        )
-    return head | {
-        "digest": told["content_digest"] or f"{UNKNOWN} (told when a run ends properly)",
-        "file": f"{run.recording}  {size(told['bytes'])}" if told["bytes"] else "no recording",
-    }
-
-
-def _random_policy(run: Run) -> str:
-    """Return what a random policy achieves, as a sentence or nothing: what an evaluation compares with."""
+def _parts(run: Run, values: dict[str, Any]) -> list[RenderableType]:
     from runner.analysis.summary import random_policy_sentence
+    from runner.cli.evaluations import evaluation_table
     from runner.recording.reader import open_recording
 
-    with stage_line("computing what a random policy achieves"), open_recording(run.recording) as recording:
-        return random_policy_sentence(recording)
+    parts: list[RenderableType] = [facts(_head(run, values))]
+    if values["eval"]:
+        parts += [title("Evaluations"), evaluation_table(values["eval"], values["success_events"], console())]
+        with stage_line("evaluating a random policy"), open_recording(run.recording) as recording:
+            sentence = random_policy_sentence(recording)
+        parts += [sentence] if sentence else []
+    if values["loop"]:
+        parts += [title("Last results"), facts(_loop_results(values["loop"]))]
+    if values["optimality"]:
+        with open_recording(run.recording) as recording:
+            measures = _optimality(recording, values["optimality"][-1])
+        parts += [title("Greedy policy, exactly"), facts(measures)]
+    if values["tables"]:
+        fill = {
+            each["agent"]: f"{each['percent_filled']:.1f} % filled, {each['zero_cells']:,} cells are still "
+            f"zero, after {each['step']:,} steps"
+            if "step" in each
+            else UNKNOWN
+            for each in values["tables"]
+        }
+        parts += [title("Tables"), facts(fill)]
+    config = {key: _yaml(value) for key, value in values["config"].items()}
+    parts += [title("Configuration"), facts(config)]
+    if values["provenance"]:
+        parts += [title("Provenance"), facts(values["provenance"])]
+    return parts
+
+
+def _head(run: Run, values: dict[str, Any]) -> dict[str, str]:
+    ago = age((datetime.now(UTC) - run.created).total_seconds())
+    took = "" if values["seconds"] is None else f", took {duration(values['seconds'])}"
+    steps = ""
+    if None not in (values["train_steps"], values["episodes"], values["eval_steps"]):
+        steps = f"{values['train_steps']:,} of training in {values['episodes']:,} episodes, "
+        steps += f"{values['eval_steps']:,} of evaluation"
+    head = {
+        "run": f"{run.run_id}  {run.title}",
+        "status": f"{values['status']}, begun {ago} ago{took}",
+        "damage": values.get("damage", ""),
+        "error": run.summary.error or "",
+        "steps": steps,
+        "digest": values["content_digest"] or f"{UNKNOWN} (written when a run ends properly)",
+        "file": f"{run.recording}  {size(values['bytes'])}" if values["bytes"] else "no recording",
+    }
+    return {key: text for key, text in head.items() if text}
 
 
 def _loop_results(loop: dict[str, Any]) -> dict[str, str]:
-    """Return the means of the last training episodes of a loop and the values it logged last."""
+    """Return the means of a loop's last training episodes and the values it logged last."""
     recent = loop["recent_training"]
     episodes = f"last {recent['episodes']:,} episodes" if recent["episodes"] > 1 else "one episode"
     results = {"training": "no episode ended"}
     if recent["episodes"]:
-        results = {
-            "training": f"mean return {number(recent['mean_return'])}, mean length "
-            f"{number(recent['mean_length'])} ({episodes})"
-        }
+        means = f"mean return {number(recent['mean_return'])}, mean length {number(recent['mean_length'])}"
+        results["training"] = f"{means} ({episodes})"
     for name, value in loop["logged"].items():
         results[f"logged {name}"] = "not finite" if value is None else f"{value:,.6g}"
     return results
 
 
-def _exactly(run: Run, measures: dict[str, Any]) -> dict[str, str]:
-    """Return what the last exact measures say, beside what is possible."""
+def _optimality(recording: Recording, measures: dict[str, Any]) -> dict[str, str]:
+    """Return the last exact measures, next to the optimum."""
     from runner.environments.naming import states_in_words
-    from runner.recording.reader import open_recording
 
-    with open_recording(run.recording) as recording:
-        words, agents = states_in_words(recording.mdp), recording.agents
-    gain = " and ".join(
-        f"{best - own:.3f} ({agent})"
-        for agent, own, best in zip(agents, measures["values"], measures["best_responses"], strict=True)
-    )
-    told = {
+    states = states_in_words(recording.mdp)
+    gains = zip(recording.agents, measures["values"], measures["best_responses"], strict=True)
+    gain = " and ".join(f"{best - own:.3f} ({agent})" for agent, own, best in gains)
+    rows = {
         "succeeds": f"{measures['success_percent']:.1f} % of {measures['starts']:,} start states "
         f"(the optimum {measures['optimal_success_percent']:.1f} %)",
         "length": f"{measures['mean_length']:.2f} steps (the optimum {measures['optimal_mean_length']:.2f})",
@@ -137,27 +132,17 @@ def _exactly(run: Run, measures: dict[str, Any]) -> dict[str, str]:
         "to gain": f"{gain}, by a best response",
     }
     cycles = list(zip(*(measures[f"cycle_{key}"] for key in ("states", "lengths", "percents")), strict=True))
-    if cycles:
-        lines = [
-            f"{percent:.1f} %  {f'round {length} states' if length > 1 else 'one state'}: {words[state]}"
-            for state, length, percent in cycles[:MOST_CYCLES]
-        ]
-        more = len(cycles) - MOST_CYCLES
-        told["stuck in"] = "\n".join([*lines, *([f"and {more:,} more cycles (--json)"] if more > 0 else [])])
-    return told
-
-
-def _fill_in_words(table: dict[str, Any]) -> str:
-    if "step" not in table:
-        return UNKNOWN
-    return (
-        f"{table['percent_filled']:.1f} % filled, {table['zero_cells']:,} cells are still zero, "
-        f"after {table['step']:,} steps"
-    )
+    lines = [
+        f"{percent:.1f} %  {f'round {length} states' if length > 1 else 'one state'}: {states[state]}"
+        for state, length, percent in cycles[:MAX_CYCLES]
+    ]
+    if len(cycles) > MAX_CYCLES:
+        lines.append(f"and {len(cycles) - MAX_CYCLES:,} more cycles (--json)")
+    return rows | ({"stuck in": "\n".join(lines)} if lines else {})
 
 
 def _yaml(value: Any) -> str:
-    """Return a value as a configuration would say it, on one line."""
+    """Return a value as YAML on one line."""
     import yaml
 
     text = yaml.safe_dump(value, default_flow_style=True, width=10**6, sort_keys=False)

@@ -1,4 +1,4 @@
-"""`dualtaxi token`: the tokens that a service asks for."""
+"""`dualtaxi token`: the access tokens of a server."""
 
 from __future__ import annotations
 
@@ -6,24 +6,25 @@ import click
 
 from runner.cli import Group
 from runner.cli.options import json_option
-from runner.cli.output import print_json, say
+from runner.cli.output import draw, print_json, say, table
+from runner.service.security import READ, WRITE, Tokens
+from runner.service.settings import tokens_file
 
 
 @click.group("token", cls=Group)
-def command() -> None:
+def token_command() -> None:
     """Create, list and revoke access tokens.
 
     They are stored as hashes, in the configuration folder of the user who runs the server.
 
-    \b
     Examples:
       dualtaxi token create laptop
       dualtaxi token ls
       dualtaxi token revoke laptop
-    """  # noqa: D301 - Click wants the backspace itself
+    """
 
 
-@command.command("create")
+@token_command.command("create")
 @click.argument("name")
 @click.option(
     "--scope",
@@ -36,62 +37,49 @@ def command() -> None:
 def create(name: str, scope: str, as_json: bool) -> None:
     """Create a token called NAME and print it, once: only its hash is stored.
 
-    \b
     Examples:
       dualtaxi token create laptop
       dualtaxi token create pusher --scope write
-    """  # noqa: D301 - Click wants the backspace itself
-    from runner.service.security import READ, WRITE, Tokens
-    from runner.service.settings import tokens_file
-
+    """
     scopes = (READ, WRITE) if scope == WRITE else (READ,)
     token, secret = Tokens(tokens_file()).create(name, scopes)
     if as_json:
         print_json(token.as_json() | {"token": secret})
     else:
         click.echo(secret)
-        say(f"Keep it; it is not shown again. `dualtaxi token revoke {token.id}` takes it away.")
+        say(f"Keep it; it is not shown again. `dualtaxi token revoke {token.id}` revokes it.")
 
 
-@command.command("ls")
+@token_command.command("ls")
 @json_option
 def ls(as_json: bool) -> None:
     """List the tokens; only their hashes are stored.
 
-    \b
     Example:
       dualtaxi token ls
-    """  # noqa: D301 - Click wants the backspace itself
-    from runner.cli.output import draw, table
-    from runner.service.security import Tokens
-    from runner.service.settings import tokens_file
-
+    """
     tokens = Tokens(tokens_file()).all()
     if as_json:
         print_json({"tokens": [token.as_json() for token in tokens]})
     elif tokens:
         headings = ("id", "name", "scopes", "created")
-        drawn = table(*headings, left=headings, shrinking=("name",))
+        grid = table(*headings, left=headings, shrinking=("name",))
         for token in tokens:
-            drawn.add_row(token.id, token.name, " ".join(token.scopes), token.created)
-        draw(drawn)
+            grid.add_row(token.id, token.name, " ".join(token.scopes), token.created)
+        draw(grid)
     else:
         say("No tokens yet. `dualtaxi token create NAME` makes one.")
 
 
-@command.command("revoke")
+@token_command.command("revoke")
 @click.argument("which", metavar="TOKEN")
 @json_option
 def revoke(which: str, as_json: bool) -> None:
     """Revoke a token by its id or name; a running server refuses it from now on.
 
-    \b
     Example:
       dualtaxi token revoke laptop
-    """  # noqa: D301 - Click wants the backspace itself
-    from runner.service.security import Tokens
-    from runner.service.settings import tokens_file
-
+    """
     token = Tokens(tokens_file()).revoke(which)
     if as_json:
         print_json(token.as_json())

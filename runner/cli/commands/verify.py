@@ -1,4 +1,4 @@
-"""`dualtaxi verify`: whether a recording is what its job gives."""
+"""`dualtaxi verify`: check a recording by training its run again."""
 
 from __future__ import annotations
 
@@ -7,24 +7,27 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from runner.cli import Command
 from runner.cli.options import json_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json
+from runner.cli.progress import bytes_line
 from runner.cli.runs import find_recording, job_progress, require_over
-from runner.errors import ExitCode
+from runner.errors import Diverged, ExitCode
 from runner.util.humanize import UNKNOWN
 
 if TYPE_CHECKING:
-    from runner.errors import Diverged
     from runner.execution.verify import Verification
 
 
-@click.command("verify")
+@click.command("verify", cls=Command)
 @run_argument
 @click.option("--rerun", is_flag=True, help="Compare with the installed environment.")
 @recordings_option
 @json_option
 @click.pass_context
-def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | None, as_json: bool) -> None:
+def verify_command(
+    ctx: click.Context, run_name: str, rerun: bool, recordings: Path | None, as_json: bool
+) -> None:
     """Check RUN, or a recording by its path: every byte, step, episode, figure and table.
 
     The run is trained again in memory, with the environment in the recording, and compared. The first
@@ -38,13 +41,11 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
 
     Exit code 1 if anything is wrong.
 
-    \b
     Examples:
       dualtaxi verify @latest
       dualtaxi verify k3v9m2xq --rerun
       dualtaxi verify backup/recording.mcap --json
-    """  # noqa: D301 - Click wants the backspace itself
-    from runner.cli.progress import bytes_line
+    """
     from runner.execution.verify import damage_of, verify
 
     path, run = find_recording(run_name, recordings)
@@ -57,7 +58,7 @@ def command(ctx: click.Context, run_name: str, rerun: bool, recordings: Path | N
     if as_json:
         print_json(_as_json(found, rerun))
     else:
-        draw(facts(_in_words(found, rerun)))
+        draw(facts(_rows(found, rerun)))
     if not found.sound:
         ctx.exit(ExitCode.DIFFERENT)
 
@@ -70,32 +71,27 @@ def _verdict(found: Verification, rerun: bool) -> str:
     return "diverged" if rerun and found.difference is not None else "wrong"
 
 
-def _in_words(found: Verification, rerun: bool) -> dict[str, str]:
-    step = found.difference.step if found.difference is not None else None
+def _rows(found: Verification, rerun: bool) -> dict[str, str]:
     verdict = _verdict(found, rerun)
-    told = {
-        "recording": str(found.path),
-        "verdict": f"diverged at step {step:,}" if verdict == "diverged" and step is not None else verdict,
-    }
+    if verdict == "diverged" and found.difference is not None and found.difference.step is not None:
+        verdict = f"diverged at step {found.difference.step:,}"
+    rows = {"recording": str(found.path), "verdict": verdict}
     if found.nothing_yet:
-        return told | {"next": "`dualtaxi resume` does the run from its beginning"}
+        return rows | {"next": "`dualtaxi resume` trains the run from the beginning"}
     if found.sound:
-        told["compared"] = f"{found.train_steps:,} steps of training, {found.eval_steps:,} of evaluation"
-        told["digest"] = found.content_digest or f"{UNKNOWN} (told when a run ends properly)"
+        rows["compared"] = f"{found.train_steps:,} steps of training, {found.eval_steps:,} of evaluation"
+        rows["digest"] = found.content_digest or f"{UNKNOWN} (written when a run ends properly)"
+        rows["not compared"] = found.not_compared
     else:
-        told["first"] = found.finding
-    if found.sound and found.not_compared:
-        told["not compared"] = found.not_compared
-    if found.notes:
-        told["note"] = "\n".join(found.notes)
-    if found.provenance:
-        told["differs"] = "\n".join(
-            f"{key}: {then or 'unknown'} then, {now or 'unknown'} here"
-            for key, (then, now) in found.provenance.items()
-        )
-    elif rerun:
-        told["differs"] = "nothing: the same code, packages and processor"
-    return told
+        rows["first"] = found.finding
+    rows["note"] = "\n".join(found.notes)
+    rows["differs"] = "\n".join(
+        f"{key}: {then or 'unknown'} then, {now or 'unknown'} here"
+        for key, (then, now) in found.provenance.items()
+    )
+    if rerun and not found.provenance:
+        rows["differs"] = "nothing: the same code, packages and processor"
+    return {key: text for key, text in rows.items() if text}
 
 
 def _as_json(found: Verification, rerun: bool) -> dict[str, Any]:
@@ -114,16 +110,7 @@ def _as_json(found: Verification, rerun: bool) -> dict[str, Any]:
 
 
 def _difference(difference: Diverged) -> dict[str, Any]:
-    return {
-        "topic": difference.topic,
-        "episode": difference.episode,
-        "step": difference.step,
-        "field": difference.field,
-        "found": _plain(difference.found),
-        "expected": _plain(difference.expected),
-    }
-
-
-def _plain(value: object) -> object:
-    """Return a value that JSON can hold."""
-    return value if isinstance(value, str | int | float | list | dict | None) else str(value)
+    keys = ("topic", "episode", "step", "field", "found", "expected")
+    values = {key: getattr(difference, key) for key in keys}
+    plain = (str, int, float, list, dict, type(None))
+    return {key: value if isinstance(value, plain) else str(value) for key, value in values.items()}

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from runner.cli import Command
 from runner.cli.choosing import request_of, tell
 from runner.cli.options import PICTURE_SIZE, STEP, RunName, recordings_option, selection_options
 from runner.cli.output import say
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from runner.export.rerun.selection import Location
 
 
-@click.command("view")
+@click.command("view", cls=Command)
 @click.argument("run_names", metavar="RUN [RUN]", nargs=-1, required=True, type=RunName())
 @click.option(
     "--at",
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
 @click.option("--force", is_flag=True, help="Replace the screenshot if it exists.")
 @selection_options
 @recordings_option
-def command(
+def view_command(
     run_names: tuple[str, ...],
     step: tuple[int, ...] | None,
     web: bool,
@@ -74,13 +75,12 @@ def command(
     episode of --at among them, or of two runs the episode in which they diverge. The command ends when the
     viewer is closed, or by Ctrl-C.
 
-    \b
     Examples:
       dualtaxi view @latest
       dualtaxi view @latest --at 2999:3
       dualtaxi view first second --web
       dualtaxi view @latest --at eval:3000:0:4 --screenshot step.png
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     if len(run_names) > 2:
         raise click.UsageError(f"found {len(run_names)} runs, expected one or two.")
     from runner.cli.progress import stage_line

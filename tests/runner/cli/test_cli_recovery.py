@@ -84,14 +84,14 @@ def test_a_run_that_was_killed_before_it_had_a_recording(command, copied, name):
     copied.update(status="interrupted", summary={})
     result = command(name, copied.run_id)
     assert result.exit_code == 2
-    assert f"`dualtaxi resume {copied.run_id}` does it from the beginning" in result.stderr
+    assert f"`dualtaxi resume {copied.run_id}` trains it from the beginning" in result.stderr
 
 
 def test_what_a_missing_recording_leaves_to_do_depends_on_the_run(command, copied):
     copied.recording.unlink()
     assert command.json("show", copied.run_id)["status"] == "finished"
     loop = copied.update(config={"made_by": "runner.record"})
-    assert "only the loop that it was made by" in command("play", loop.run_id).stderr
+    assert "only the loop that recorded it" in command("play", loop.run_id).stderr
     copied.update(status="running", owner=owner())
     assert "it has just begun" in command("play", copied.run_id).stderr
 
@@ -281,7 +281,7 @@ def test_what_cannot_be_repaired_stays(command, tmp_path, content):
 
 def test_qtable(recorded, recorded_run, tmp_path):
     out = tmp_path / "table.npy"
-    result = recorded("qtable", recorded_run.recording, "--step", 300, "--out", out)
+    result = recorded("qtable", recorded_run.recording, "--step", 300, "-o", out)
     assert result.exit_code == 0
     assert "after 300 training steps" in result.stdout
     with open_recording(recorded_run.recording) as recording:

@@ -103,11 +103,11 @@ def test_a_small_disk_is_warned_of_where_nobody_answers(command, tiny, monkeypat
 @pytest.mark.parametrize(("answer", "code", "runs"), [("n\n", 1, 0), ("y\n", 0, 1), ("", 130, 0)])
 def test_a_small_disk_is_asked_about_on_a_terminal(command, tiny, monkeypatch, answer, code, runs):
     monkeypatch.setattr(estimate, "free_bytes", lambda _: 1000)
-    monkeypatch.setattr(run_command, "_someone_answers", lambda: True)
+    monkeypatch.setattr(run_command, "_is_interactive", lambda: True)
     result = command("run", tiny, "--json", input=answer)
     assert result.exit_code == code
     assert len(list_runs(command.recordings)) == runs
-    assert "Go on?" in result.stderr
+    assert "Continue?" in result.stderr
 
 
 def test_a_bad_configuration_is_told_line_by_line(command, tiny):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.cli import removing
+from runner.cli.commands import remove
 from runner.config import from_mapping
 from runner.recording.labels import LABELS_FILE
 from runner.runs.locking import locked
@@ -47,7 +47,7 @@ def answer(monkeypatch):
             def isatty(self):
                 return True
 
-        monkeypatch.setattr(removing.sys, "stdin", Terminal(text))
+        monkeypatch.setattr(remove.sys, "stdin", Terminal(text))
         monkeypatch.setattr("click.termui.visible_prompt_func", lambda *_: text)
 
     return answers
@@ -120,7 +120,7 @@ def test_filters_sorting_columns_and_paging(command, make):
     assert command("ls", "-q", "age:>2.5d").stdout.split() == [run.run_id for run in runs[3:]]
     told = command.json("ls", "--columns", "id,config.episodes,bytes", "--limit", 1)["runs"]
     assert told == [{"id": runs[0].run_id, "config.episodes": 5, "bytes": 5000}]
-    assert command("ls", "bytes:>1MB").stderr == f"No run in {command.recordings} fits.\n"
+    assert command("ls", "bytes:>1MB").stderr == f"No run in {command.recordings} matches.\n"
 
 
 def test_csv_has_what_json_has(command, make):

@@ -1,4 +1,4 @@
-"""`dualtaxi config`: list, copy and check configurations, print the schema."""
+"""`dualtaxi init`, `config` and `completion`: folders, configurations and the shell."""
 
 from __future__ import annotations
 
@@ -6,33 +6,60 @@ from pathlib import Path
 
 import click
 
-from runner.cli import Group
-from runner.cli.options import SHIPPED, config_argument, json_option, set_option
+from runner.cli import Command, Group
+from runner.cli.options import DIRECTORY, SHIPPED, config_argument, json_option, output_option, set_option
 from runner.cli.output import draw, print_json, say, table
 
 
+@click.command("init", cls=Command)
+@click.argument("folder", metavar="[FOLDER]", default=".", type=DIRECTORY)
+@json_option
+def init_command(folder: Path, as_json: bool) -> None:
+    """Create a folder to start in, with configs/, recordings/ and a README of what to type.
+
+    FOLDER defaults to the current one. Existing files are left as they are.
+
+    Examples:
+      dualtaxi init
+      dualtaxi init experiments
+    """
+    from runner.config.shipped import start_folder
+
+    made: list[str] = []
+    kept: list[str] = []
+    for path, is_new in start_folder(folder):
+        (made if is_new else kept).append(str(path))
+    if as_json:
+        print_json({"folder": str(folder.absolute()), "made": made, "kept": kept})
+        return
+    for name in made:
+        click.echo(name)
+    if kept:
+        say(f"{len(kept)} of {len(made) + len(kept)} existed already and were left as they are.")
+    change = "" if folder == Path() else f"cd {folder} && "
+    say(f"Next: {change}dualtaxi run configs/quick.yaml")
+
+
 @click.group("config", cls=Group)
-def command() -> None:
+def config_command() -> None:
     """List, copy and check configurations; print their schema.
 
-    \b
     Examples:
       dualtaxi config ls
       dualtaxi config copy quick -o mine.yaml
       dualtaxi config check mine.yaml
       dualtaxi config schema > schema.json
-    """  # noqa: D301 - Click wants the backspace itself
+    """
 
 
-@command.command("ls")
+@config_command.command("ls")
 @json_option
 def ls(as_json: bool) -> None:
-    """List the shipped experiments, which `run` takes by name, and sweeps, which `sweep` does.
+    """List the shipped experiments, for `run`, and sweeps, for `sweep run`.
 
-    \b
     Example:
       dualtaxi config ls
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.config.shipped import shipped
 
     if as_json:
@@ -42,30 +69,23 @@ def ls(as_json: bool) -> None:
         ]
         print_json({"configs": configs})
         return
-    made = table("name", "kind", "about", left=("name", "kind", "about"), shrinking=("about",))
+    grid = table("name", "kind", "about", left=("name", "kind", "about"), shrinking=("about",))
     for each in shipped().values():
-        made.add_row(each.name, each.kind, each.about)
-    draw(made)
+        grid.add_row(each.name, each.kind, each.about)
+    draw(grid)
 
 
-@command.command("copy")
+@config_command.command("copy")
 @click.argument("name", metavar="NAME", type=SHIPPED)
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="The file to write.  [default: NAME.yaml]",
-)
+@output_option("NAME.yaml")
 @json_option
 def copy(name: str, output: Path | None, as_json: bool) -> None:
     """Copy the shipped experiment NAME into a file of your own, to change it.
 
-    \b
     Examples:
       dualtaxi config copy quick
       dualtaxi config copy hyperparameters -o search.yaml
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.config.shipped import copy_shipped, find_shipped
 
     experiment = find_shipped(name)
@@ -78,7 +98,7 @@ def copy(name: str, output: Path | None, as_json: bool) -> None:
         say(f"Next: {experiment.command.rpartition(' ')[0]} {target}")
 
 
-@command.command("check")
+@config_command.command("check")
 @config_argument
 @set_option
 @json_option
@@ -88,11 +108,10 @@ def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     The output is a configuration again. All problems are reported at once, with file, line, column and key;
     the exit code is then 2. Whether the environment exists is checked by `dualtaxi run`, before it begins.
 
-    \b
     Examples:
       dualtaxi config check quick
       dualtaxi config check mine.yaml --set episodes=50 --json
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.config import load
 
     experiment = load(config, overrides)
@@ -103,17 +122,36 @@ def check(config: Path, overrides: tuple[str, ...], as_json: bool) -> None:
         click.echo(experiment.to_yaml(), nl=False)
 
 
-@command.command("schema")
+@config_command.command("schema")
 @json_option
 def schema(as_json: bool) -> None:  # noqa: ARG001 - a schema is JSON anyway
     """Print the JSON Schema of configuration files, with which editors check and complete them.
 
     It is JSON with or without --json.
 
-    \b
     Example:
       dualtaxi config schema > configs/schema.json
-    """  # noqa: D301 - Click wants the backspace itself
+    """
     from runner.config import json_schema
 
     print_json(json_schema(), indent=2)
+
+
+@click.command("completion", cls=Command)
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion_command(shell: str) -> None:
+    """Print the script that makes SHELL complete commands, options, files and the names of runs.
+
+    Examples:
+      eval "$(dualtaxi completion bash)"                       now, in this shell
+      dualtaxi completion bash >> ~/.bashrc                    from now on
+      dualtaxi completion fish > ~/.config/fish/completions/dualtaxi.fish
+    """
+    from click.shell_completion import get_completion_class
+
+    from runner.cli import cli
+
+    kind = get_completion_class(shell)
+    if kind is None:
+        raise click.BadParameter(f"click knows no completion for {shell}.")
+    click.echo(kind(cli, {}, "dualtaxi", "_DUALTAXI_COMPLETE").source())

@@ -1,0 +1,242 @@
+"""`dualtaxi rm` and `dualtaxi prune`: show what would be removed, ask, remove it."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from runner.archive.places import archive_place
+from runner.cli import Command
+from runner.cli.options import (
+    INDEX,
+    filter_argument,
+    folders_option,
+    json_option,
+    recordings_option,
+    runs_argument,
+)
+from runner.cli.output import aligned, console, draw, print_json, printable, say, table
+from runner.cli.runs import find
+from runner.errors import RunnerError
+from runner.runs.catalogue.columns import STATUSES
+from runner.runs.run import recordings_folder, runs_in
+from runner.util.humanize import UNKNOWN, age, number, size
+
+if TYPE_CHECKING:
+    from runner.runs.catalogue.removal import Removal
+    from runner.runs.run import Run
+
+_MAX_DRAWN: Final = 1000
+"""Rows that are fitted to a terminal; more are printed as in a file, which is far quicker."""
+_HEADINGS: Final = ("id", "name", "seed", "status", "success %", "age", "frees")
+_LEFT: Final = ("id", "name", "status")
+
+_yes_option = click.option("--yes", "-y", is_flag=True, help="Do not ask for confirmation.")
+_foreign_option = click.option(
+    "--force", is_flag=True, help="Also remove files and folders in a run's folder that no run writes."
+)
+_dry_run_option = click.option(
+    "--dry-run", is_flag=True, help="Show what would be removed and how much is freed, and remove nothing."
+)
+
+
+@click.command("rm", cls=Command)
+@runs_argument
+@recordings_option
+@_yes_option
+@_dry_run_option
+@_foreign_option
+@json_option
+def rm_command(
+    run_names: tuple[str, ...], recordings: Path | None, yes: bool, dry_run: bool, force: bool, as_json: bool
+) -> None:
+    """Remove runs and their recordings, after confirmation.
+
+    If a run is running or tagged `keep`, or its folder holds files of other origin, nothing is removed. Links
+    are not followed. Archives stay.
+
+    Examples:
+      dualtaxi rm k3v9m2xq p7
+      dualtaxi rm @latest --dry-run
+      dualtaxi ls --quiet status:failed | xargs dualtaxi rm --yes
+    """
+    from runner.runs.catalogue.removal import plan
+
+    root = recordings_folder(recordings)
+    runs = {run.folder.resolve(): run for run in (find(name, recordings) for name in run_names)}
+    removals = [plan(run, root, force) for run in runs.values()]
+    refused = [f"run {each.run_id} stays: {each.refusal}." for each in removals if each.refusal]
+    if refused:
+        raise RunnerError("\n".join([*refused, "Nothing was removed."]))
+    _carry_out(removals, {}, force, yes, dry_run, as_json)
+
+
+@click.command("prune", cls=Command)
+@filter_argument
+@folders_option
+@click.option("--older-than", metavar="AGE", help="Runs that started longer ago than this: 30d, 12h, 2w.")
+@click.option("--keep-last", type=INDEX, metavar="N", help="Keep the newest N runs of each configuration.")
+@click.option(
+    "--status",
+    "statuses",
+    multiple=True,
+    type=click.Choice([status for status in STATUSES if status != "running"]),
+    help="Runs with this status; may be repeated. Archived runs are removed only with --status archived.",
+)
+@_dry_run_option
+@_yes_option
+@_foreign_option
+@json_option
+def prune_command(
+    words: tuple[str, ...],
+    recordings: tuple[Path, ...],
+    older_than: str | None,
+    keep_last: int | None,
+    statuses: tuple[str, ...],
+    dry_run: bool,
+    yes: bool,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Remove the runs that match FILTER (as in `dualtaxi ls`) and all options, after confirmation.
+
+    At least one of them must be given. --keep-last keeps the newest runs of each configuration name, counted
+    over all runs. Runs that are running or tagged `keep` stay, and so do those whose folder holds files of
+    other origin.
+
+    Examples:
+      dualtaxi prune --older-than 30d --keep-last 5 --status interrupted --dry-run
+      dualtaxi prune 'config:quick success_percent:<50' --yes
+    """
+    from runner.runs.catalogue.filters import parse, seconds_of
+    from runner.runs.catalogue.index import look
+    from runner.runs.catalogue.removal import Criteria, plan, plan_row, unwanted
+
+    try:
+        seconds = None if older_than is None else seconds_of(older_than)
+    except ValueError:
+        raise RunnerError(
+            f"--older-than: found {older_than!r}, expected an age such as 30d, 12h or 2w."
+        ) from None
+    criteria = Criteria(parse(" ".join(words)), seconds, keep_last, statuses)
+    if criteria.filter.condition is None and older_than is None and keep_last is None and not statuses:
+        raise click.UsageError("expected a FILTER, --older-than, --keep-last or --status: which runs?")
+    rows, protected = look(recordings, lambda index: unwanted(index, criteria, time.time()), say)
+    if dry_run:
+        removals = [plan_row(row, force) for row in rows]
+    else:
+        places = [(Path(row["root"]), row["entry"]) for row in rows]
+        removals = [plan(run, root, force) for root, entry in places for run in runs_in(root / entry)]
+    kept = {each.run_id: each.refusal for each in removals if each.refusal}
+    for run_id, reason in kept.items():
+        say(f"Run {run_id} stays: {reason}.")
+    if protected:
+        counts = ", ".join(f"{count:,} {reason}" for reason, count in sorted(protected.items()))
+        say(f"Left alone: {counts}.")
+    removals = [each for each in removals if not each.refusal]
+    if not removals and not as_json:
+        say("There is nothing to remove.")
+        return
+    _carry_out(removals, kept, force, yes, dry_run, as_json)
+
+
+def _carry_out(
+    removals: Sequence[Removal], kept: dict[str, str], force: bool, yes: bool, dry_run: bool, as_json: bool
+) -> None:
+    """Show the removals, ask, carry them out and print what was freed.
+
+    Args:
+        removals: the removals, none of them refused.
+        kept: run id to reason, of the runs that stay; for programs.
+        force: also remove strange files.
+        yes: do not ask.
+        dry_run: remove nothing.
+        as_json: print JSON.
+
+    Raises:
+        RunnerError: confirmation is needed, and there is no terminal.
+    """
+    from runner.runs.catalogue.removal import clean, remove, total
+
+    freed = total(removals)
+    if removals and not as_json:
+        _draw(removals)
+    if removals and not dry_run:
+        if not yes and not sys.stdin.isatty():
+            raise RunnerError(
+                "there is no terminal to ask on; --yes removes without asking, --dry-run shows."
+            )
+        runs = "this run" if len(removals) == 1 else f"these {len(removals):,} runs"
+        if not yes:
+            click.confirm(f"Remove {runs} for good, and free {size(freed)}?", abort=True, err=True)
+        for removal in removals:
+            remove(removal, force)
+        for root in {removal.root for removal in removals}:
+            clean(root)
+    if as_json:
+        reasons = [{"run_id": run_id, "why": reason} for run_id, reason in kept.items()]
+        removed = [_as_json(removal) for removal in removals]
+        print_json({"dry_run": dry_run, "freed": freed, "removed": removed, "kept": reasons})
+    elif dry_run:
+        say(f"Nothing was removed; it would free {size(freed)}.")
+    else:
+        click.echo(
+            f"Removed {'1 run' if len(removals) == 1 else f'{len(removals):,} runs'}, freed {size(freed)}."
+        )
+
+
+def _as_json(removal: Removal) -> dict[str, object]:
+    return {
+        "run_id": removal.run_id,
+        "name": removal.name,
+        "status": removal.status,
+        "path": str(removal.folder.absolute()),
+        "bytes": removal.freed,
+    }
+
+
+def _draw(removals: Sequence[Removal]) -> None:
+    rows = [_cells(removal) for removal in removals]
+    if console().is_terminal and len(removals) <= _MAX_DRAWN:
+        grid = table(*_HEADINGS, left=_LEFT, shrinking=("name",))
+        for row in rows:
+            grid.add_row(*row)
+        draw(grid)
+    else:
+        lines = [_HEADINGS, *(tuple(map(printable, row)) for row in rows)]
+        click.echo("\n".join(aligned(lines, [heading in _LEFT for heading in _HEADINGS])))
+    for removal in removals:
+        if removal.is_archived:
+            say(_archive_notice(removal.run()))
+
+
+def _cells(removal: Removal) -> tuple[str, ...]:
+    return (
+        removal.run_id,
+        removal.name,
+        UNKNOWN if removal.seed is None else str(removal.seed),
+        removal.status,
+        UNKNOWN if removal.success_percent is None else number(removal.success_percent),
+        age((datetime.now(UTC) - removal.created).total_seconds()),
+        size(removal.freed),
+    )
+
+
+def _archive_notice(run: Run) -> str:
+    """Return what is left of a run in its archive; object storage is not queried, which may take minutes."""
+    target = run.archive.target
+    if "://" in target:
+        return f"The archive of {run.run_id} at {target} is left alone."
+    try:
+        place = archive_place(run)
+    except RunnerError as error:
+        return f"Run {run.run_id} may still be in its archive, which cannot be read: {error}"
+    if place is None:
+        return f"Run {run.run_id} was archived at {target}, but is not there: nothing of it will be left."
+    return f"The archive of {run.run_id} at {place} stays."

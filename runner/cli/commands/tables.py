@@ -1,0 +1,182 @@
+"""`dualtaxi qtable` and `dualtaxi table`: a learned table at any step, and an environment's."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from runner.analysis.frames import transition_columns
+from runner.cli import Command
+from runner.cli.options import (
+    FILE,
+    INDEX,
+    force_option,
+    json_option,
+    recordings_option,
+    run_argument,
+    set_option,
+)
+from runner.cli.output import draw, facts, print_json, say, table, title
+from runner.cli.progress import stage_line
+from runner.cli.runs import compilation_notice, find_recorded
+from runner.export.places import require_new, write_new
+from runner.util.humanize import UNKNOWN, number
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+ROWS_AT_ONCE = 50_000
+
+
+@click.command("qtable", cls=Command)
+@run_argument
+@click.option("--step", type=INDEX, metavar="N", help="After N training steps.  [default: the last]")
+@click.option("--episode", type=INDEX, metavar="N", help="After N training episodes.")
+@click.option("--state", type=INDEX, metavar="S", help="The values of one state, with their history.")
+@click.option(
+    "-o",
+    "--output",
+    type=FILE,
+    metavar="FILE.npy",
+    help="Write the whole table: float64 [states, actions], of several agents [agents, states, actions].",
+)
+@force_option
+@recordings_option
+@json_option
+def qtable_command(
+    run_name: str,
+    step: int | None,
+    episode: int | None,
+    state: int | None,
+    output: Path | None,
+    force: bool,
+    recordings: Path | None,
+    as_json: bool,
+) -> None:
+    """Show the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
+
+    With --state: its values, the policy if the algorithm learns one, the greedy action (ties go to the
+    first), how often each action was taken there so far, and which step last changed each value. In Python:
+    runner.replay.tables.tables_at().
+
+    Examples:
+      dualtaxi qtable @latest --episode 500
+      dualtaxi qtable k3v9m2xq --step 50000 --state 17
+      dualtaxi qtable k3v9m2xq --step 50000 -o table.npy
+    """
+    if step is not None and episode is not None:
+        raise click.UsageError("--step and --episode exclude each other: choose one.")
+    import numpy as np
+
+    from runner.analysis.qtable import at_moment, one_array, told_of
+    from runner.recording.reader import open_recording
+
+    if output is not None:
+        require_new(output, force)
+    run = find_recorded(run_name, recordings)
+    with (
+        open_recording(run.recording) as recording,
+        compilation_notice(),
+        stage_line("replaying recorded steps"),
+    ):
+        replay = at_moment(recording, step, episode)
+        values = told_of(recording, replay, state)
+        array = one_array(replay.tables)
+    if output is not None:
+
+        def write(path: Path) -> None:
+            with path.open("wb") as stream:  # NumPy would append .npy to a path
+                np.save(stream, array)
+
+        write_new(output, force, write)
+        values["path"] = str(output.absolute())
+    if as_json:
+        print_json(values)
+    else:
+        _draw(values)
+
+
+def _draw(values: dict[str, Any]) -> None:
+    head = {"run": values["run"], "step": f"after {values['step']:,} training steps"}
+    for each in values["tables"]:
+        head[each["agent"]] = (
+            f"{each['states']:,} states, {each['actions']} actions, {each['percent_filled']:.1f} % filled, "
+            f"values from {each['lowest']:.4g} to {each['highest']:.4g}"
+        )
+    if "state" in values:
+        head["state"] = f"{values['state']}: {values['state_in_words']}"
+        head["visits"] = f"{values['visits']:,}"
+    parts: list[Any] = [facts(head)]
+    for each in values["tables"] if "state" in values else ():
+        rows = [row for row in values["values"] if row["agent"] == each["agent"]]
+        parts += [title(each["agent"]), _state_table(rows)]
+    draw(*parts)
+    if "path" in values:
+        say(f"Written: {values['path']}")
+
+
+def _state_table(rows: list[dict[str, Any]]) -> Table:
+    """Return the table of a state's actions."""
+    policy = ("policy",) if "policy" in rows[0] else ()
+    headings = ("action", "", "value", *policy, "greedy", "visits", "changed\nby step", "in\nepisode")
+    grid = table(*headings, left=("", "greedy"), shrinking=("",))
+    for row in rows:
+        changes = (row["changed_step"], row["changed_episode"])
+        grid.add_row(
+            str(row["action"]),
+            row["action_in_words"],
+            number(row["value"], 4),
+            *(number(row[name], 4) for name in policy),
+            "greedy" if row["greedy"] else "",
+            f"{row['visits']:,}",
+            *(UNKNOWN if change is None else f"{change:,}" for change in changes),
+        )
+    return grid
+
+
+@click.command("table", cls=Command)
+@click.option(
+    "--env",
+    "env_id",
+    default="dualtaxi:DualTaxi-v1",
+    show_default=True,
+    metavar="ID",
+    help="Gymnasium's id of the environment; before a colon, the module to import for it.",
+)
+@set_option
+@json_option
+def table_command(env_id: str, overrides: tuple[str, ...], as_json: bool) -> None:
+    """Print an environment's transition table as CSV, with names.
+
+    A row for each state, action and outcome that can happen: state, action, probability, next_state, reward,
+    is_over. With --set mode=competitive also the reward of each agent. With --json, one line for each row. In
+    Python: runner.frames.transition_table().
+
+    Examples:
+      dualtaxi table | head
+      dualtaxi table --set env.kwargs.slip=0.1 > slippery.csv
+      dualtaxi table --env FrozenLake-v1 --set env.kwargs.is_slippery=false
+    """
+    from runner.config import from_mapping
+    from runner.environments.loading import load_mdp
+
+    config = from_mapping({"env": {"id": env_id}, "episodes": 1}, overrides)
+    columns = transition_columns(load_mdp(config.env.id, config.env.kwargs, config.rewards))
+
+    def rows() -> Iterator[tuple[Any, ...]]:
+        for start in range(0, len(columns["state"]), ROWS_AT_ONCE):
+            part = [column[start : start + ROWS_AT_ONCE].tolist() for column in columns.values()]
+            yield from zip(*part, strict=True)
+
+    if as_json:
+        for row in rows():
+            print_json(dict(zip(columns, row, strict=True)), indent=None)
+    else:
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(rows())
