@@ -227,6 +227,11 @@ class Drawing:
         return "frame with a flag" if kind == "goal" else "black figure"
 
 
+def drawing_of(mdp: Mdp) -> Drawing | None:
+    """Return the drawing of an environment's scene; None if it has none, or one without cells."""
+    return None if mdp.scene is None or mdp.scene_cells is None else Drawing(mdp.scene)
+
+
 def picture(width: float, height: float, title: str, content: str) -> str:
     """Return elements as an SVG picture with a description for screen readers."""
     return (

@@ -16,10 +16,10 @@ from runner.errors import RunnerError
 from runner.service import health, login, pages
 from runner.service.api import comparing, files, jobs, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
+from runner.service.fragments import load_sweep_libraries
 from runner.service.guard import Guard
 from runner.service.jobs.pool import JobPool
 from runner.service.logs import LOG, AccessLog
-from runner.service.played import load_sweep_libraries
 from runner.service.problems import add_error_handlers, answers
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache

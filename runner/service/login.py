@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
-from runner.service.pages.forms import Form
-from runner.service.pages.problems import message_of
-from runner.service.pages.rendering import page
+from runner.export.reports.rendering import View
+from runner.service.pages.rendering import Form, message_of, page
 from runner.service.problems import status_of
 from runner.service.security import Tokens, unauthorized
 from runner.service.sessions import COOKIE, SESSION_SECONDS, Sessions
@@ -21,10 +21,19 @@ TOKEN_COOKIE: Final = "dualtaxi_token"
 """Held the token itself in earlier versions; browsers are told to forget it."""
 
 
+@dataclass(frozen=True)
+class LoginView(View):
+    """The form for a token."""
+
+    TEMPLATE: ClassVar = "login.html"
+    next: str
+    problem: str = ""
+
+
 @router.get("/login")
 def ask(request: Request, next: Annotated[str, Query(max_length=4000)] = "/") -> Response:  # noqa: A002
     """Ask for a token."""
-    answer = page(request, "login.html", next=next, problem="")
+    answer = page(request, LoginView(next))
     if TOKEN_COOKIE in request.cookies:
         answer.delete_cookie(TOKEN_COOKIE, **_cookie_of(request))
     return answer
@@ -42,7 +51,7 @@ def login(request: Request, sent: Form) -> Response:
             raise unauthorized("token: found one that is unknown, or was revoked.")
         session = sessions.begin(token)
     except RunnerError as error:
-        return page(request, "login.html", status_of(error), next=where, problem=message_of(error, request))
+        return page(request, LoginView(where, message_of(error, request)), status_of(error))
     answer = RedirectResponse(where if is_local(where) else "/", HTTPStatus.SEE_OTHER)
     answer.set_cookie(COOKIE, session, max_age=SESSION_SECONDS, **_cookie_of(request))
     return answer

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from runner.analysis.groups import Group
 from runner.drawing import palette
 from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour
-from runner.export.plots.curves import HEIGHT, WIDTH, panel_chart
+from runner.export.plots.curves import HEIGHT, WIDTH, Plot, panel_chart
 from runner.export.plots.metrics import Panel
 from runner.sweep.plots import Axis, Picture
 
@@ -58,6 +58,12 @@ def sweep_sheet(title: str, picture: Picture, groups: Sequence[Group], panel: Pa
     for number, (line, colour) in enumerate(notes):
         sheet.text(10, end + 12 + 11 * number, line, size=SMALL, colour=colour)
     return sheet
+
+
+def picture_plots(picture: Picture) -> list[Plot]:
+    """Return the trials for a page: along each parameter, and in parallel coordinates."""
+    along = [Plot(axis.path, parameter_chart(picture, axis).svg(), False) for axis in picture.axes]
+    return [*along, Plot("All parameters", parallel_chart(picture).svg(), True)]
 
 
 def parameter_chart(picture: Picture, axis: Axis) -> Chart:

@@ -1,66 +1,84 @@
-"""A sweep as one self-contained page: what came of it, what mattered, and how the best trial learned."""
+"""A sweep as one self-contained page: its ranking, what mattered, and how the best trial learned."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 from runner.analysis.groups import Group
-from runner.drawing import palette
-from runner.export.plots.curves import footnote, panel_plots
-from runner.export.reports.rendering import templates
-from runner.export.reports.report import require_packages
-from runner.sweep.charts import parallel_chart, parameter_chart
+from runner.analysis.sections import Grid, Section
+from runner.export.plots.curves import Plot, footnote, panel_plots
+from runner.export.reports.rendering import LegendEntry, View, render
+from runner.sweep.charts import picture_plots
 from runner.sweep.plots import learning, picture_of
 from runner.sweep.results import Results, sections
+
+
+@dataclass(frozen=True)
+class PageSection:
+    """A section of the page."""
+
+    id: str
+    title: str
+    sentences: list[str]
+    grids: list[Grid]
+
+
+@dataclass(frozen=True)
+class SweepView(View):
+    """The page of a sweep."""
+
+    TEMPLATE: ClassVar = "sweep.html"
+    title: str
+    lead: list[str]
+    sections: list[PageSection]
+    parameters: list[Plot]
+    note: str
+    best: str | None
+    legend: list[LegendEntry]
+    plots: list[Plot]
+    footnote: str
+    moment: str
 
 
 def render_sweep(results: Results, recordings: Path) -> str:
     """Return the page.
 
     Args:
-        results: of the sweep.
+        results: the results of the sweep.
         recordings: the folder of its runs.
 
     Raises:
         MissingExtra: Jinja2 is not installed.
         RunnerError: no trial is finished yet, or a run cannot be read.
     """
-    require_packages()
     picture = picture_of(results)
     groups, panels = learning(results, recordings)
-    made = sections(results)
-    return (
-        templates()
-        .get_template("sweep.html")
-        .render(
-            title=made[0].title,
-            lead=made[0].sentences,
-            sections=[_section(each) for each in made],
-            parameters=[parameter_chart(picture, axis).svg() for axis in picture.axes],
-            parallel=parallel_chart(picture).svg(),
-            note=picture.footnote,
-            best=results.best_yaml,
-            legend=[(i % len(palette.SERIES), *_told(group)) for i, group in enumerate(groups)],
-            panels=panel_plots(panels, len(groups)),
-            footnote=footnote(groups),
-            moment=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
-        )
+    ranking, *others = sections(results)
+    view = SweepView(
+        title=ranking.title,
+        lead=ranking.sentences,
+        sections=[PageSection("ranking", "Ranking", [], ranking.grids), *map(_section, others)],
+        parameters=picture_plots(picture),
+        note=picture.footnote,
+        best=results.best_yaml,
+        legend=sweep_legend(groups),
+        plots=panel_plots(panels, len(groups)),
+        footnote=footnote(groups),
+        moment=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     )
+    return render(view)
 
 
-def _told(group: Group) -> tuple[str, str]:
-    """Return which trial a group's runs are of, and what there is to say of it."""
-    which, _, rest = group.described.partition(", ")
-    return which, rest
+def sweep_legend(groups: list[Group]) -> list[LegendEntry]:
+    """Return which trial each group of runs belongs to."""
+    parts = (group.described.partition(", ") for group in groups)
+    return [LegendEntry(trial, rest) for trial, _, rest in parts]
 
 
-def _section(section: Any) -> dict[str, Any]:
-    return {
-        "id": re.sub(r"\W+", "-", section.title.partition(":")[0].lower()),
-        "title": section.title,
-        "sentences": section.sentences,
-        "grids": section.grids,
-    }
+def _section(section: Section) -> PageSection:
+    anchor = re.sub(r"\W+", "-", section.title.partition(":")[0].lower())
+    return PageSection(anchor, section.title, section.sentences, section.grids)

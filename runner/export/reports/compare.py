@@ -4,76 +4,65 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 from runner.analysis.compare import Comparison, MetricResult
 from runner.analysis.compare.sections import EXPLANATION, in_short, metric_section
 from runner.analysis.groups import Group
 from runner.analysis.sections import Grid
-from runner.drawing import palette
 from runner.export.plots.comparisons import intervals_svg, letter, profile_svg
-from runner.export.plots.curves import footnote, plots_of
-from runner.export.reports.rendering import templates
-from runner.export.reports.report import require_packages
+from runner.export.plots.curves import Plot, footnote, plots_of
+from runner.export.reports.rendering import LegendEntry, View, render
 from runner.util.humanize import UNKNOWN
+
+
+class Figure(NamedTuple):
+    """A plot with its caption."""
+
+    svg: str
+    caption: str
+
+
+@dataclass(frozen=True)
+class ComparedMetric:
+    """A metric on the page."""
+
+    id: str
+    title: str
+    sentences: list[str]
+    grids: list[Grid]
+    figures: list[Figure]
+
+
+@dataclass(frozen=True)
+class ComparisonView(View):
+    """The page of a comparison."""
+
+    TEMPLATE: ClassVar = "compare.html"
+    title: str
+    lead: list[str]
+    notes: Sequence[str]
+    legend: list[LegendEntry]
+    metrics: list[ComparedMetric]
+    plots: list[Plot]
+    footnote: str
+    runs: Grid
+    moment: str
+    explanation: str = EXPLANATION
 
 
 def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
     """Return the page.
 
     Args:
-        comparison: of these groups.
-        groups: the same, for their learning curves.
+        comparison: the comparison of these groups.
+        groups: the groups, for their learning curves.
 
     Raises:
-        MissingExtra: Jinja2 or Matplotlib is not installed.
+        MissingExtra: Jinja2 is not installed.
     """
-    require_packages()
     labels = [group.label for group in groups]
-    return (
-        templates()
-        .get_template("compare.html")
-        .render(
-            title=" against ".join(labels) if len(labels) < 4 else f"{len(labels)} groups of runs compared",
-            lead=in_short(comparison),
-            notes=comparison.notes,
-            legend=[
-                (
-                    i % len(palette.SERIES),
-                    letter(i),
-                    _described(group),
-                )
-                for i, group in enumerate(groups)
-            ],
-            metrics=[_metric(metric, labels) for metric in comparison.metrics],
-            panels=plots_of(groups),
-            footnote=footnote(groups),
-            runs=_runs(groups),
-            explanation=EXPLANATION,
-            moment=comparison.moment,
-        )
-    )
-
-
-def _described(group: Group) -> str:
-    return f"{group.label}: {len(group.runs)} run{'s' if len(group.runs) > 1 else ''}"
-
-
-def _metric(metric: MetricResult, labels: list[str]) -> dict[str, Any]:
-    section = metric_section(metric, profile=False)
-    figures = [{"svg": intervals_svg(metric, labels), "caption": "Values"}]
-    if len(metric.thresholds) > 1:
-        figures.append({"svg": profile_svg(metric, labels), "caption": "Performance profile"})
-    return {
-        "id": "metric-" + re.sub(r"\W+", "-", metric.name),
-        "title": section.title,
-        "sentences": section.sentences,
-        "grids": section.grids,
-        "figures": figures if metric.groups else [],
-    }
-
-
-def _runs(groups: Sequence[Group]) -> Grid:
     rows = [
         (
             run.run_id,
@@ -85,4 +74,28 @@ def _runs(groups: Sequence[Group]) -> Grid:
         for i, group in enumerate(groups)
         for run in group.runs
     ]
-    return Grid(("run", "group", "name", "seed", "state"), rows)
+    return render(
+        ComparisonView(
+            title=" against ".join(labels) if len(labels) < 4 else f"{len(labels)} groups of runs compared",
+            lead=in_short(comparison),
+            notes=comparison.notes,
+            legend=[
+                LegendEntry(letter(i), f"{group.label}: {len(group.runs)} run{'s'[: len(group.runs) - 1]}")
+                for i, group in enumerate(groups)
+            ],
+            metrics=[_metric(metric, labels) for metric in comparison.metrics],
+            plots=plots_of(groups),
+            footnote=footnote(groups),
+            runs=Grid(("run", "group", "name", "seed", "status"), rows),
+            moment=comparison.moment,
+        )
+    )
+
+
+def _metric(metric: MetricResult, labels: list[str]) -> ComparedMetric:
+    section = metric_section(metric, profile=False)
+    figures = [Figure(intervals_svg(metric, labels), "Values")] if metric.groups else []
+    if metric.groups and len(metric.thresholds) > 1:
+        figures.append(Figure(profile_svg(metric, labels), "Performance profile"))
+    anchor = "metric-" + re.sub(r"\W+", "-", metric.name)
+    return ComparedMetric(anchor, section.title, section.sentences, section.grids, figures)

@@ -1,7 +1,7 @@
-"""One recorded episode as arrays: what replay, film and notebook show of it.
+"""One recorded episode as arrays, for replays, films and notebooks.
 
-Frame k is the state after k steps; with it go the step that led there and the Q-values of what is chosen
-there next. So an episode of T steps has T + 1 frames.
+Frame k is the state after k steps, with the step that led there and the Q-values of the next choice. So an
+episode of T steps has T + 1 frames.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_after, evaluations_of
+from runner.drawing import svg
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import (
     action_names,
@@ -31,25 +32,25 @@ from runner.recording.reader import Recording
 from runner.replay.checks import check_steps
 from runner.replay.tables import TableReplay, tables_at
 
-MOST_STEPS: Final = 1000
+MAX_STEPS: Final = 1000
 """Steps of an episode that a page shows; the page says so where an episode has more."""
-MOST_VALUES: Final = 6
+MAX_VALUES: Final = 6
 """Q-values of a state that a page shows: the highest, and that of the action taken."""
 
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """A recorded episode; arrays of its T shown steps, and of T + 1 states."""
+    """A part of a recorded episode: arrays of T steps, and of T + 1 states."""
 
     title: str
     phase: str
     number: int
     length: int
-    """Steps it has, of which T are here."""
+    """Steps of the whole episode."""
     total: float
-    """What the rewards of all of them sum to."""
+    """Sum of the rewards of the whole episode."""
     ended: str
-    """How it ended: `success`, `terminated`, `truncated`, `reset` before its end, or `cut off`."""
+    """`success`, `terminated`, `truncated`, `reset` (before its end) or `cut off`."""
     states: NDArray[np.int64]
     actions: NDArray[np.int64]
     rewards: NDArray[np.float64]
@@ -57,33 +58,33 @@ class Episode:
     events: NDArray[np.int64]
     explored: NDArray[np.int64]
     values: tuple[NDArray[np.float64], ...]
-    """For each learner the Q-values in the first T states, [T, actions]; none where they cannot be had."""
+    """For each learner the Q-values in the first T states, [T, actions]; empty if they are unknown."""
     names: tuple[str, ...] = ()
-    """Why it is shown."""
+    """Reasons for showing it, such as `best trial`."""
     first: int = 0
-    """Steps before those that are here."""
+    """Steps of the episode before this part."""
     before: tuple[float, ...] = ()
-    """What each learner's rewards in them sum to; nothing where there are none."""
+    """Sum of each learner's rewards in them; empty if there are none."""
 
     @property
     def steps(self) -> int:
-        """The steps that are here."""
+        """Number of steps of this part."""
         return len(self.actions)
 
     def called(self, name: str) -> Episode:
-        """Return it with one more name before its title: `best trial`."""
+        """Return it with one more reason for showing it, such as `best trial`."""
         return replace(self, names=(*self.names, name))
 
     @property
     def heading(self) -> str:
-        """Its names and its title: `best trial: trial 3 of ...`."""
+        """Its reasons and its title: `best trial: trial 3 of ...`."""
         names = " and ".join(self.names)
         text = f"{names}: {self.title}" if names else self.title
         return text[0].upper() + text[1:]
 
     @property
     def description(self) -> str:
-        """Length, end and return in words, and how many of its steps are here if not all are."""
+        """Length, end and return in words, and the number of steps if these are not all."""
         part = "" if self.steps == self.length else f" Shown are the first {self.steps:,} steps."
         return self.outcome + part
 
@@ -96,21 +97,26 @@ class Episode:
         return f"{self.length:,} steps, {ended}. Rewards sum to {self.total:g}."
 
 
-def training_episode(recording: Recording, number: int, most: int = MOST_STEPS, first: int = 0) -> Episode:
-    """Return a training episode, counted from 0, also one that never ended: `most` steps from `first` on.
+def training_episode(recording: Recording, number: int, limit: int = MAX_STEPS, first: int = 0) -> Episode:
+    """Return at most `limit` steps of a training episode, counted from 0, even if it never ended.
 
     Raises:
         RecordingError: there is no such episode, or no steps.
     """
     require_steps(recording, "show")
     title = f"training episode {number:,}"
-    return _episode(recording, "train", number, title, range(first, first + most))
+    return _episode(recording, "train", number, title, range(first, first + limit))
 
 
-def trial(recording: Recording, after: int, number: int, most: int = MOST_STEPS, first: int = 0) -> Episode:
-    """Return a trial, counted from 0, of the evaluation after so many training episodes.
+def trial(recording: Recording, after: int, number: int, limit: int = MAX_STEPS, first: int = 0) -> Episode:
+    """Return at most `limit` steps of a trial, counted from 0.
 
-    It is `most` of its steps, from `first` on.
+    Args:
+        recording: the run.
+        after: training episodes before the evaluation.
+        number: the trial.
+        limit: the largest number of steps.
+        first: the first step.
 
     Raises:
         RecordingError: there is no such evaluation or trial, or no steps.
@@ -119,7 +125,7 @@ def trial(recording: Recording, after: int, number: int, most: int = MOST_STEPS,
     where = str(recording.path)
     evaluation = evaluation_after(evaluations_of(recording), after, where)
     index = evaluation.trial(number, where)
-    shown = range(first, first + most)
+    shown = range(first, first + limit)
     return _episode(recording, "eval", index, trial_in_words(after, number), shown, evaluation.train_step)
 
 
@@ -134,7 +140,7 @@ def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
 
 
 def deeds_in_words(mdp: Mdp) -> list[str]:
-    """Return the words of every joint action, saying whose: `taxi 1 south, taxi 2 pickup`."""
+    """Return every joint action in words, with its agents: `taxi 1 south, taxi 2 pickup`."""
     words = [str(word) for word in actions_in_words(mdp)]
     if len(mdp.agents) < 2 or action_names(mdp) is None:
         return words
@@ -161,8 +167,8 @@ def typical_trial(recording: Recording) -> tuple[int, int]:
 def default_trial(recording: Recording) -> tuple[int, int] | None:
     """Return the trial to show if the user names none: training episodes before it, and its number.
 
-    It is the typical trial of the last whole evaluation. A loop does not say how many trials an evaluation
-    has: there it is the first trial after the most training episodes. None if there is no such trial.
+    It is the typical trial of the last whole evaluation. In a loop, where the number of trials of an
+    evaluation is unknown, it is the first trial after the last training. None if there is no such trial.
     """
     if recording.is_job:
         return typical_trial(recording) if last_whole_evaluation(recording) is not None else None
@@ -176,10 +182,10 @@ def last_episode(recording: Recording) -> int:
 
 
 def last_whole_evaluation(recording: Recording) -> int | None:
-    """Return the training episodes before the last evaluation all of whose trials are there.
+    """Return the training episodes before the last evaluation whose trials were all recorded.
 
-    A recording that was cut off may have an evaluation's metrics without its trials. A loop has none: where
-    its evaluations end nobody said.
+    A recording that was cut off may have an evaluation's metrics without its trials. None for a loop, where
+    the end of an evaluation is unknown.
     """
     if not recording.is_job:
         return None
@@ -193,13 +199,13 @@ def last_whole_evaluation(recording: Recording) -> int | None:
     return None
 
 
-def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[str, Any]:
-    """Return what a page needs to show episodes, as JSON can hold it: lists of numbers, words once.
+def payload(recording: Recording, episodes: list[Episode], drawing: svg.Drawing | None) -> dict[str, Any]:
+    """Return the data of a replay as JSON values: lists of numbers, with each text once.
 
     Args:
         recording: the run.
-        episodes: which.
-        places: from states to places as `svg.Drawing.places` gives them; None without a scene.
+        episodes: episodes of the run.
+        drawing: the drawing of its scene; None without a scene.
     """
     mdp, agents = recording.mdp, recording.agents
     own = numbered_actions(mdp)
@@ -209,11 +215,9 @@ def payload(recording: Recording, episodes: list[Episode], places: Any) -> dict[
         "choices": [joint] if len(agents) == 1 else own,
         "learners": [spoken(agent) for agent in agents],
         "events": [event_in_words(name) for name in mdp.event_names],
-        "episodes": [_packed(mdp, episode, places) for episode in episodes],
+        "episodes": [_packed(mdp, episode, drawing) for episode in episodes],
+        "trail": svg.TRAIL,
     }
-
-
-# --- inside -------------------------------------------------------------------------------------------
 
 
 def _episode(
@@ -257,9 +261,9 @@ def _end(recording: Recording, phase: str, number: int, last: np.void) -> str:
 def _values(
     recording: Recording, steps: NDArray[np.void], table_step: int
 ) -> tuple[NDArray[np.float64], ...]:
-    """Return each learner's Q-values in the states of steps; none where the tables cannot be had."""
+    """Return each learner's Q-values in the states of steps; empty if they are unknown."""
     if not recording.is_job:
-        return ()  # what somebody's own loop learned is not known
+        return ()
     try:
         if table_step >= 0:
             tables = tables_at(recording, table_step)
@@ -273,15 +277,18 @@ def _values(
     return tuple(rows[:, i, :width] for i, width in enumerate(widths))
 
 
-def _packed(mdp: Mdp, episode: Episode, places: Any) -> dict[str, Any]:
-    """Return an episode's arrays; what belongs to a state is there once."""
+def _packed(mdp: Mdp, episode: Episode, drawing: svg.Drawing | None) -> dict[str, Any]:
+    """Return the arrays of an episode; words and places of a state are stored once."""
     distinct, which = np.unique(episode.states, return_inverse=True)
+    places = []
+    if drawing is not None:
+        places = drawing.places(mdp, distinct).reshape(len(distinct), -1).tolist()
     chosen = [agent_actions(mdp, action) for action in episode.actions.tolist()]
     return {
         "title": episode.heading,
         "description": episode.description,
         "states": [str(word) for word in states_in_words(mdp)[distinct]],
-        "places": [] if places is None else places(distinct).reshape(len(distinct), -1).tolist(),
+        "places": places,
         "state": which.tolist(),
         "action": episode.actions.tolist(),
         "reward": [[_short(reward) for reward in row] for row in episode.rewards.tolist()],
@@ -306,9 +313,9 @@ def _rows(values: NDArray[np.float64], taken: list[int]) -> dict[str, Any]:
     which: list[int] = []
     packed: list[list[list[Any]]] = []
     for row, action in zip(values, taken, strict=True):
-        best = np.argsort(-row, kind="stable")[:MOST_VALUES].tolist()
+        best = np.argsort(-row, kind="stable")[:MAX_VALUES].tolist()
         shown = best if action in best else [*best[:-1], action]
-        if len(row) <= MOST_VALUES:
+        if len(row) <= MAX_VALUES:
             shown = sorted(shown)
         pairs = [[int(choice), _short(float(row[choice]))] for choice in shown]
         key = str(pairs)
@@ -320,6 +327,6 @@ def _rows(values: NDArray[np.float64], taken: list[int]) -> dict[str, Any]:
 
 
 def _short(value: float) -> float | int:
-    """Return a value rounded to five significant digits, as the page says."""
+    """Round a value to five significant digits."""
     rounded = float(f"{value:.5g}")
     return int(rounded) if rounded == int(rounded) else rounded

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 
 from runner.drawing import palette, svg, svg_maps
 from runner.recording.metrics import METRICS
@@ -30,6 +30,30 @@ class View:
     TEMPLATE: ClassVar[str]
 
 
+class LegendEntry(NamedTuple):
+    """The line of a legend that explains the colour of its place."""
+
+    letter: str
+    """What stands for it in text and plots; may be empty."""
+    text: str
+
+
+class Link(NamedTuple):
+    """A link of a page."""
+
+    text: str
+    address: str
+
+
+def partials() -> Any:
+    """Return the macros of `parts.html`, which reports and pages share, as functions that return HTML.
+
+    Raises:
+        MissingExtra: Jinja2 is not installed.
+    """
+    return templates().get_template("parts.html").module
+
+
 def render(view: View) -> str:
     """Return the page of a report.
 
@@ -39,10 +63,10 @@ def render(view: View) -> str:
     return fill(templates(), view)
 
 
-def fill(environment: Environment, view: View) -> str:
-    """Return the HTML of a view."""
+def fill(environment: Environment, view: View, **shared: Any) -> str:
+    """Return the HTML of a view, with values that all views of an environment share."""
     values = {field.name: getattr(view, field.name) for field in fields(view)}
-    return environment.get_template(view.TEMPLATE).render(values)
+    return environment.get_template(view.TEMPLATE).render(values, **shared)
 
 
 @functools.cache

@@ -1,8 +1,8 @@
 "use strict";
-// A replay: every frame is the elements of the picture moved to the places that came with the data.
+// A replay: a frame moves the elements of the picture to the places in the data.
 //
-// Frame k of an episode is the state after k steps. An episode's data may be a part of it: the frames
-// from `first` on, with the sums of the rewards before them; what else is wanted is then asked of `load`.
+// Frame k of an episode is the state after k steps. The data may be a part of an episode: the frames from `first`
+// on, with the sums of the rewards before them; `load` returns the part with another frame.
 class Replay {
   constructor(root, data, { load = null, moved = () => {} } = {}) {
     Object.assign(this, { root, data, load, moved, episode: null, timer: null, k: 0, pace: 350 });
@@ -34,18 +34,18 @@ class Replay {
 
   async show(k) {
     this.k = k = Math.min(this.length, Math.max(0, k));
-    const said = `step ${k} of ${this.length}`;
+    const count = `step ${k} of ${this.length}`;
     this.slider.value = k;
-    this.slider.setAttribute("aria-valuetext", said);
-    this.find(".count").textContent = said;
+    this.slider.setAttribute("aria-valuetext", count);
+    this.find(".count").textContent = count;
     if (!this.holds(k)) {
-      const wanted = await this.load(k);
+      const loaded = await this.load(k);
       if (this.k !== k) return;
-      this.episode = wanted;
+      this.episode = loaded;
     }
     const i = k - (this.episode.first ?? 0);
     if (this.episode.places.length) this.draw(i);
-    this.tell(i);
+    this.describe(i);
     this.choices(i);
     this.moved(k);
   }
@@ -67,28 +67,28 @@ class Replay {
     }
   }
 
-  tell(i) {
-    const { data, episode } = this, list = Replay.made("dl");
-    const say = (name, content) => {
-      list.append(Replay.made("dt", name));
-      const value = Replay.made("dd");
+  describe(i) {
+    const { data, episode } = this, list = Replay.make("dl");
+    const add = (name, content) => {
+      list.append(Replay.make("dt", name));
+      const value = Replay.make("dd");
       value.append(...(Array.isArray(content) ? content : [content]));
       list.append(value);
     };
-    say("State", episode.states[episode.state[i]]);
+    add("State", episode.states[episode.state[i]]);
     if (i > 0) {
-      say("Last action", data.actions[episode.action[i - 1]] + this.explorers(episode.explored[i - 1]));
-      say("Reward", this.several(episode.reward[i - 1]));
+      add("Last action", data.actions[episode.action[i - 1]] + this.explorers(episode.explored[i - 1]));
+      add("Reward", this.several(episode.reward[i - 1]));
       const events = data.events.filter((_, bit) => episode.event[i - 1] >>> bit & 1);
-      say("Events", events.length ? events.map((name) => Replay.made("span", name, "event")) : "none");
-      say("Sum so far", this.several(this.total(i)));
+      add("Events", events.length ? events.map((name) => Replay.make("span", name, "event")) : "none");
+      add("Sum so far", this.several(this.total(i)));
     } else {
-      say("Last action", "none yet: the episode begins");
+      add("Last action", "none yet: the episode begins");
     }
     this.find(".caption").replaceChildren(list);
   }
 
-  // Bit i of a step's mask is learner i: whose part of the action was chosen at random.
+  // Bit i of a step's mask: learner i chose its part of the action at random.
   explorers(mask) {
     const { learners } = this.data, who = learners.filter((_, learner) => mask >>> learner & 1);
     if (!who.length) return "";
@@ -110,29 +110,29 @@ class Replay {
   choices(i) {
     const { data, episode } = this;
     const parts = episode.values.map((table, learner) => {
-      const box = Replay.made("div");
+      const box = Replay.make("div");
       if (i >= table.row.length) return box;
       const rows = table.rows[table.row[i]], taken = table.taken[i];
       const names = data.choices.length > 1 ? data.choices[learner] : data.choices[0];
       const who = data.learners.length > 1 ? data.learners[learner] : "Next action";
-      const title = Replay.made("h4", who + ": Q-values here ");
+      const title = Replay.make("h4", who + ": Q-values here ");
       const most = rows.length < table.of ? `${rows.length} of ${table.of} actions; ` : "";
-      title.append(Replay.made("small", `(${most}bars from the lowest here to the highest)`));
+      title.append(Replay.make("small", `(${most}bars from the lowest here to the highest)`));
       const values = rows.map((row) => row[1]), low = Math.min(...values), high = Math.max(...values);
-      const bars = Replay.made("ol");
+      const bars = Replay.make("ol");
       for (const [action, value] of rows) {
-        const item = Replay.made("li", undefined, action === taken ? "taken" : "");
-        const bar = Replay.made("span"), fill = Replay.made("i");
+        const item = Replay.make("li", undefined, action === taken ? "taken" : "");
+        const bar = Replay.make("span"), fill = Replay.make("i");
         fill.style.width = `${high > low ? 4 + 96 * (value - low) / (high - low) : 4}%`;
         bar.append(fill);
-        item.append(Replay.made("span", (action === taken ? "\u25b8 " : "") + names[action]), bar, Replay.made("b", String(value).replace("-", "\u2212")));
+        item.append(Replay.make("span", (action === taken ? "\u25b8 " : "") + names[action]), bar, Replay.make("b", String(value).replace("-", "\u2212")));
         bars.append(item);
       }
       box.append(title, bars);
       return box;
     });
-    if (i + (episode.first ?? 0) === this.length) parts.push(Replay.made("p", "The last step shown."));
-    else if (!episode.values.length) parts.push(Replay.made("p", "Next action: " + data.actions[episode.action[i]]));
+    if (i + (episode.first ?? 0) === this.length) parts.push(Replay.make("p", "The last step shown."));
+    else if (!episode.values.length) parts.push(Replay.make("p", "Next action: " + data.actions[episode.action[i]]));
     this.find(".choice").replaceChildren(...parts);
   }
 
@@ -163,7 +163,7 @@ class Replay {
     }, this.pace);
   }
 
-  static made(tag, text, name) {
+  static make(tag, text, name) {
     const element = document.createElement(tag);
     if (text !== undefined) element.textContent = text;
     if (name) element.className = name;
@@ -173,7 +173,7 @@ class Replay {
   static signed(value) { return (value > 0 ? "+" : "") + String(value).replace("-", "\u2212"); }
 }
 
-// A report: its episodes stand in the page.
+// A report contains its episodes.
 for (const root of document.querySelectorAll(".replay[data-replay]")) {
   const data = JSON.parse(document.getElementById(root.dataset.replay).textContent);
   const replay = new Replay(root, data), choose = root.querySelector(".episode");

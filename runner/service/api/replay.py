@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel
 
-from runner.service import played
+from runner.service import fragments
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.problems import answers
 
@@ -122,7 +122,7 @@ async def part_of(
     """
     key = ("replay part", recording_state(run), which, start, steps)
     return await cache.get_or_await(
-        key, lambda: processes(played.part, run.recording, which, start, steps), LONG
+        key, lambda: processes(fragments.episode_part, run.recording, which, start, steps), LONG
     )
 
 

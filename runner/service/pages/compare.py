@@ -1,93 +1,167 @@
-"""Runs against each other: what differs, where they diverge, both replays in step, their Q-tables."""
+"""Comparisons of runs: their differences, where they diverge, both replays in step, their Q-tables."""
 
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any, Final
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.groups import flat_config
 from runner.analysis.step_reference import episode_reference, parse_step_reference, step_reference
+from runner.drawing import svg
 from runner.errors import RunnerError
+from runner.export.reports.rendering import View
 from runner.recording.metrics import METRICS
+from runner.recording.reader import open_recording
 from runner.runs.run import Run
-from runner.service import played
+from runner.service import fragments
+from runner.service.addresses import after_step, episode_in_words, episode_path, link
 from runner.service.api.comparing import found_runs
 from runner.service.api.replay import LONG
 from runner.service.dependencies import CacheOf, CatalogueOf, ProcessesOf, timed_recording_state
-from runner.service.pages.frame import head_of, is_loop, last_evaluation
-from runner.service.pages.rendering import link, page, picture_address
-from runner.service.pages.step_address import (
-    after_step,
-    episode_in_words,
-    episode_place,
-)
+from runner.service.pages.frame import RunHead, head_of, is_loop, last_evaluation
+from runner.service.pages.rendering import page
 from runner.util import humanize
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
 
 TABS: Final = (
     ("", "Overview"),
-    ("/divergence", "Where they part"),
+    ("/divergence", "Where they diverge"),
     ("/replay", "Replays in step"),
     ("/tables", "Q-tables"),
 )
-MOST: Final = 12
+MAX_RUNS: Final = 12
 """Runs that a page compares."""
 Names = Annotated[list[str] | None, Query(max_length=100)]
+Rows = list[tuple[str, list[str]]]
+"""Rows of a table: a name, and the value of each run."""
+
+
+@dataclass(frozen=True)
+class ComparedRun:
+    """A run in a comparison."""
+
+    head: RunHead
+    letter: str
+    label: str
+    number: int
+    """Number of its colour."""
+
+
+@dataclass(frozen=True)
+class Compared:
+    """The head of every page of a comparison."""
+
+    runs: list[ComparedRun]
+    tabs: list[tuple[str, str, str]]
+    """Path, title and address."""
+    here: str
+
+    @property
+    def charts(self) -> list[dict[str, str]]:
+        """The runs, as `charts.js` reads them."""
+        return [{"id": run.head.id, "label": run.label} for run in self.runs]
+
+
+@dataclass(frozen=True)
+class CompareView(View):
+    """A page of a comparison."""
+
+    compared: Compared
+
+
+@dataclass(frozen=True)
+class OverviewView(CompareView):
+    """The settings and results of runs, and their curves."""
+
+    TEMPLATE: ClassVar = "compare_overview.html"
+    differing: Rows
+    results: Rows
+    same: bool
+    """Whether the content of all runs is the same."""
+
+
+@dataclass(frozen=True)
+class DivergenceView(CompareView):
+    """The first step that differs."""
+
+    TEMPLATE: ClassVar = "compare_divergence.html"
+    lead: str
+    notes: list[str]
+    body: str
+
+
+@dataclass(frozen=True)
+class TablesView(CompareView):
+    """The difference of the Q-tables."""
+
+    TEMPLATE: ClassVar = "compare_tables.html"
+    body: str
+
+
+@dataclass(frozen=True)
+class ReplaysView(CompareView):
+    """An episode of two runs, in step."""
+
+    TEMPLATE: ClassVar = "compare_replay.html"
+    sources: list[str]
+    scenes: list[str]
+    episode: str
+    prefix: str
+    """The reference of the episode, without its step."""
+    t: int
+    before: str
+    after: str
+    base: str
 
 
 @router.get("")
 async def overview(request: Request, catalogue: CatalogueOf, run: Names = None) -> Response:
-    """Show what differs between runs, and their curves over each other."""
-    return await run_in_threadpool(_overview, request, await _chosen(catalogue, run))
+    """Show the differences of runs, and their curves in common plots."""
+    runs = await _chosen(catalogue, run)
 
+    def show() -> Response:
+        settings = [{**({"seed": str(each.seed)} if each.has_seed else {}), **_flat(each)} for each in runs]
+        rows = [
+            (key, [each.get(key, humanize.UNKNOWN) for each in settings])
+            for key in dict.fromkeys(key for each in settings for key in each)
+        ]
+        digests = {each.summary.content_digest for each in runs}
+        view = OverviewView(
+            _compared(runs, ""),
+            differing=[(key, values) for key, values in rows if len(set(values)) > 1],
+            results=_results(runs),
+            same=len(digests) == 1 and None not in digests,
+        )
+        return page(request, view)
 
-def _overview(request: Request, found: list[Run]) -> Response:
-    settings = [{**({"seed": str(each.seed)} if each.has_seed else {}), **_flat(each)} for each in found]
-    keys = list(dict.fromkeys(key for each in settings for key in each))
-    told = [(key, [each.get(key, humanize.UNKNOWN) for each in settings]) for key in keys]
-    return page(
-        request,
-        "compare_overview.html",
-        **_head(found, ""),
-        differing=[(key, values) for key, values in told if len(set(values)) > 1],
-        results=_results(found),
-        same=_same_content(found),
-    )
+    return await run_in_threadpool(show)
 
 
 @router.get("/divergence")
 async def divergence(
     request: Request, catalogue: CatalogueOf, cache: CacheOf, processes: ProcessesOf, run: Names = None
 ) -> Response:
-    """Show the first step at which two runs differ, and why."""
-    found = _two(await _chosen(catalogue, run))
-    told = await _difference(found, cache, processes)
-    return await run_in_threadpool(
-        page,
-        request,
-        "compare_divergence.html",
-        **_head(found, "/divergence"),
-        told=told,
-        spot=step_reference,
-        after=after_step,
-    )
+    """Show the first step at which two runs differ, and the cause."""
+    runs = _two(await _chosen(catalogue, run))
+    found = await _difference(runs, cache, processes)
+    compared = _compared(runs, "/divergence")
+    view = DivergenceView(compared, found["lead"], found["notes"], found["body"])
+    return await run_in_threadpool(page, request, view)
 
 
 @router.get("/tables")
 async def tables(
     request: Request, catalogue: CatalogueOf, cache: CacheOf, processes: ProcessesOf, run: Names = None
 ) -> Response:
-    """Show how far the Q-tables of two runs are apart."""
-    found = _two(await _chosen(catalogue, run))
-    told = (await _difference(found, cache, processes))["tables"]
-    for figure in told["figures"]:
-        if "high" not in figure:  # Matplotlib writes styles into its elements, which the policy forbids here
-            figure["address"] = picture_address(figure["svg"])
-    return await run_in_threadpool(page, request, "compare_tables.html", **_head(found, "/tables"), told=told)
+    """Show the difference of the Q-tables of two runs."""
+    runs = _two(await _chosen(catalogue, run))
+    body = (await _difference(runs, cache, processes))["tables"]
+    return await run_in_threadpool(page, request, TablesView(_compared(runs, "/tables"), body))
 
 
 @router.get("/replay")
@@ -99,127 +173,100 @@ async def replay(
     run: Names = None,
     at: Annotated[str, Query(max_length=60)] = "",
 ) -> Response:
-    """Show an episode of two runs, in step; the one in which they diverge unless another is asked for."""
-    found = _two(await _chosen(catalogue, run))
-    spot = parse_step_reference(at) if at else ()
-    if not spot:
-        divergences = (await _difference(found, cache, processes))["divergences"]
-        spot = after_step(divergences[0]["at"]) if divergences else (0, 0)
-    return await run_in_threadpool(_replays, request, found, spot)
+    """Show an episode of two runs, in step; by default the one in which they diverge."""
+    runs = _two(await _chosen(catalogue, run))
+    step = parse_step_reference(at) if at else ()
+    if not step:
+        first = (await _difference(runs, cache, processes))["first_step"]
+        step = after_step(first) if first else (0, 0)
+    names = [each.run_id for each in runs]
 
+    def neighbour(by: int) -> str:
+        other = [*step[:-2], step[-2] + by, 0]
+        return link("/compare/replay", {"run": names, "at": step_reference(other)}) if other[-2] >= 0 else ""
 
-def _replays(request: Request, found: list[Run], spot: tuple[int, ...]) -> Response:
-    """Return the page of both replays; their recordings are read for the pictures."""
-    around = [_replay_link(found, spot, by) for by in (-1, 1)]
-    return page(
-        request,
-        "compare_replay.html",
-        **_head(found, "/replay"),
-        sources=[f"/api/v1/runs/{each.run_id}/replay/{episode_place(spot)}" for each in found],
-        episode=episode_in_words(spot),
-        spot=spot,
-        before=around[0],
-        after=around[1],
-        scenes=[_still(each) for each in found],
-        base=link("/compare/replay", {"run": [each.run_id for each in found]}),
-        prefix=episode_reference(spot),
-    )
+    def show() -> Response:
+        view = ReplaysView(
+            _compared(runs, "/replay"),
+            sources=[f"/api/v1/runs/{name}/replay/{episode_path(step)}" for name in names],
+            scenes=[_scene(each) for each in runs],
+            episode=episode_in_words(step),
+            prefix=episode_reference(step),
+            t=step[-1],
+            before=neighbour(-1),
+            after=neighbour(1),
+            base=link("/compare/replay", {"run": names}),
+        )
+        return page(request, view)
 
-
-# --- inside -------------------------------------------------------------------------------------------
+    return await run_in_threadpool(show)
 
 
 async def _chosen(catalogue: CatalogueOf, names: list[str] | None) -> list[Run]:
-    """Return the runs that are compared.
+    """Return the runs to compare.
 
     Raises:
         RunnerError: there are fewer than two of them, or too many.
     """
     names = list(dict.fromkeys(names or []))
-    if not 2 <= len(names) <= MOST:
-        raise RunnerError(f"found {len(names)} runs, expected 2 to {MOST}: select them in the table of runs.")
+    if not 2 <= len(names) <= MAX_RUNS:
+        raise RunnerError(
+            f"found {len(names)} runs, expected 2 to {MAX_RUNS}: select them in the table of runs."
+        )
     return await found_runs(catalogue, names)
 
 
-def _two(found: list[Run]) -> list[Run]:
-    if len(found) != 2:
-        raise RunnerError(f"found {len(found)} runs, expected two: only two are compared step by step.")
+def _two(runs: list[Run]) -> list[Run]:
+    if len(runs) != 2:
+        raise RunnerError(f"found {len(runs)} runs, expected two: only two are compared step by step.")
+    return runs
+
+
+async def _difference(runs: list[Run], cache: CacheOf, processes: ProcessesOf) -> dict[str, Any]:
+    """Return the difference of two runs, see `fragments.difference`."""
+    key = ("difference", *map(timed_recording_state, runs))
+    body = await cache.get_or_await(key, lambda: processes(fragments.difference, *runs), LONG)
+    found: dict[str, Any] = await run_in_threadpool(json.loads, body)
     return found
 
 
-async def _difference(found: list[Run], cache: CacheOf, processes: ProcessesOf) -> dict[str, Any]:
-    """Return in what two runs differ, as `played.difference` has it."""
-    key = ("difference", *map(timed_recording_state, found))
-    body = await cache.get_or_await(key, lambda: processes(played.difference, *found), LONG)
-    told: dict[str, Any] = await run_in_threadpool(json.loads, body)
-    return told
-
-
-def _head(found: list[Run], here: str) -> dict[str, Any]:
-    names = [each.run_id for each in found]
-    return {
-        "runs": [
-            {**head_of(each), "letter": _letter(i), "number": i % 7, "label": f"{_letter(i)}: {each.name}"}
-            for i, each in enumerate(found)
-        ],
-        "tabs": [(tab, name, link(f"/compare{tab}", {"run": names})) for tab, name in TABS]
-        if len(found) == 2
-        else [],
-        "here": here,
-    }
-
-
-def _letter(number: int) -> str:
-    return chr(ord("A") + number)
+def _compared(runs: list[Run], here: str) -> Compared:
+    names = [each.run_id for each in runs]
+    tabs = [(tab, title, link(f"/compare{tab}", {"run": names})) for tab, title in TABS]
+    letters = [chr(ord("A") + i) for i in range(len(runs))]
+    compared = [
+        ComparedRun(head_of(each), letter, f"{letter}: {each.name}", i % 7)
+        for i, (each, letter) in enumerate(zip(runs, letters, strict=True))
+    ]
+    return Compared(compared, tabs if len(runs) == 2 else [], here)
 
 
 def _flat(run: Run) -> dict[str, str]:
     return {key: str(value) for key, value in flat_config(run.file.config).items()}
 
 
-def _results(found: list[Run]) -> list[tuple[str, list[str]]]:
-    """Return what came of runs, a row a measure."""
-    last = [last_evaluation(each) for each in found]
-    measures = {
-        metric.heading: [each.values.get(metric.name) for each in last]
-        for metric in METRICS
-        if not metric.per_agent or any(map(is_loop, found))
-    }
+def _results(runs: list[Run]) -> Rows:
+    """Return the results of runs, a row for each measure."""
+    last = [last_evaluation(each) for each in runs]
+    metrics = [metric for metric in METRICS if not metric.per_agent or any(map(is_loop, runs))]
+    digests = [str(each.summary.content_digest or humanize.UNKNOWN)[:16] for each in runs]
     return [
-        ("Status", [each.status for each in found]),
+        ("Status", [each.status for each in runs]),
         *(
-            (f"{heading.capitalize()} in the last evaluation", [humanize.number(value) for value in values])
-            for heading, values in measures.items()
+            (
+                f"{metric.heading.capitalize()} in the last evaluation",
+                [humanize.number(each.values.get(metric.name)) for each in last],
+            )
+            for metric in metrics
         ),
-        ("Training episodes", [humanize.number(each.summary.episodes, 0) for each in found]),
-        ("Steps of training", [humanize.number(each.summary.train_steps, 0) for each in found]),
-        (
-            "Content digest",
-            [str(each.summary.content_digest or humanize.UNKNOWN)[:16] for each in found],
-        ),
+        ("Training episodes", [humanize.number(each.summary.episodes, 0) for each in runs]),
+        ("Training steps", [humanize.number(each.summary.train_steps, 0) for each in runs]),
+        ("Content digest", digests),
     ]
 
 
-def _same_content(found: list[Run]) -> bool:
-    digests = {each.summary.content_digest for each in found}
-    return len(digests) == 1 and None not in digests
-
-
-def _replay_link(found: list[Run], spot: tuple[int, ...], by: int) -> str:
-    """Return the address of the episode before or after one; nothing before the first."""
-    if spot[-2] + by < 0:
-        return ""
-    other = [*spot[:-2], spot[-2] + by, 0]
-    return link("/compare/replay", {"run": [each.run_id for each in found], "at": step_reference(other)})
-
-
-def _still(run: Run) -> str:
-    """Return the picture of a run's grid with everything at its first cell; the script moves it."""
-    from runner.drawing import svg
-    from runner.recording.reader import open_recording
-
+def _scene(run: Run) -> str:
+    """Return the picture of a run's grid, whose things the script moves to their places."""
     with open_recording(run.recording) as recording:
         scene = recording.environment.get("scene")
-    if scene is None:
-        return ""
-    return svg.Drawing(scene).frame(None, f"The grid of {run.name}", style="")
+    return "" if scene is None else svg.Drawing(scene).frame(None, f"The grid of {run.name}", style="")

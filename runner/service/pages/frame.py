@@ -1,11 +1,13 @@
-"""What stands around every page of a run."""
+"""The head of every page of a run, and the last results of loops."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 from runner.analysis.evaluations import loop_summary
 from runner.errors import RecordingError
+from runner.export.reports.rendering import View
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics
 from runner.runs.run import Run
@@ -21,22 +23,40 @@ TABS: Final = (
 )
 
 
-def framed(run: Run, here: str) -> dict[str, Any]:
-    """Return what every page of a run has."""
-    return {"run": head_of(run), "tabs": TABS, "here": here}
+@dataclass(frozen=True)
+class RunHead:
+    """The facts of a run that all of its pages show."""
+
+    id: str
+    name: str
+    seed: int | None
+    status: str
+    created: str
+    tags: tuple[str, ...]
+    note: str
+    tabs: tuple[tuple[str, str], ...] = TABS
 
 
-def head_of(run: Run) -> dict[str, Any]:
-    """Return what the pages say of a run above all else."""
-    return {
-        "id": run.run_id,
-        "name": run.name,
-        "seed": run.seed if run.has_seed else None,
-        "status": run.status,
-        "created": run.created.isoformat(),
-        "tags": run.tags,
-        "note": run.note,
-    }
+@dataclass(frozen=True)
+class RunView(View):
+    """A page of a run."""
+
+    run: RunHead
+    here: str
+    """Path of its tab."""
+
+
+def head_of(run: Run) -> RunHead:
+    """Return the facts of a run that all of its pages show."""
+    return RunHead(
+        id=run.run_id,
+        name=run.name,
+        seed=run.seed if run.has_seed else None,
+        status=run.status,
+        created=run.created.isoformat(),
+        tags=run.tags,
+        note=run.note,
+    )
 
 
 def is_loop(run: Run) -> bool:
@@ -45,7 +65,7 @@ def is_loop(run: Run) -> bool:
 
 
 def loop_results(run: Run) -> dict[str, Any]:
-    """Return the last results of a loop as `loop_summary` does; none if the recording cannot be read."""
+    """Return the last results of a loop as `loop_summary` does; empty if the recording cannot be read."""
     try:
         with open_recording(run.recording) as recording:
             return loop_summary(recording)

@@ -1,19 +1,22 @@
-"""The queue of jobs, a job, and the uploads that are no runs yet."""
+"""The queue of jobs, a job, and the uploads that are not yet runs."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
-from runner.service.api.jobs import Number, queue_response, told
+from runner.export.reports.rendering import View
+from runner.service.addresses import Paging
+from runner.service.api.jobs import JobResponse, Number, QueueResponse, queue_response, told
 from runner.service.api.uploads import OwnerOf, UploadsOf, list_uploads
 from runner.service.dependencies import JobsOf
-from runner.service.pages.rendering import link, page
+from runner.service.pages.rendering import page
 
 if TYPE_CHECKING:
     from runner.service.jobs.pool import JobPool
@@ -22,50 +25,86 @@ if TYPE_CHECKING:
 router = APIRouter(prefix="/queue", include_in_schema=False)
 
 ROWS: Final = 50
-MOST_LINES: Final = 1000
+MAX_LINES: Final = 1000
 """Lines of a job's log that its page shows."""
+PageNumber = Annotated[int, Query(alias="page", ge=1, lt=10**6)]
+
+
+@dataclass(frozen=True)
+class ShownJob:
+    """A job with its progress."""
+
+    facts: JobResponse
+    share: float | None
+    """Share of the work that is done; None if it is unknown."""
+    progress: str
+    """The same in words, as `job.js` writes it."""
+
+
+@dataclass(frozen=True)
+class QueueRowsView(View):
+    """The part of the queue's page that changes."""
+
+    TEMPLATE: ClassVar = "queue_rows.html"
+    jobs: list[ShownJob]
+    status: QueueResponse
+    is_active: bool
+    """Whether a job is running or queued."""
+    paging: Paging
+
+
+@dataclass(frozen=True)
+class QueueView(QueueRowsView):
+    """The queue."""
+
+    TEMPLATE: ClassVar = "queue.html"
+    uploads: list[Any]
+
+
+@dataclass(frozen=True)
+class JobView(View):
+    """A job."""
+
+    TEMPLATE: ClassVar = "job.html"
+    job: ShownJob
+    log: list[Mapping[str, Any]]
+    place: int
+    """Number of the first event after the log."""
+    submitted: str
+    is_over: bool
+    seconds: float | None
 
 
 @router.get("")
 def queue(
-    request: Request,
-    jobs: JobsOf,
-    uploads: UploadsOf,
-    owner: OwnerOf,
-    number: Annotated[int, Query(alias="page", ge=1, lt=10**6)] = 1,
+    request: Request, jobs: JobsOf, uploads: UploadsOf, owner: OwnerOf, number: PageNumber = 1
 ) -> Response:
-    """Show the jobs, the newest first, and the uploads that are no runs yet."""
-    coming = [upload for upload in list_uploads(uploads, owner).uploads if upload.state != "stored"]
-    return page(request, "queue.html", uploads=coming[:ROWS], **_queue(jobs, number))
+    """Show the jobs, the newest first, and the uploads that are not yet runs."""
+    pending = [upload for upload in list_uploads(uploads, owner).uploads if upload.state != "stored"]
+    return page(request, QueueView(*_rows(jobs, number), pending[:ROWS]))
 
 
-@router.get("/standing")
-def queue_standing(
-    request: Request, jobs: JobsOf, number: Annotated[int, Query(alias="page", ge=1, lt=10**6)] = 1
-) -> Response:
-    """Return the jobs as a part of their page; 204 when none is under way."""
-    shown = _queue(jobs, number)
-    if not shown["active"]:
-        return Response(status_code=HTTPStatus.NO_CONTENT)
-    return page(request, "queue_rows.html", **shown)
+@router.get("/status")
+def queue_status(request: Request, jobs: JobsOf, number: PageNumber = 1) -> Response:
+    """Return the jobs as a part of their page; 204 if all are over."""
+    view = QueueRowsView(*_rows(jobs, number))
+    return page(request, view) if view.is_active else Response(status_code=HTTPStatus.NO_CONTENT)
 
 
 @router.get("/{number}")
 def job(request: Request, jobs: JobsOf, number: Number) -> Response:
-    """Show a job: how far it is, what it said, its runs."""
-    log, place = _log(jobs, number)
-    found = jobs.store.job(number)  # not older than its log: what comes behind that, the page's script hears
-    return page(
-        request,
-        "job.html",
+    """Show a job: its progress, its log, its runs."""
+    events, place = jobs.store.last_events(number, MAX_LINES)
+    found = jobs.store.job(number)  # read after its log: the script of the page receives later events
+    view = JobView(
         job=shown_job(found, jobs),
-        log=log,
+        log=[{"kind": event.kind, **event.data} for event in events],
         place=place,
         submitted=jobs.store.submitted(number),
-        runs=_runs(found, jobs),
         is_over=found.is_over,
         seconds=_seconds(found),
     )
+    return page(request, view)
 
 
 @router.post("/{number}/cancel")
@@ -77,66 +116,35 @@ def cancel(jobs: JobsOf, number: Number) -> Response:
 
 @router.post("/{number}/resume")
 def resume(jobs: JobsOf, number: Number) -> Response:
-    """Go on with a job."""
+    """Resume a job."""
     jobs.resume(number)
     return RedirectResponse(f"/queue/{number}", HTTPStatus.SEE_OTHER)
 
 
-# --- inside -------------------------------------------------------------------------------------------
-
-
-def _queue(jobs: JobPool, number: int) -> dict[str, Any]:
-    found = list(reversed(jobs.store.jobs()))
-    shown = found[(number - 1) * ROWS : number * ROWS]
-    return {
-        "jobs": [shown_job(job, jobs) for job in shown],
-        "standing": queue_response(jobs.status()),
-        "active": any(job.state in ("queued", "running") for job in found),
-        "page": number,
-        "pages": max(1, math.ceil(len(found) / ROWS)),
-        "turned": lambda to: link("/queue", {"page": to}),
-    }
-
-
-def shown_job(job: Job, jobs: JobPool) -> dict[str, Any]:
-    """Return what is shown of a job."""
-    facts = told(job, jobs).model_dump()
-    progress = facts["progress"] or {}
-    return facts | {"share": _share(job, progress), "said": _said(job, progress)}
-
-
-def _share(job: Job, progress: dict[str, Any]) -> float | None:
-    """Return how much of a job is done; None if nobody knows."""
-    if job.state != "running" or not progress:
-        return None
+def shown_job(job: Job, jobs: JobPool) -> ShownJob:
+    """Return a job with its progress."""
+    facts = told(job, jobs)
+    now = facts.progress
+    if not now or job.state != "running":
+        return ShownJob(facts, None, "")
     if job.kind == "sweep":
-        return float(progress["done"] / max(1, progress["runs"]))
-    own = progress["episode"] / max(1, progress["episodes"])
-    return float((progress["run"] - 1 + own) / progress["runs"])
+        share = now["done"] / max(1, now["runs"])
+        return ShownJob(facts, share, f"{now['done']:,} of {now['runs']:,} runs")
+    share = (now["run"] - 1 + now["episode"] / max(1, now["episodes"])) / now["runs"]
+    run = f", run {now['run']} of {now['runs']}" if now["runs"] > 1 else ""
+    return ShownJob(facts, share, f"{now['episode']:,} of {now['episodes']:,} episodes{run}")
 
 
-def _said(job: Job, progress: dict[str, Any]) -> str:
-    """Return how far a job is in words; `job.js` says the same."""
-    if job.state != "running" or not progress:
-        return ""
-    if job.kind == "sweep":
-        return f"{progress['done']:,} of {progress['runs']:,} runs"
-    run = f", run {progress['run']} of {progress['runs']}" if progress["runs"] > 1 else ""
-    return f"{progress['episode']:,} of {progress['episodes']:,} episodes{run}"
-
-
-def _log(jobs: JobPool, number: int) -> tuple[list[dict[str, Any]], int]:
-    """Return the last events of a job, and the place behind them."""
-    found, place = jobs.store.last_events(number, MOST_LINES)
-    return [{"kind": event.kind, **event.data} for event in found], place
+def _rows(jobs: JobPool, number: int) -> tuple[list[ShownJob], QueueResponse, bool, Paging]:
+    """Return the fields of `QueueRowsView`."""
+    newest_first = list(reversed(jobs.store.jobs()))
+    shown = [shown_job(job, jobs) for job in newest_first[(number - 1) * ROWS : number * ROWS]]
+    is_active = any(job.state in ("queued", "running") for job in newest_first)
+    return shown, queue_response(jobs.status()), is_active, Paging(number, len(newest_first), ROWS, "/queue")
 
 
 def _seconds(job: Job) -> float | None:
-    """Return how long a job took, from its first start; None if it is not over, or never started."""
+    """Return the duration of a job from its first start; None if it is not over, or never started."""
     if not job.is_over or not job.started or not job.ended:
         return None
     return (datetime.fromisoformat(job.ended) - datetime.fromisoformat(job.started)).total_seconds()
-
-
-def _runs(job: Job, jobs: JobPool) -> list[dict[str, Any]]:
-    return [{"seed": seed, "id": run_id} for seed, run_id in jobs.store.run_ids(job.number).items()]

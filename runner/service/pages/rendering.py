@@ -1,24 +1,25 @@
-"""Templates to answers: what every page has, numbers in words, and errors as pages."""
+"""Pages and the forms that they send: templates filled with typed views, also for errors."""
 
 from __future__ import annotations
 
-import base64
 import functools
-from collections.abc import Mapping
+import json
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from importlib.resources import files
-from typing import Any, Final
-from urllib.parse import urlencode
+from typing import Annotated, Any, ClassVar, Final
+from urllib.parse import parse_qsl, urlencode
 
 import jinja2
-from fastapi import Request, Response
+from fastapi import Depends, FastAPI, Request, Response
 from markupsafe import Markup
 
-from runner.drawing import palette
-from runner.export.reports.rendering import code
-from runner.recording.metrics import METRICS
+from runner.errors import RunnerError
+from runner.export.reports.rendering import TEMPLATES as REPORT_TEMPLATES
+from runner.export.reports.rendering import View, code, environment_of, fill
+from runner.service import problems
 from runner.service.pages import static
 from runner.util import humanize
 
@@ -30,102 +31,66 @@ SECTIONS: Final = (
     ("/submit", "Submit"),
     ("/disk", "Disk"),
 )
-
-
-@functools.cache
-def templates() -> jinja2.Environment:
-    """Return the templates of pages; those of reports are beside them."""
-    environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_source),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    environment.filters |= {
-        "number": humanize.number,
-        "size": humanize.size,
-        "duration": humanize.duration,
-        "age": _age,
-        "code": code,
-        "problem": _problem,
-        "count": lambda value: humanize.number(value, 0),
-        "sentence": lambda text: f"{text[:1].upper()}{text[1:]}{'' if text[-1:] in '.:' else '.'}",
-        "with_name": lambda value, name: (name, value),
-        "with_prefix": lambda value, prefix: f"{prefix}{value}",
-        "query": lambda values: urlencode(list(values), doseq=True),
-    }
-    environment.globals |= {"static": static.address, "sections": SECTIONS, "metrics": METRICS}
-    return environment
-
-
-def page(request: Request, template: str, status: HTTPStatus = HTTPStatus.OK, **context: Any) -> Response:
-    """Return a page.
-
-    Args:
-        request: which it answers.
-        template: its name.
-        status: of the answer.
-        context: what the template asks for.
-    """
-    body = render(request.url.path, template, viewer=viewer_of(request), **context)
-    return Response(body, status, media_type="text/html")
+MAX_FIELDS: Final = 100
+"""Fields of a form."""
 
 
 @dataclass(frozen=True)
 class Viewer:
-    """Who looks at a page, and so what it offers."""
+    """The user of a page, who decides what it offers."""
 
     name: str
-    """Of the token; empty where none is needed."""
+    """Name of the token; empty where none is needed."""
     can_write: bool
 
 
+@dataclass(frozen=True)
+class ProblemView(View):
+    """The page of an error."""
+
+    TEMPLATE: ClassVar = "problem.html"
+    title: str
+    message: str
+
+
+def page(request: Request, view: View, status: HTTPStatus = HTTPStatus.OK) -> Response:
+    """Return the page of a view as the response to a request."""
+    body = render(request.url.path, view, viewer_of(request))
+    return Response(body, status, media_type="text/html")
+
+
+def render(path: str, view: View, viewer: Viewer) -> bytes:
+    """Return the HTML of a page at a path."""
+    return fill(templates(), view, path=path, viewer=viewer).encode()
+
+
 def viewer_of(request: Request) -> Viewer:
-    """Return who looks at a page."""
+    """Return the user who sent a request."""
     token = getattr(request.state, "token", None)
     if token is None:
         return Viewer("", not request.app.state.settings.needs_token)
     return Viewer(token.name, token.can_write)
 
 
-def render(path: str, template: str, viewer: Viewer, **context: Any) -> bytes:
-    """Return the HTML of a page at a path."""
-    return templates().get_template(template).render(path=path, viewer=viewer, **context).encode()
-
-
-def link(path: str, values: Mapping[str, Any]) -> str:
-    """Return an address with these values, without those that are empty."""
-    kept = [(key, value) for key, value in values.items() if value not in ("", None, [], ())]
-    return f"{path}?{urlencode(kept, doseq=True)}" if kept else path
-
-
-def picture_address(picture: str) -> str:
-    """Return an SVG of a page as the address of a picture.
-
-    A picture knows nothing of the page's styles, so it gets the colours for light and dark of its own.
-    """
-    space = "" if "xmlns=" in picture[:300] else ' xmlns="http://www.w3.org/2000/svg"'
-    start, tag, rest = picture.partition(">")
-    start = start.replace("<svg", f"<svg{space}", 1)
-    body = f"{start}{tag}<style>{_picture_style()}</style>{rest}".encode()
-    return f"data:image/svg+xml;base64,{base64.b64encode(body).decode()}"
-
-
 @functools.cache
-def _picture_style() -> str:
-    return f"{palette.css_variables()} :root {{ color: var(--ink); }}"
-
-
-def _source(name: str) -> str | None:
-    for folder in (TEMPLATES, static.REPORT):
-        if (folder / name).is_file():
-            return (folder / name).read_text("utf-8")
-    return None
+def templates() -> jinja2.Environment:
+    """Return the templates of pages, and those of reports, whose partial templates they use."""
+    environment = environment_of((TEMPLATES, REPORT_TEMPLATES))
+    environment.filters |= {
+        "size": humanize.size,
+        "duration": humanize.duration,
+        "age": _age,
+        "problem": _problem,
+        "with_name": lambda value, name: (name, value),
+        "with_prefix": lambda value, prefix: f"{prefix}{value}",
+        "query": lambda values: urlencode(list(values), doseq=True),
+    }
+    environment.globals |= {"static": static.address, "sections": SECTIONS}
+    return environment
 
 
 def _problem(message: str) -> Markup:
-    """Return an error as HTML; what a caret points into is set in a fixed width, so that it points there."""
+    """Return an error as HTML; lines with a caret have a fixed width, so that it points at its place."""
     text, _, marked = message.partition("\n")
     if not marked.rstrip().endswith("^"):
         return Markup("<p>{}</p>").format(code(message))
@@ -133,6 +98,60 @@ def _problem(message: str) -> Markup:
 
 
 def _age(moment: datetime | str) -> str:
-    """Return how long ago a moment was, in words."""
+    """Return the time since a moment, in words."""
     then = datetime.fromisoformat(moment) if isinstance(moment, str) else moment
     return humanize.age((datetime.now(UTC) - then).total_seconds())
+
+
+async def form_of(request: Request) -> dict[str, str]:
+    """Return the fields of a form as text, with the line ends of files.
+
+    Raises:
+        RunnerError: the body is not a form.
+    """
+    body = await request.body()
+    try:
+        pairs = parse_qsl(
+            body.decode("ascii"), keep_blank_values=True, max_num_fields=MAX_FIELDS, errors="strict"
+        )
+    except ValueError as error:
+        raise RunnerError(f"body: found no form ({error}).") from error
+    return {name: value.replace("\r\n", "\n") for name, value in pairs}
+
+
+Form = Annotated[dict[str, str], Depends(form_of)]
+
+
+def message_of(error: RunnerError, request: Request) -> str:
+    """Return the message of an error for a page, the same as that of the API."""
+    return problems.error_body(error, request.app.state.settings).message
+
+
+def add_error_handlers(app: FastAPI) -> None:
+    """Respond to errors of pages with a page, instead of the JSON of the API."""
+
+    def with_page(handler: Any) -> Callable[[Request, Exception], Awaitable[Response]]:
+        async def respond(request: Request, error: Exception) -> Response:
+            return _error_page(request, await handler(request, error))
+
+        return respond
+
+    for kind, handler in list(app.exception_handlers.items()):
+        app.add_exception_handler(kind, with_page(handler))
+
+
+def refused(request: Request, error: RunnerError) -> Response:
+    """Return the response to a request that is refused before it is routed."""
+    return _error_page(request, problems.refused(request, error))
+
+
+def _error_page(request: Request, response: Response) -> Response:
+    """Return an error as a page, if a browser requested a page."""
+    if "text/html" not in request.headers.get("accept", "") or request.url.path.startswith("/api/"):
+        return response
+    status = HTTPStatus(response.status_code)
+    message = json.loads(bytes(response.body))["error"]["message"]
+    found = page(request, ProblemView(status.phrase.capitalize(), message), status)
+    headers = {key: value for key, value in response.headers.items() if not key.startswith("content-")}
+    found.headers.update(headers)
+    return found

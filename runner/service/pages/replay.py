@@ -3,38 +3,84 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple
 
+import numpy as np
 from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.step_reference import episode_reference
+from runner.drawing import svg
 from runner.errors import RunnerError
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import open_recording
 from runner.runs.run import Run
-from runner.service import played
+from runner.service import fragments
+from runner.service.addresses import episode_path
 from runner.service.api.replay import part_of
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
-from runner.service.pages.frame import framed
-from runner.service.pages.problems import message_of
-from runner.service.pages.rendering import page
-from runner.service.pages.step_address import episode_place
+from runner.service.pages.frame import RunView, head_of
+from runner.service.pages.rendering import message_of, page
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
-BROAD: Final = 850
-"""A grid wider than this is shown over the whole width."""
 BEFORE: Final = 250
-"""Steps before the one that is asked for in the part that a page shows first, as in `parts.js`."""
+"""Steps before the requested one in the part that a page shows first, as in `parts.js`."""
 
 Number = Annotated[int, Path(ge=0, lt=2**62)]
 T = Annotated[int, Query(ge=0, lt=2**62)]
 
 
+@dataclass(frozen=True)
+class ShownStep:
+    """A step of an episode."""
+
+    title: str
+    description: str
+    length: int
+    """Steps of the episode."""
+    t: int
+    picture: str
+    key: str
+    broad: bool
+    state: str
+    action: str
+
+
+class Evaluation(NamedTuple):
+    """An evaluation that can be replayed."""
+
+    after: int
+    """Training episodes before it."""
+    trials: int
+
+
+@dataclass(frozen=True)
+class ReplayView(RunView):
+    """The page of a step, or of the error of its episode."""
+
+    TEMPLATE: ClassVar = "run_replay.html"
+    which: tuple[int, ...]
+    """(episode,) of training, or (training episodes before, trial) of an evaluation."""
+    step: ShownStep | None
+    problem: str
+    episodes: int
+    """Training episodes of the run."""
+    evaluations: list[Evaluation]
+    before: str
+    after: str
+    """Addresses of the episodes before and after this one; may be empty."""
+    source: str
+    """Address of the episode's data."""
+    reference: str
+    """Reference of the episode, without its step."""
+
+
 @router.get("")
-async def replay_chosen(
+async def chosen_replay(
     run: RecordedRun,
     cache: CacheOf,
     processes: ProcessesOf,
@@ -43,19 +89,20 @@ async def replay_chosen(
     after: str = "",
     trial: str = "",
 ) -> Response:
-    """Lead to the episode that a form asks for, or to the one that is most worth looking at."""
+    """Redirect to the episode that a form names, or to a typical one."""
     if phase == "train":
         place = f"train/{_whole(episode)}"
     elif phase == "eval" and after:
         place = f"eval/{_whole(after)}/{_whole(trial)}"
     else:
         key = ("typical", recording_state(run))
-        place = (await cache.get_or_await(key, lambda: processes(played.typical, run.recording))).decode()
+        found = await cache.get_or_await(key, lambda: processes(fragments.typical_episode, run.recording))
+        place = found.decode()
     return RedirectResponse(f"/runs/{run.run_id}/replay/{place}", HTTPStatus.FOUND)
 
 
 @router.get("/train/{episode}")
-async def replay_training(
+async def training_replay(
     request: Request, run: RecordedRun, cache: CacheOf, processes: ProcessesOf, episode: Number, t: T = 0
 ) -> Response:
     """Show a step of a training episode."""
@@ -63,7 +110,7 @@ async def replay_training(
 
 
 @router.get("/eval/{after}/{trial}")
-async def replay_trial(
+async def trial_replay(
     request: Request,
     run: RecordedRun,
     cache: CacheOf,
@@ -76,98 +123,86 @@ async def replay_trial(
     return await _replay(request, run, cache, processes, (after, trial), t)
 
 
-# --- inside -------------------------------------------------------------------------------------------
-
-
 async def _replay(
     request: Request, run: Run, cache: CacheOf, processes: ProcessesOf, which: tuple[int, ...], t: int
 ) -> Response:
-    """Return the page of a step of an episode, rendered by a thread: it reads the recording."""
     part: bytes | RunnerError
     try:
         part = await part_of(run, cache, processes, which, max(0, t - BEFORE))
     except RunnerError as error:
         part = error
-    return await run_in_threadpool(_rendered, request, run, which, t, part)
+
+    def show() -> Response:  # in a thread, as it reads the recording
+        if isinstance(part, RunnerError):
+            view = _view(run, which, None, message_of(part, request))
+            return page(request, view, HTTPStatus.NOT_FOUND)
+        return page(request, _view(run, which, _step(json.loads(part), t)))
+
+    return await run_in_threadpool(show)
 
 
-def _rendered(
-    request: Request, run: Run, which: tuple[int, ...], t: int, part: bytes | RunnerError
-) -> Response:
-    """Return the page of a step, or of the error that came of its episode."""
-    spot = (*which, t)
-    shown: dict[str, Any] = {"problem": "", "part": None}
-    status = HTTPStatus.OK
-    if isinstance(part, RunnerError):
-        shown["problem"], status = message_of(part, request), HTTPStatus.NOT_FOUND
-    else:
-        shown |= _shown(json.loads(part), t)
+def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str = "") -> ReplayView:
     with open_recording(run.recording) as recording:
-        around = _around(run, recording, which)
-    return page(
-        request,
-        "run_replay.html",
-        status,
-        **framed(run, "replay"),
-        **around,
-        **shown,
+        episodes = recording.count(recording.topic("/train/episode"))
+        evaluations = [
+            Evaluation(metrics["episode"], metrics["trials"])
+            for metrics in (recording.iter_metrics("eval") if recording.is_job else ())
+        ]
+    if len(which) == 1:
+        count = episodes
+    else:
+        count = next((each.trials for each in evaluations if each.after == which[0]), 0)
+    *_, number = which
+
+    def neighbour(other: int) -> str:
+        path = episode_path((*which[:-1], other, 0))
+        return f"/runs/{run.run_id}/replay/{path}" if 0 <= other < max(count, number) else ""
+
+    return ReplayView(
+        run=head_of(run),
+        here="replay",
         which=which,
-        source=f"/api/v1/runs/{run.run_id}/replay/{episode_place(spot)}",
-        spot=episode_reference(spot),
+        step=step,
+        problem=problem,
+        episodes=episodes,
+        evaluations=evaluations,
+        before=neighbour(number - 1),
+        after=neighbour(number + 1),
+        source=f"/api/v1/runs/{run.run_id}/replay/{episode_path((*which, 0))}",
+        reference=episode_reference((*which, 0)),
     )
 
 
-def _shown(part: dict[str, Any], t: int) -> dict[str, Any]:
-    """Return the picture and the words of a step."""
-    import numpy as np
-
-    from runner.drawing import svg
-
+def _step(part: Mapping[str, Any], t: int) -> ShownStep:
+    """Return a step of a part of an episode, see `fragments.episode_part`."""
     episode = part["episode"]
     at = min(t, episode["length"])
     i = at - episode["first"]
+    state = episode["states"][episode["state"][i]]
     picture, key, broad = "", "", False
     if episode["places"]:
         drawing = svg.Drawing(part["scene"])
         places = np.array(episode["places"], np.int16)[episode["state"]].reshape(len(episode["state"]), -1, 3)
-        words = episode["states"][episode["state"][i]]
-        picture = drawing.frame(places[i], f"The grid: {words}", places[: i + 1], style="")
-        key, broad = drawing.key(), drawing.width > BROAD
-    action = "none yet: the episode begins" if i == 0 else part["actions"][episode["action"][i - 1]]
-    return {
-        "part": part,
-        "at": at,
-        "picture": picture,
-        "key": key,
-        "broad": broad,
-        "state": episode["states"][episode["state"][i]],
-        "action": action,
-    }
-
-
-def _around(run: Run, recording: Recording, which: tuple[int, ...]) -> dict[str, Any]:
-    """Return which episodes there are, and the addresses of those before and after one."""
-    episodes = recording.count(recording.topic("/train/episode"))
-    found = [
-        {"after": metrics["episode"], "trials": metrics["trials"]}
-        for metrics in (recording.iter_metrics("eval") if recording.is_job else [])
-    ]
-    base = f"/runs/{run.run_id}/replay"
-    if len(which) == 1:
-        before = f"{base}/train/{which[0] - 1}" if which[0] else ""
-        after = f"{base}/train/{which[0] + 1}" if which[0] + 1 < episodes else ""
-    else:
-        trials = next((each["trials"] for each in found if each["after"] == which[0]), 0)
-        before = f"{base}/eval/{which[0]}/{which[1] - 1}" if which[1] else ""
-        after = f"{base}/eval/{which[0]}/{which[1] + 1}" if which[1] + 1 < trials else ""
-    return {"episodes": episodes, "evaluations": found, "before": before, "after": after}
+        picture = drawing.frame(places[i], f"The grid: {state}", places[: i + 1], style="")
+        key, broad = drawing.key(), drawing.width > svg.BROAD
+    return ShownStep(
+        title=episode["title"],
+        description=episode["description"],
+        length=episode["length"],
+        t=at,
+        picture=picture,
+        key=key,
+        broad=broad,
+        state=state,
+        action=part["actions"][episode["action"][i - 1]] if i else "none yet: the episode begins",
+    )
 
 
 def _whole(text: str) -> int:
-    """Return a whole number from a form; 0 where nothing was typed.
+    """Return a whole number from a form; 0 for an empty field.
 
     Raises:
-        RunnerError: something else was.
+        RunnerError: the field contains something else.
     """
     if text and not (text.isdecimal() and len(text) < 16):
         raise RunnerError(f"found {text[:40]!r}, expected a number of an episode or a trial, from 0.")

@@ -1,7 +1,7 @@
-"""The Rerun web viewer, from this service: its files are those of the installed package.
+"""The Rerun web viewer, served with the files of the installed package.
 
-The package has them only inside its executable, which serves them. So they are taken from there once, over
-loopback, and kept in the user's cache.
+The package contains them only inside its executable, which serves them. So they are fetched from there once,
+over loopback, and kept in the user's cache.
 """
 
 from __future__ import annotations
@@ -9,21 +9,26 @@ from __future__ import annotations
 import contextlib
 import http.client
 import tempfile
+from dataclasses import dataclass
 from http import HTTPStatus
+from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, ClassVar, Final
 
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
+from filelock import FileLock
 
 from runner.analysis.step_reference import parse_step_reference
-from runner.service import played
+from runner.export.reports.rendering import View
+from runner.service import fragments
+from runner.service.addresses import episode_in_words, link, replay_address
 from runner.service.api.replay import LONG
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.guard import POLICY
-from runner.service.pages.frame import framed
-from runner.service.pages.rendering import link, page
-from runner.service.pages.step_address import episode_in_words, replay_address
+from runner.service.pages.frame import RunView, head_of
+from runner.service.pages.rendering import page
+from runner.util.extras import missing
 from runner.util.files import cache_folder, replacing, storage_errors
 
 router = APIRouter(include_in_schema=False)
@@ -32,25 +37,45 @@ FILES: Final = {"re_viewer.js": "text/javascript", "re_viewer_bg.wasm": "applica
 FRAME_POLICY: Final = POLICY.replace(
     "default-src 'self';", "default-src 'self'; script-src 'self' 'wasm-unsafe-eval';"
 )
-"""WebAssembly is compiled in this one page, and nothing else is allowed in it that is not elsewhere."""
+"""This page alone may compile WebAssembly; otherwise its policy is that of all pages."""
 OVERVIEW: Final = "Some training episodes and the last evaluation."
-"""What the viewer shows unless it is opened at a step."""
+"""Content of the viewer unless it is opened at a step."""
 _FOREVER: Final = "public, max-age=31536000, immutable"
 _SECONDS: Final = 60
+
+
+@dataclass(frozen=True)
+class RerunView(RunView):
+    """The viewer in the page of a run."""
+
+    TEMPLATE: ClassVar = "run_rerun.html"
+    content: str
+    back: str
+    """Address of the same step in the replay; empty without a step."""
+    frame: str
+
+
+@dataclass(frozen=True)
+class FrameView(View):
+    """The viewer alone."""
+
+    TEMPLATE: ClassVar = "rerun_frame.html"
+    title: str
+    files: str
+    """Folder of the viewer's files."""
+    recording: str
+    step: int
+    """Step of the viewer's timeline."""
 
 
 @router.get("/runs/{run}/rerun")
 def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
     """Show the Rerun viewer, opened at a step."""
-    spot = parse_step_reference(at) if at else ()
-    return page(
-        request,
-        "run_rerun.html",
-        **framed(run, "rerun"),
-        told=f"{episode_in_words(spot)}, step {spot[-1]}." if spot else OVERVIEW,
-        back=replay_address(run, spot) if spot else "",
-        frame=link(f"/runs/{run.run_id}/rerun/frame", {"at": at}),
-    )
+    step = parse_step_reference(at) if at else ()
+    content = f"{episode_in_words(step)}, step {step[-1]}." if step else OVERVIEW
+    back = replay_address(run.run_id, step) if step else ""
+    frame = link(f"/runs/{run.run_id}/rerun/frame", {"at": at})
+    return page(request, RerunView(head_of(run), "rerun", content, back, frame))
 
 
 @router.get("/runs/{run}/rerun/frame")
@@ -61,19 +86,18 @@ async def frame(
     processes: ProcessesOf,
     at: Annotated[str, Query(max_length=60)] = "",
 ) -> Response:
-    """Show nothing but the viewer, at a step."""
-    spot = parse_step_reference(at) if at else ()
-    key = ("spot", recording_state(run), spot)
-    step = await cache.get_or_await(key, lambda: processes(played.spot, run, spot), LONG)
-    asked: dict[str, Any] = {"episodes": spot[0]} if len(spot) == 2 else {"evaluations": list(spot[:1])}
-    found = page(
-        request,
-        "rerun_frame.html",
+    """Show the viewer alone, opened at a step."""
+    step = parse_step_reference(at) if at else ()
+    key = ("timeline step", recording_state(run), step)
+    time = await cache.get_or_await(key, lambda: processes(fragments.timeline_step, run, step), LONG)
+    query: dict[str, Any] = {"episodes": step[0]} if len(step) == 2 else {"evaluations": list(step[:1])}
+    view = FrameView(
         title=f"{run.name}, {run.run_id}",
         files=f"/static/rerun/{version()}",
-        recording=link(f"/api/v1/runs/{run.run_id}/replay.rrd", asked),
-        step=int(step),
+        recording=link(f"/api/v1/runs/{run.run_id}/replay.rrd", query),
+        step=int(time),
     )
+    found = page(request, view)
     found.headers["content-security-policy"] = FRAME_POLICY
     return found
 
@@ -90,45 +114,34 @@ def version() -> str:
     """Return the version of the installed viewer.
 
     Raises:
-        MissingExtra: there is none.
+        MissingExtra: it is not installed.
     """
-    from importlib.metadata import PackageNotFoundError
-    from importlib.metadata import version as installed
-
-    from runner.util.extras import missing
-
     try:
-        return installed("rerun-sdk")
-    except PackageNotFoundError as error:
+        return metadata.version("rerun-sdk")
+    except metadata.PackageNotFoundError as error:
         raise missing("rerun", "all", "the Rerun viewer") from error
 
 
 def viewer_files() -> Path:
-    """Return the folder of the viewer's files, which are taken from the package when first asked for.
+    """Return the folder of the viewer's files, which are fetched from the package on first use.
 
     Raises:
         ViewerError: the viewer cannot be started.
         StorageError: the cache cannot be written.
     """
-    from filelock import FileLock
-
     folder = cache_folder() / "viewer" / version()
-    if _is_whole(folder):
+    if all((folder / name).is_file() for name in FILES):
         return folder
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         with FileLock(folder / "lock", timeout=_SECONDS):
-            if not _is_whole(folder):
-                _take(folder)
+            if not all((folder / name).is_file() for name in FILES):
+                _fetch_files(folder)
     return folder
 
 
-def _is_whole(folder: Path) -> bool:
-    return all((folder / name).is_file() for name in FILES)
-
-
-def _take(folder: Path) -> None:
-    """Take the files from the executable, which serves them."""
+def _fetch_files(folder: Path) -> None:
+    """Fetch the files from the executable, which serves them."""
     from runner.export.rerun import viewer
 
     port, data = viewer.free_port(), viewer.free_port()
@@ -139,18 +152,18 @@ def _take(folder: Path) -> None:
             viewer.wait_for(process, port, log)
             for name in FILES:
                 with replacing(folder / name) as fresh:
-                    fresh.write_bytes(_fetched(port, name))
+                    fresh.write_bytes(_fetch(port, name))
 
 
-def _fetched(port: int, name: str) -> bytes:
+def _fetch(port: int, name: str) -> bytes:
     from runner.export.rerun import viewer
 
     with contextlib.closing(
         http.client.HTTPConnection(viewer.LOOPBACK, port, timeout=_SECONDS)
     ) as connection:
         connection.request("GET", f"/{name}")
-        answer = connection.getresponse()
-        body = answer.read()
-    if answer.status != HTTPStatus.OK or len(body) < 1000:
+        response = connection.getresponse()
+        body = response.read()
+    if response.status != HTTPStatus.OK or len(body) < 1000:
         raise viewer.ViewerError(f"the Rerun viewer has no {name}; install rerun-sdk again.")
     return body

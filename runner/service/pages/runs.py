@@ -1,22 +1,24 @@
-"""The table of runs: searched, sorted, its columns chosen, a page at a time."""
+"""The table of runs, searched, sorted and with chosen columns, a page at a time; their use of the disk."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
+from runner.export.reports.rendering import View
 from runner.runs.catalogue.columns import FIELDS, HEADINGS, SETTING, Kind, as_text, columns_of, field_of
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.index import order_of
-from runner.service.dependencies import CacheOf, CatalogueOf
-from runner.service.pages.problems import message_of
-from runner.service.pages.rendering import Viewer, link, render, viewer_of
+from runner.runs.catalogue.usage import sizes, usage_of
+from runner.service.addresses import Paging, link
+from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
+from runner.service.pages.rendering import message_of, page, render, viewer_of
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index
@@ -39,14 +41,94 @@ USUAL: Final = (
 FOLDED: Final = ("id", "seed", "tag", "episodes")
 """Columns that a narrow screen leaves out, unless the columns were chosen."""
 ROWS: Final = 50
+FREED_BY: Final = {
+    "same_content": ("Duplicates", "The same content was recorded before: `dualtaxi rm` removes runs."),
+    "unfinished": (
+        "Unfinished",
+        "`dualtaxi prune --status interrupted --status failed`, if they are not to be resumed.",
+    ),
+    "left_over": ("Left over", "Damaged originals that a repair kept, and files of interrupted commands."),
+    "cached": ("Cached", "Created again when needed."),
+    "half_removed": ("Half removed", "The next `dualtaxi rm` or `prune` removes the rest."),
+}
+"""What could be freed, with its heading and how to do it."""
 _LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
 _FALLING: Final = (Kind.NUMBER, Kind.SIZE, Kind.DATE)
-"""Of these the largest come first when a heading is clicked."""
+"""Kinds whose largest values come first after a click on the heading."""
+
+
+class Heading(NamedTuple):
+    """The heading of a column."""
+
+    text: str
+    meaning: str
+    kind: str
+    """CSS classes."""
+    sorted: str | None
+    """`ascending` or `descending` if the rows are sorted by it."""
+    address: str
+    """Of the table sorted by it; empty if it cannot be."""
+
+
+class Cell(NamedTuple):
+    """A cell of the table."""
+
+    text: str
+    kind: str
+    address: str
+    is_status: bool
+
+
+@dataclass(frozen=True)
+class Table:
+    """The rows of a page."""
+
+    headings: list[Heading]
+    rows: list[tuple[str, list[Cell]]]
+    """Run id and cells."""
+    total: int
+    """Runs that match the filter."""
+    all_runs: int
+    paging: Paging
+
+
+@dataclass(frozen=True)
+class RunsView(View):
+    """The table of runs with its search form."""
+
+    TEMPLATE: ClassVar = "runs.html"
+    filter: str
+    sort: str
+    columns: Sequence[str]
+    columns_query: str
+    """The columns as the address contains them; empty for the usual ones."""
+    table: Table | None
+    problem: str
+
+    fields: Sequence[tuple[str, str, str]]
+    """Name, heading and meaning of each column that can be chosen, first those that are shown."""
+    settings: Sequence[str]
+    """Columns that are values of the configuration."""
+
+
+@dataclass(frozen=True)
+class DiskView(View):
+    """The use of the disk."""
+
+    TEMPLATE: ClassVar = "disk.html"
+    total: Mapping[str, int]
+    free: int
+    freeable: list[tuple[str, str, int]]
+    """Heading, explanation and bytes."""
+    rows: list[tuple[dict[str, Any], dict[str, int]]]
+    """Row of the catalogue, and bytes by kind, of the largest runs."""
+    others: int
+    """Number of runs that are not shown."""
 
 
 @router.get("/")
 def home() -> Response:
-    """Lead to the runs."""
+    """Redirect to the runs."""
     return RedirectResponse("/runs", HTTPStatus.FOUND)
 
 
@@ -60,101 +142,96 @@ async def runs(
     columns: Annotated[list[str] | None, Query(max_length=100)] = None,
     page: Annotated[int, Query(ge=1, lt=10**8)] = 1,
 ) -> Response:
-    """Show the runs that fit a filter."""
-    status = HTTPStatus.OK
-
-    viewer = viewer_of(request)
+    """Show the runs that match a filter."""
+    viewer, status = viewer_of(request), HTTPStatus.OK
 
     def make() -> bytes:
-        return _page(catalogue, filter, sort, ",".join(columns or ()), page, viewer)
+        return render("/runs", _view(catalogue, filter, sort, ",".join(columns or ()), page), viewer)
 
     try:
-        body = await cache.get_or_make(("runs page", catalogue.state(), request.url.query, viewer), make)
+        key = ("runs page", catalogue.state(), request.url.query, viewer)
+        body = await cache.get_or_make(key, make)
     except RunnerError as error:
         status = HTTPStatus.BAD_REQUEST
-        told = _frame(filter, "", USUAL) | {"problem": message_of(error, request), "rows": [], "total": None}
-        body = render("/runs", "runs.html", viewer, **told)
+        view = _search(filter, "", USUAL, "", None, message_of(error, request))
+        body = render("/runs", view, viewer)
     return Response(body, status, media_type="text/html")
 
 
-def _page(catalogue: Catalogue, text: str, sort: str, columns: str, number: int, viewer: Viewer) -> bytes:
+@router.get("/disk")
+def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: JobsOf) -> Response:
+    """Show the use of the disk, and what could be freed."""
+    largest, sums = usage_of(catalogue.read, Filter(None), ROWS)
+    freeable = sums.freeable(settings.recordings)
+    view = DiskView(
+        total=sums.by_kind(),
+        free=jobs.status().free_bytes,
+        freeable=[(*FREED_BY[kind], size) for kind, size in freeable.items() if size],
+        rows=[(usage.row, sizes([usage])) for usage in largest],
+        others=sums.runs - len(largest),
+    )
+    return page(request, view)
+
+
+def _view(catalogue: Catalogue, text: str, sort: str, columns: str, number: int) -> RunsView:
     chosen, order = parse(text), order_of(sort)
     shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
+    is_usual = list(shown) == list(USUAL)
 
     def work(index: Index) -> tuple[list[dict[str, Any]], int, int]:
         found, total = index.page(chosen, *order, limit=ROWS, offset=(number - 1) * ROWS)
         return index.with_same_as(found), total, index.count(Filter(None)) if text else total
 
-    rows, total, everything = catalogue.read(work)
-    asked = {"filter": text, "sort": sort, "columns": _asked(shown)}
-    folded = FOLDED if list(shown) == list(USUAL) else ()
-    if folded and any(row["mean_return"] is not None for row in rows):
+    rows, total, all_runs = catalogue.read(work)
+    query = {"filter": text, "sort": sort, "columns": "" if is_usual else ",".join(shown)}
+    if is_usual and any(row["mean_return"] is not None for row in rows):
         shown = [*shown[: shown.index("mean_length")], "mean_return", *shown[shown.index("mean_length") :]]
-    return render(
-        "/runs",
-        "runs.html",
-        viewer,
-        **_frame(text, sort, shown) | {"asked_columns": asked["columns"]},
-        problem="",
+    folded = FOLDED if is_usual else ()
+    table = Table(
+        headings=[_heading(column, query, column in folded) for column in shown],
+        rows=[(row["id"], [_cell(row, column, column in folded) for column in shown]) for row in rows],
         total=total,
-        everything=everything,
-        heads=[_head(column, asked, column in folded) for column in shown],
-        rows=[
-            {"id": row["id"], "cells": [_cell(row, column, column in folded) for column in shown]}
-            for row in rows
-        ],
-        page=number,
-        pages=math.ceil(total / ROWS),
-        turned=lambda to: link("/runs", asked | {"page": to if to > 1 else ""}),
+        all_runs=all_runs,
+        paging=Paging(number, total, ROWS, link("/runs", query)),
     )
+    return _search(text, sort, shown, query["columns"], table)
 
 
-def _frame(text: str, sort: str, shown: Sequence[str]) -> dict[str, Any]:
-    """Return what stands around the rows: the columns that are shown first, in their order."""
-    known = [column for column in shown if column in FIELDS]
-    return {
-        "filter": text,
-        "sort": sort,
-        "columns": shown,
-        "asked_columns": _asked(shown),
-        "settings": [column for column in shown if column.startswith(SETTING)],
-        "fields": [(name, FIELDS[name].meaning) for name in dict.fromkeys([*known, *FIELDS])],
-        "headings": HEADINGS,
-    }
+def _search(
+    text: str, sort: str, shown: Sequence[str], query: str, table: Table | None, problem: str = ""
+) -> RunsView:
+    names = dict.fromkeys([*(column for column in shown if column in FIELDS), *FIELDS])
+    fields = [(name, HEADINGS.get(name, name).replace("_", " "), FIELDS[name].meaning) for name in names]
+    settings = [column for column in shown if column.startswith(SETTING)]
+    return RunsView(text, sort, shown, query, table, problem, fields, settings)
 
 
-def _asked(shown: Sequence[str]) -> str:
-    """Return the columns as an address has them; nothing if they are the usual ones."""
-    return "" if list(shown) == list(USUAL) else ",".join(shown)
-
-
-def _head(column: str, asked: dict[str, Any], folded: bool) -> dict[str, Any]:
-    """Return a heading: what a click on it sorts by, and whether the rows are sorted by it now."""
-    setting = column.startswith(SETTING)
-    known = setting or column in FIELDS
-    kind = Kind.NUMBER if setting or not known else field_of(column).kind
-    now = asked["sort"]
-    first = f"-{column}" if kind in _FALLING and not setting else column
-    other = column if first.startswith("-") else f"-{column}"
-    return {
-        "heading": HEADINGS.get(column, column).replace("_", " "),
-        "meaning": "" if setting or not known else field_of(column).meaning,
-        "kind": _classes(not setting and kind in _LEFT, folded),
-        "sorted": {column: "ascending", f"-{column}": "descending"}.get(now),
-        "href": link("/runs", asked | {"sort": other if now == first else first}) if known else "",
-    }
+def _heading(column: str, query: Mapping[str, str], folded: bool) -> Heading:
+    is_setting = column.startswith(SETTING)
+    is_sortable = is_setting or column in FIELDS
+    kind = Kind.NUMBER if is_setting or not is_sortable else field_of(column).kind
+    rising, falling = column, f"-{column}"
+    first, second = (falling, rising) if kind in _FALLING and not is_setting else (rising, falling)
+    return Heading(
+        text=HEADINGS.get(column, column).replace("_", " "),
+        meaning="" if is_setting or not is_sortable else field_of(column).meaning,
+        kind=_classes(not is_setting and kind in _LEFT, folded),
+        sorted={rising: "ascending", falling: "descending"}.get(query["sort"]),
+        address=link("/runs", {**query, "sort": second if query["sort"] == first else first})
+        if is_sortable
+        else "",
+    )
 
 
 def _classes(left: bool, folded: bool) -> str:
     return " ".join(name for name, holds in (("text", left), ("fold", folded)) if holds)
 
 
-def _cell(row: dict[str, Any], column: str, folded: bool) -> dict[str, Any]:
+def _cell(row: dict[str, Any], column: str, folded: bool) -> Cell:
+    text, address = as_text(row, column), ""
+    if column in ("id", "name"):
+        address = f"/runs/{row['id']}"
+    elif column == "same_as" and row["same_as"]:
+        address = f"/runs/{row['same_as']}"
     kind = _classes(column in FIELDS and field_of(column).kind in _LEFT, folded)
-    href = f"/runs/{row['id']}" if column in ("id", "name") else ""
-    if column == "same_as" and row["same_as"]:
-        href = f"/runs/{row['same_as']}"
-    text = as_text(row, column)
-    if column == "digest":
-        text = text[:16]
-    return {"text": text, "kind": kind, "href": href, "status": column == "status"}
+    return Cell(text[:16] if column == "digest" else text, kind, address, column == "status")

@@ -1,7 +1,7 @@
-"""The files of the pages: style, scripts, the chart library; compressed once, and kept by browsers.
+"""The files of the pages: style, scripts and the chart library, compressed once and cached by browsers.
 
-Their addresses hold a digest of them all, so that a browser never asks again for what it has, and never
-shows an older one after an upgrade.
+Their addresses contain a digest of all of them, so that a browser never requests what it has, and never uses
+an older file after an upgrade.
 """
 
 from __future__ import annotations
@@ -17,13 +17,12 @@ from typing import Final
 
 from fastapi import APIRouter, HTTPException, Request, Response
 
+from runner.export.reports.rendering import TEMPLATES as REPORT_TEMPLATES
 from runner.export.reports.rendering import page_style
 
 router = APIRouter(include_in_schema=False)
 
 FOLDER: Final = files("runner.service.pages") / "static"
-REPORT: Final = files("runner.export") / "templates"
-"""Of reports, whose code is not imported for it: it brings Numba along, and its memory."""
 UPLOT: Final = "vendor/uplot-1.6.32"
 _TYPES: Final = {
     "css": "text/css",
@@ -32,22 +31,6 @@ _TYPES: Final = {
     "LICENSE": "text/plain",
 }
 _FOREVER: Final = "public, max-age=31536000, immutable"
-_OWN: Final = (
-    *(
-        "ages.js",
-        "asked.js",
-        "charts.js",
-        "episode.js",
-        "job.js",
-        "later.js",
-        "live.js",
-        "parts.js",
-        "rerun.css",
-        "rerun.js",
-    ),
-    *("stepping.js", "submit.js", "table.js"),
-)
-_OTHERS: Final = ("icon.svg", f"{UPLOT}/uPlot.iife.min.js", f"{UPLOT}/LICENSE")
 
 
 @dataclass(frozen=True)
@@ -56,16 +39,19 @@ class Asset:
 
     media_type: str
     body: bytes
-    packed: bytes
-    """The same, by gzip."""
+    compressed: bytes
 
 
 @functools.cache
 def assets() -> Mapping[str, Asset]:
     """Return the files by name."""
-    bodies = {name: (FOLDER / name).read_bytes() for name in (*_OWN, *_OTHERS)}
-    bodies["replay.js"] = (REPORT / "replay.js").read_bytes()
-    bodies["style.css"] = _style().encode()
+    bodies = {entry.name: entry.read_bytes() for entry in FOLDER.iterdir() if entry.is_file()}
+    bodies |= {
+        name: (FOLDER / name).read_bytes() for name in (f"{UPLOT}/uPlot.iife.min.js", f"{UPLOT}/LICENSE")
+    }
+    bodies["replay.js"] = (REPORT_TEMPLATES / "replay.js").read_bytes()
+    layouts = (FOLDER / UPLOT / "uPlot.min.css").read_text("utf-8"), bodies.pop("pages.css").decode()
+    bodies["style.css"] = "\n".join([page_style(), *layouts]).encode()
     return {
         name: Asset(_TYPES[name.rpartition("/")[2].rpartition(".")[2]], body, gzip.compress(body, mtime=0))
         for name, body in bodies.items()
@@ -74,7 +60,7 @@ def assets() -> Mapping[str, Asset]:
 
 @functools.cache
 def version() -> str:
-    """Return a digest of all the files."""
+    """Return a digest of all files."""
     digest = hashlib.sha256()
     for name, asset in sorted(assets().items()):
         digest.update(name.encode() + b"\0" + asset.body)
@@ -82,10 +68,10 @@ def version() -> str:
 
 
 def address(name: str) -> str:
-    """Return where a file is.
+    """Return the address of a file.
 
     Raises:
-        KeyError: there is none of that name.
+        KeyError: there is no file of that name.
     """
     assets()[name]
     return f"/static/{version()}/{name}"
@@ -97,20 +83,8 @@ def static(digest: str, name: str, request: Request) -> Response:
     asset = assets().get(name)
     if asset is None:
         raise HTTPException(HTTPStatus.NOT_FOUND)
-    packed = "gzip" in request.headers.get("accept-encoding", "")
     headers = {"vary": "accept-encoding", "cache-control": _FOREVER if digest == version() else "no-cache"}
-    return Response(
-        asset.packed if packed else asset.body,
-        media_type=asset.media_type,
-        headers=headers | ({"content-encoding": "gzip"} if packed else {}),
-    )
-
-
-def _style() -> str:
-    """Return the style of a report and of the pictures, and what pages have besides."""
-    parts = [
-        page_style(),
-        (FOLDER / UPLOT / "uPlot.min.css").read_text("utf-8"),
-        (FOLDER / "pages.css").read_text("utf-8"),
-    ]
-    return "\n".join(parts)
+    if "gzip" in request.headers.get("accept-encoding", ""):
+        headers["content-encoding"] = "gzip"
+        return Response(asset.compressed, media_type=asset.media_type, headers=headers)
+    return Response(asset.body, media_type=asset.media_type, headers=headers)

@@ -1,13 +1,14 @@
-"""The sweeps, and what came of one."""
+"""The sweeps, and the results of one."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
@@ -15,15 +16,14 @@ from fastapi.responses import HTMLResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.errors import RunnerError, RunNotFound
+from runner.export.reports.rendering import View
 from runner.runs.catalogue.filters import parse
-from runner.service import played
+from runner.service import fragments
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
-from runner.service.pages.jobs import shown_job
-from runner.service.pages.problems import message_of
-from runner.service.pages.rendering import page, picture_address, templates
-from runner.service.processes import ProcessPool
-from runner.service.response_cache import ALWAYS, ResponseCache
+from runner.service.pages.jobs import ShownJob, shown_job
+from runner.service.pages.rendering import message_of, page
+from runner.service.response_cache import ALWAYS
 from runner.sweep import folder_of, sweeps_in, tag_of
 from runner.sweep.state import read_sweep
 
@@ -31,31 +31,66 @@ router = APIRouter(prefix="/sweeps", include_in_schema=False)
 
 Name = Annotated[str, InPath(max_length=100)]
 Part = Literal["results", "importance", "pictures"]
-"""Parts of a page in the order in which they are computed, the fastest first."""
+PARTS: Final = {
+    "results": fragments.sweep_results,
+    "importance": fragments.sweep_importance,
+    "pictures": fragments.sweep_pictures,
+}
+"""Parts of the page of a sweep in the order in which they are computed, the fastest first."""
+
+
+@dataclass(frozen=True)
+class ListedSweep:
+    """A sweep in the list; with a problem, only its name is known."""
+
+    name: str
+    problem: str
+    strategy: str = ""
+    parameters: str = ""
+    objective: str = ""
+    runs: int = 0
+
+
+@dataclass(frozen=True)
+class SweepsView(View):
+    """The list of sweeps."""
+
+    TEMPLATE: ClassVar = "sweeps.html"
+    sweeps: list[ListedSweep]
+
+
+@dataclass(frozen=True)
+class SweepPageView(View):
+    """The page of a sweep."""
+
+    TEMPLATE: ClassVar = "sweep_page.html"
+    name: str
+    tag: str
+    runs: int
+    parameters: list[str]
+    job: ShownJob | None
+    """The newest job of the sweep."""
+    parts: Mapping[str, str | None]
+    """HTML of each part; None while it is computed."""
 
 
 @router.get("")
 def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Response:
     """Show the sweeps."""
-    found: list[dict[str, Any]] = []
+    found: list[ListedSweep] = []
     for folder in settings.recordings:
         for name in sweeps_in(folder):
             try:
                 sweep = read_sweep(name, folder)
             except RunnerError as error:
-                found.append({"name": name, "problem": message_of(error, request)})
+                found.append(ListedSweep(name, message_of(error, request)))
                 continue
+            runs = _tagged(catalogue, name)
+            parameters = ", ".join(sweep.file.parameters)
             found.append(
-                {
-                    "name": name,
-                    "problem": "",
-                    "strategy": sweep.file.strategy,
-                    "parameters": ", ".join(sweep.file.parameters),
-                    "objective": sweep.objective.described,
-                    "runs": _runs_tagged(catalogue, name),
-                }
+                ListedSweep(name, "", sweep.file.strategy, parameters, sweep.objective.described, runs)
             )
-    return page(request, "sweeps.html", sweeps=found)
+    return page(request, SweepsView(found))
 
 
 @router.get("/{name}")
@@ -69,27 +104,26 @@ async def sweep(
     jobs: JobsOf,
     whole: Annotated[bool, Query(description="Wait for results and pictures.")] = False,
 ) -> Response:
-    """Show what came of a sweep: at once, with what is not ready yet announced in its place."""
-    seen = await run_in_threadpool(_look, name, settings.recordings, catalogue)
+    """Show the results of a sweep, at once, with placeholders for the parts that are not ready yet."""
+    state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
     parts: dict[str, str | None] = {}
-    for part, render in _RENDERERS.items():
-        body = await _made(seen, part, cache, processes) if whole else cache.get((f"sweep {part}", seen))
-        parts[part] = await run_in_threadpool(render, body) if body else None
+    for part in PARTS:
+        body = await _made(state, part, cache, processes) if whole else cache.get(_key(state, part))
+        parts[part] = None if body is None else body.decode()
 
-    def shown() -> Response:
-        made_by = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
-        return page(
-            request,
-            "sweep.html",
+    def show() -> Response:
+        own = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
+        view = SweepPageView(
             name=name,
             tag=tag_of(name),
-            runs=seen.runs,
-            parameters=list(read_sweep(name, seen.folder).file.parameters),
-            job=shown_job(made_by[-1], jobs) if made_by else None,
+            runs=state.runs,
+            parameters=list(read_sweep(name, state.folder).file.parameters),
+            job=shown_job(own[-1], jobs) if own else None,
             parts=parts,
         )
+        return page(request, view)
 
-    return await run_in_threadpool(shown)
+    return await run_in_threadpool(show)
 
 
 @router.get("/{name}/{part}")
@@ -101,18 +135,14 @@ async def sweep_part(
     cache: CacheOf,
     processes: SweepProcesses,
 ) -> Response:
-    """Return a part of a sweep's page: the ranking, what mattered, or the pictures."""
-    seen = await run_in_threadpool(_look, name, settings.recordings, catalogue)
-    body = await _made(seen, part, cache, processes)
-    return HTMLResponse(await run_in_threadpool(_RENDERERS[part], body))
-
-
-# --- inside -------------------------------------------------------------------------------------------
+    """Return a part of the page of a sweep: the ranking, the importance of parameters, or the pictures."""
+    state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
+    return HTMLResponse(await _made(state, part, cache, processes))
 
 
 @dataclass(frozen=True)
-class _Seen:
-    """A sweep as it was found: what is made of it is the same as long as this is."""
+class _SweepState:
+    """The state of a sweep; what is computed from it holds as long as it is the same."""
 
     name: str
     folder: Path
@@ -122,13 +152,15 @@ class _Seen:
     """Of the catalogue's rows of its runs, and of the files of the sweep itself."""
 
 
-def _look(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _Seen:
-    """Return a sweep as it is now.
+def _state_of(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _SweepState:
+    """Return the present state of a sweep.
 
     Raises:
-        RunNotFound: there is none of this name.
+        RunNotFound: there is no sweep of this name.
     """
-    folder = _folder_of(name, folders)
+    folder = next((folder for folder in folders if name in sweeps_in(folder)), None)
+    if folder is None:
+        raise RunNotFound(f"no sweep {name!r}: the page of sweeps lists those there are.")
     chosen = parse(f'tag:"{tag_of(name)}"')
     rows = catalogue.read(lambda index: index.select(chosen))
     files = sorted(
@@ -137,48 +169,21 @@ def _look(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _Seen:
         if (facts := entry.stat())
     )
     digest = hashlib.sha256(json.dumps([files, rows], default=str, sort_keys=True).encode()).hexdigest()
-    return _Seen(name, folder, len(rows), digest)
+    return _SweepState(name, folder, len(rows), digest)
 
 
-async def _made(seen: _Seen, part: str, cache: ResponseCache, processes: ProcessPool) -> bytes:
-    """Return a part of a sweep's page as data, made by a child process unless it is kept."""
-    make = _MAKERS[part]
-    return await cache.get_or_await(
-        (f"sweep {part}", seen), lambda: processes(make, seen.name, seen.folder, seen.digest), ALWAYS
-    )
-
-
-def _results_html(body: bytes) -> str:
-    return templates().get_template("sweep_results.html").render(told=json.loads(body))
-
-
-def _importance_html(body: bytes) -> str:
-    return templates().get_template("sweep_importance.html").render(told=json.loads(body))
-
-
-def _pictures_html(body: bytes) -> str:
-    told = json.loads(body)
-    for panel in told["learning"]["panels"]:
-        panel["address"] = picture_address(panel["svg"])
-    pictures = [picture_address(picture) for picture in told["pictures"]]
-    return templates().get_template("sweep_pictures.html").render(told=told, pictures=pictures)
-
-
-_MAKERS: Final = {
-    "results": played.sweep_results,
-    "importance": played.sweep_importance,
-    "pictures": played.sweep_pictures,
-}
-_RENDERERS: Final = {"results": _results_html, "importance": _importance_html, "pictures": _pictures_html}
-
-
-def _runs_tagged(catalogue: Catalogue, name: str) -> int:
+def _tagged(catalogue: Catalogue, name: str) -> int:
     chosen = parse(f'tag:"{tag_of(name)}"')
     return catalogue.read(lambda index: index.count(chosen))
 
 
-def _folder_of(name: str, folders: tuple[Path, ...]) -> Path:
-    for folder in folders:
-        if name in sweeps_in(folder):
-            return folder
-    raise RunNotFound(f"no sweep {name!r}: the page of sweeps lists those there are.")
+def _key(state: _SweepState, part: str) -> tuple[str, _SweepState]:
+    return f"sweep {part}", state
+
+
+async def _made(state: _SweepState, part: str, cache: CacheOf, processes: SweepProcesses) -> bytes:
+    """Return the HTML of a part, cached or made by a child process."""
+    make = PARTS[part]
+    return await cache.get_or_await(
+        _key(state, part), lambda: processes(make, state.name, state.folder, state.digest), ALWAYS
+    )

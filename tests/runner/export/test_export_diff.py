@@ -53,7 +53,7 @@ def test_the_page_of_another_seed_shows_where_the_runs_part(world, pictured):
     check_page(page)
     assert f"at t = {difference.divergence.t}" in text_of(page)
     starts = difference.cause.kind == "start"
-    drawn = page.count("B, where it stood: " if starts else "B, after its step: ")
+    drawn = page.count("B, at its start: " if starts else "B, after its step: ")
     assert (drawn > 0) == (world != "corridor")
 
 

@@ -99,20 +99,20 @@ def test_a_mistake_is_told_at_its_line_then_a_job_is_submitted_and_watched_to_it
     assert selected == "episodes: -5"
     field.clear()
     field.send_keys(ASKED.format(episodes=180))
-    wait(browser, lambda: "1 run" in text_of(browser, "#fine"))
+    wait(browser, lambda: "1 run" in text_of(browser, "#valid"))
     browser.find_element(By.CSS_SELECTOR, "button[value=submit]").click()
     wait(browser, lambda: "/queue/" in browser.current_url)
     wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "[data-state].finished"))
     browser.find_element(By.CSS_SELECTOR, "[data-runs] a").click()
-    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "#standing"))
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "#status"))
     assert find_run("asked", folder).run_id in browser.current_url
-    assert "180" in text_of(browser, "#standing")
+    assert "180" in text_of(browser, "#status")
 
 
 def test_metrics_are_drawn_and_zoomed_and_the_address_says_so(page):
     browser = page("/runs/first")
     wait(browser, lambda: len(browser.find_elements(By.CSS_SELECTOR, ".uplot canvas")) > 3)
-    assert "Every recorded point" in text_of(browser, "[data-said]")
+    assert "Every recorded point" in text_of(browser, "[data-message]")
     browser.find_element(By.NAME, "from").send_keys("10")
     browser.find_element(By.NAME, "to").send_keys("40" + Keys.ENTER)
     wait(browser, lambda: "from=10&to=40" in browser.current_url)
@@ -171,16 +171,16 @@ def test_thinned_curves_say_so_and_are_read_again_where_one_zooms(page, folder):
         recordings=folder,
     )
     browser = page("/runs/long")
-    wait(browser, lambda: "Thinned: of up to" in text_of(browser, "[data-said]"))
+    wait(browser, lambda: "Thinned: of up to" in text_of(browser, "[data-message]"))
     assert ", thinned" in text_of(browser, ".plots")
     plot = browser.find_element(By.CSS_SELECTOR, ".u-over")
     browser.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", plot)
     drag = ActionChains(browser).move_to_element_with_offset(plot, -40, 0).click_and_hold()
     drag.move_by_offset(2, 0).move_by_offset(10, 0).release().perform()
-    wait(browser, lambda: "Every recorded point" in text_of(browser, "[data-said]"))
+    wait(browser, lambda: "Every recorded point" in text_of(browser, "[data-message]"))
     assert "from=" in browser.current_url
     ActionChains(browser).double_click(browser.find_element(By.CSS_SELECTOR, ".u-over")).perform()
-    wait(browser, lambda: "Thinned" in text_of(browser, "[data-said]"))
+    wait(browser, lambda: "Thinned" in text_of(browser, "[data-message]"))
 
 
 @pytest.mark.parametrize(("address", "phase", "number"), [("train/7", "train", 7), ("train/59", "train", 59)])

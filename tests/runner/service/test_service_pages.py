@@ -57,7 +57,7 @@ def test_the_caret_of_a_wrong_filter_stands_under_its_place_in_a_fixed_width(cli
 
 def test_that_not_all_evaluations_are_shown_is_said(client, monkeypatch):
     assert "The last" not in page_of(client, "/runs/first/evaluations")
-    monkeypatch.setattr("runner.service.pages.run.MOST_EVALUATIONS", 2)
+    monkeypatch.setattr("runner.service.pages.run.MAX_EVALUATIONS", 2)
     page = page_of(client, "/runs/first/evaluations")
     assert "The last 2 of 7;" in page
     assert re.findall(r'replay/eval/(\d+)/0"', page) == ["50", "60"]
@@ -244,14 +244,14 @@ def test_a_job_is_shown_and_cancelled(client):
 
 
 def test_how_a_run_stands_is_told_while_it_runs_only(client, recordings):
-    assert client.get("/runs/first/standing").status_code == 204
+    assert client.get("/runs/first/status").status_code == 204
     file = find_run("first", recordings).folder / "run.json"
     facts = json.loads(file.read_text())
     owner = facts["owner"] | {"host": "elsewhere"}  # who lives as long as the file is young
     file.write_text(json.dumps(facts | {"status": "running", "summary": {}, "owner": owner}))
     page = page_of(client, "/runs/first")
     assert 'data-live="/runs/' in page
-    assert "so far" in client.get("/runs/first/standing").text
+    assert "so far" in client.get("/runs/first/status").text
 
 
 @pytest.mark.parametrize("error", [None, 5, ["no", "text"]])
@@ -267,16 +267,16 @@ def test_the_page_of_a_run_is_live_from_when_a_job_will_go_on_with_it(client, re
     monkeypatch.setattr("runner.service.jobs.pool.RESERVE_BYTES", 1 << 62)  # so that no job is begun
     run = find_run("first", recordings).update(status="interrupted")
     assert "data-live" not in page_of(client, "/runs/first")
-    assert client.get("/runs/first/standing?status=interrupted").status_code == 204
+    assert client.get("/runs/first/status?status=interrupted").status_code == 204
     assert client.post("/api/v1/jobs", content="env: {id: FrozenLake-v1}\nepisodes: 60").status_code == 201
     client.app.state.jobs.store.start_run(1, 0, run.run_id)
     page = page_of(client, "/runs/first")
-    assert f'data-live="/runs/{run.run_id}/standing?status=interrupted"' in page
+    assert f'data-live="/runs/{run.run_id}/status?status=interrupted"' in page
     assert "live.js" in page
-    assert client.get("/runs/first/standing?status=interrupted").status_code == 200
-    assert client.get("/runs/first/standing?status=running").status_code == 204, "the page says otherwise"
+    assert client.get("/runs/first/status?status=interrupted").status_code == 200
+    assert client.get("/runs/first/status?status=running").status_code == 204, "the page says otherwise"
     client.post("/queue/1/cancel")
-    assert client.get("/runs/first/standing?status=interrupted").status_code == 204
+    assert client.get("/runs/first/status?status=interrupted").status_code == 204
 
 
 def test_what_a_run_keeps_of_its_failure_does_not_say_where_the_folder_is(client, recordings):
@@ -321,8 +321,8 @@ def test_the_page_of_a_finished_job_leads_to_its_run_and_asks_for_no_events(clie
     page = page_of(client, f"/queue/{number}")
     run_id = job["begun"][0]["run_id"]
     assert f'href="/runs/{run_id}">The run</a>' in page
-    assert f'run <a href="/runs/{run_id}">{run_id}</a> begins' in page
-    assert "begun</small>" not in page
+    assert f'run <a href="/runs/{run_id}">{run_id}</a> started' in page
+    assert "started</small>" not in page
     assert "data-active" not in page
     assert re.search(r"ago, finished <time[^>]* data-age>[^<]+</time> ago, took [\d.]+ s<", page)
     place = re.search(r'data-place="(\d+)"', page)[1]

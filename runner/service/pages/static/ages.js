@@ -1,4 +1,4 @@
-// How long ago something was, kept up to date; the words are those of `runner.util.humanize.age`.
+// Keeps ages of moments up to date, in the words of `runner.util.humanize.age`.
 const UNITS = [[60, 1, "s"], [3600, 60, "min"], [86400, 3600, "h"], [Infinity, 86400, "d"]];
 
 function age(moment) {

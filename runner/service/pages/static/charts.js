@@ -1,17 +1,17 @@
-// Metrics of one or several runs over training episodes. Of long curves the server gives the lowest and the
-// highest value of each stretch, and says so; what is zoomed into is asked for again, at full resolution.
-import { asked } from "./asked.js";
+// Metrics of one or several runs over training episodes. Of a long curve the server returns the lowest and the
+// highest value of each stretch, with a notice; zooming in requests that part at full resolution.
+import { request } from "./api.js";
 
 const box = document.querySelector("[data-charts]");
 const runs = JSON.parse(box.dataset.charts);
-const plots = box.querySelector("[data-plots]"), said = box.querySelector("[data-said]"), form = box.querySelector("form");
+const plots = box.querySelector("[data-plots]"), message = box.querySelector("[data-message]"), form = box.querySelector("form");
 const COLOURS = 7;  // of lines, in the style
 const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
 const SHARES = "training.reward";
 const shown = new Map();
-let range = part(), asking = 0;
+let range = zoomed(), requests = 0;
 
-function part() {
+function zoomed() {
   const query = new URLSearchParams(location.search);
   const end = (name) => query.get(name) ? Number(query.get(name)) : null;
   return { from: end("from"), to: end("to") };
@@ -25,18 +25,18 @@ async function curvesOf(run) {
   const query = new URLSearchParams({ points: Math.max(400, Math.round(plots.clientWidth)) });
   if (range.from) query.set("start", Math.max(0, Math.floor(range.from)));
   if (range.to) query.set("stop", Math.ceil(range.to) + 1);
-  return (await asked(`/api/v1/runs/${run.id}/metrics?${query}`)).curves;
+  return (await request(`/api/v1/runs/${run.id}/metrics?${query}`)).curves;
 }
 
 async function draw() {
-  const mine = ++asking;
+  const mine = ++requests;
   box.setAttribute("aria-busy", "true");
   try {
     const found = await Promise.all(runs.map(curvesOf));
-    if (mine !== asking) return;
+    if (mine !== requests) return;
     show(found);
   } catch (error) {
-    said.textContent = error.message;
+    message.textContent = error.message;
   }
   box.removeAttribute("aria-busy");
 }
@@ -54,7 +54,7 @@ function show(found) {
   for (const [metric, one] of shown) if (!metrics.has(metric)) { one.chart?.destroy(); one.figure.remove(); shown.delete(metric); }
   const all = [...metrics.values()].flatMap((panel) => panel.lines);
   const thinned = all.filter((line) => line.thinned);
-  said.textContent = !all.length ? "No metrics were recorded."
+  message.textContent = !all.length ? "No metrics were recorded."
     : thinned.length ? `Thinned: of up to ${Math.max(...thinned.map((line) => line.of)).toLocaleString("en")} points a curve the lowest and highest of each stretch are drawn. Zoom in for all of them.`
       : "Every recorded point is drawn. Drag across a plot to zoom; double click shows all.";
 }
@@ -93,8 +93,8 @@ function plot(metric, panel) {
   one.kinds = kinds;
 }
 
-// A key of all lines, each as it is drawn; a click hides or shows one. While the cursor is over a plot the
-// key has the episode and the values there.
+// A key of all lines, as they are drawn; a click hides or shows a line. While the cursor is over a plot, the key
+// shows the episode and the values there.
 function legend(chart, key, labels) {
   const entries = labels.map((name, i) => {
     const entry = document.createElement("button"), value = document.createElement("output");
@@ -213,7 +213,7 @@ form.addEventListener("submit", (event) => {
 });
 box.querySelector("[data-reset]").addEventListener("click", () => go(null, null));
 plots.addEventListener("dblclick", () => go(null, null));
-addEventListener("popstate", () => { const { from, to } = part(); go(from, to, false); });
+addEventListener("popstate", () => { const { from, to } = zoomed(); go(from, to, false); });
 
 let width = plots.clientWidth;
 new ResizeObserver(() => {

@@ -1,11 +1,11 @@
-// The replay of an episode: its parts are asked for as they are needed, and the address is that of the step.
+// The replay of an episode: its parts are requested as they are needed, and the address names the step.
 import { onKeys, partAt } from "./parts.js";
 
 const root = document.querySelector("[data-part]"), source = root.dataset.part;
 const onward = root.querySelector("[data-to-rerun]");
 let writing = null;
 
-// Writing each step of a playing replay into the address at once would be too often for browsers.
+// Browsers limit how often the address may change, so a playing replay does not write every step.
 function moved(k) {
   onward.href = `${root.dataset.rerun}:${Math.max(0, k - 1)}`;
   clearTimeout(writing);
@@ -13,9 +13,9 @@ function moved(k) {
 }
 
 const at = Number(root.dataset.at);
-const told = await partAt(source, at);
-const replay = new Replay(root, told, { load: async (k) => (await partAt(source, k)).episode, moved });
-replay.begin(told.episode, at);
+const data = await partAt(source, at);
+const replay = new Replay(root, data, { load: async (k) => (await partAt(source, k)).episode, moved });
+replay.begin(data.episode, at);
 
 onKeys("input, textarea, select, button, a, summary", () => replay.play(), (by) => {
   replay.pause();

@@ -1,4 +1,4 @@
-// A job: its log is shown from its end; while the job is not over, its events are added as they come.
+// A job: the page shows the end of its log; until the job is over, events are added as they arrive.
 const head = document.querySelector("[data-job]");
 const [state, progress, runs, log] = ["state", "progress", "runs", "log"].map((name) => document.querySelector(`[data-${name}]`));
 const count = (number) => number.toLocaleString("en");
@@ -21,24 +21,24 @@ function linked(id) {
   return link;
 }
 
-function said(data) {
+function progressOf(data) {
   if ("done" in data) return [data.done / Math.max(1, data.runs), `${count(data.done)} of ${count(data.runs)} runs`];
   const run = data.runs > 1 ? `, run ${data.run} of ${data.runs}` : "";
   return [(data.run - 1 + data.episode / Math.max(1, data.episodes)) / data.runs, `${count(data.episode)} of ${count(data.episodes)} episodes${run}`];
 }
 
 function watch() {
-  // The server rendered what came before; a connection that breaks goes on where it was by itself.
+  // The server rendered the earlier events; the browser resumes a broken connection where it was.
   const source = new EventSource(`${head.dataset.job}/events?after=${head.dataset.place}`);
   const on = (kind, show) => source.addEventListener(kind, (event) => show(JSON.parse(event.data)));
   on("progress", (data) => {
-    const [share, words] = said(data);
+    const [share, words] = progressOf(data);
     progress.hidden = false;
     progress.querySelector("progress").value = share;
     progress.querySelector("span").textContent = words;
   });
   on("run", (data) => {
-    line(data.time, "run ", linked(data.run_id), " begins");
+    line(data.time, "run ", linked(data.run_id), " started");
     if (!runs) return;
     const item = document.createElement("li");
     item.append(linked(data.run_id), `, seed ${data.seed}`);

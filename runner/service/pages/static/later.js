@@ -1,9 +1,9 @@
-// Parts of a page that take their time: each is fetched, and takes the place of what announces it.
+// Parts of a page that take long to compute: each is fetched and replaces its placeholder.
 async function fill(place) {
   try {
-    const answer = await fetch(place.dataset.later, { headers: { accept: "application/json" } });
-    if (!answer.ok) throw new Error((await answer.json().catch(() => null))?.error.message ?? `The service answers ${answer.status}.`);
-    place.innerHTML = await answer.text();  // rendered, and escaped, by the server
+    const response = await fetch(place.dataset.later, { headers: { accept: "application/json" } });
+    if (!response.ok) throw new Error((await response.json().catch(() => null))?.error.message ?? `The service responded with status ${response.status}.`);
+    place.innerHTML = await response.text();  // rendered, and escaped, by the server
   } catch (error) {
     const problem = document.createElement("p");
     problem.textContent = error.message;

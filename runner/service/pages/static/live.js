@@ -1,12 +1,12 @@
-// A part of a page that changes: asked for again and again, until the page as a whole is another.
+// A part of a page that changes: fetched repeatedly, until the whole page must be loaded again.
 const place = document.querySelector("[data-live]");
 
 async function look() {
   try {
-    const answer = await fetch(place.dataset.live, { headers: { accept: "text/html" } });
-    if (answer.status === 204) return location.reload();
-    if (answer.ok) place.innerHTML = await answer.text();  // rendered, and escaped, by the server
-  } catch { /* the service is away: ask again */ }
+    const response = await fetch(place.dataset.live, { headers: { accept: "text/html" } });
+    if (response.status === 204) return location.reload();
+    if (response.ok) place.innerHTML = await response.text();  // rendered, and escaped, by the server
+  } catch { /* the service is not available: try again */ }
   setTimeout(look, document.hidden ? 10000 : 1500);
 }
 

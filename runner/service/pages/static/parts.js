@@ -1,11 +1,11 @@
-// What the replays in pages share: the parts of an episode, asked for as they are needed, and the keys.
-import { asked } from "./asked.js";
+// The parts of an episode, requested as they are needed, and the keys of replays.
+import { request } from "./api.js";
 
-const BEFORE = 250;  // steps before the one that is wanted, as in pages/replay.py
+const BEFORE = 250;  // steps before the requested one, as in pages/replay.py
 
-export const partAt = (source, k) => asked(`${source}?start=${Math.max(0, k - BEFORE)}`);
+export const partAt = (source, k) => request(`${source}?start=${Math.max(0, k - BEFORE)}`);
 
-// Keys play and move, unless what has the focus makes something else of them.
+// Keys play and move, unless the element with the focus uses them.
 export function onKeys(others, play, move) {
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches(others)) return;

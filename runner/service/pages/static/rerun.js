@@ -1,14 +1,14 @@
-// The Rerun viewer, told which recording to open and at which step: its own files, from this service.
-const place = document.body.dataset, said = document.getElementById("said");
+// Opens a recording in the Rerun viewer at a step; the viewer's files come from this service.
+const place = document.body.dataset, message = document.getElementById("message");
 const theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
 const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
-// The viewer would report to its makers; the policy of this page keeps it from that, and this from trying.
+// The viewer sends usage data to its makers, which the policy of this page forbids; this avoids the attempt.
 const own = window.fetch.bind(window);
 window.fetch = (what, how) => new URL(what.url ?? what, location.href).origin === location.origin
   ? own(what, how) : Promise.resolve(new Response(null, { status: 204 }));
 
-// What is asked of the viewer is a message in Protocol Buffers: rerun.viewer_control.v1alpha1.
+// Commands to the viewer are Protocol Buffers messages: rerun.viewer_control.v1alpha1.
 function varint(value) {
   const bytes = [];
   for (let rest = BigInt(value); ; rest >>= 7n) {
@@ -25,16 +25,16 @@ function setTimeCursor(timeline, time) {
 }
 
 async function ready() {
-  const answer = await fetch(place.recording, { method: "GET", headers: { range: "bytes=0-0" } });
-  if (answer.ok) return;
-  const told = await answer.json().catch(() => null);
-  throw new Error(told?.error.message ?? `The service answers ${answer.status}.`);
+  const response = await fetch(place.recording, { method: "GET", headers: { range: "bytes=0-0" } });
+  if (response.ok) return;
+  const body = await response.json().catch(() => null);
+  throw new Error(body?.error.message ?? `The service responded with status ${response.status}.`);
 }
 
 async function open() {
   console.debug = () => {};
   await ready();
-  said.textContent = "Loading the viewer …";
+  message.textContent = "Loading the viewer …";
   await wasm_bindgen({ module_or_path: place.wasm });
   const handle = new wasm_bindgen.WebHandle({
     url: [new URL(place.recording, location.href).href],
@@ -42,7 +42,7 @@ async function open() {
     render_backend: "webgl", manifest_url: null,
   });
   await handle.start(document.getElementById("viewer"));
-  said.hidden = true;
+  message.hidden = true;
   const request = setTimeCursor("step", place.step);
   for (let tries = 0; tries < 400; tries++) {
     if (handle.has_panicked()) throw new Error(`The viewer has crashed: ${handle.panic_message()}`);
@@ -57,4 +57,4 @@ async function open() {
   }
 }
 
-open().catch((error) => { said.hidden = false; said.textContent = error.message; });
+open().catch((error) => { message.hidden = false; message.textContent = error.message; });

@@ -1,21 +1,21 @@
-// Two replays in step: one slider moves both; where one has ended, it stands still.
+// Two replays in step: one slider moves both; a replay that has ended stays at its last step.
 import { onKeys, partAt } from "./parts.js";
 
 const bar = document.querySelector("[data-together]");
 const [slider, button, count] = [".both", ".both-play", ".both-count"].map((name) => bar.querySelector(name));
 let timer = null, writing = null;
 
-async function begun(root) {
+async function start(root) {
   const { source } = root.dataset;
-  const told = await partAt(source, 0);
-  const replay = new Replay(root, told, { load: async (k) => (await partAt(source, k)).episode });
-  replay.begin(told.episode);
+  const data = await partAt(source, 0);
+  const replay = new Replay(root, data, { load: async (k) => (await partAt(source, k)).episode });
+  replay.begin(data.episode);
   return replay;
 }
 
 const roots = [...document.querySelectorAll("[data-source]")];
 for (const root of roots) root.querySelector(".description").textContent = "Loading …";
-const replays = (await Promise.all(roots.map((root) => begun(root).catch((error) => {
+const replays = (await Promise.all(roots.map((root) => start(root).catch((error) => {
   root.querySelector(".description").textContent = error.message;
   return null;
 })))).filter(Boolean);

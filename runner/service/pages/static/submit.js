@@ -1,7 +1,7 @@
-// The form of a configuration: checked as it is written, each mistake leads to its line.
+// The form of a configuration: checked as it is written, with a link from each mistake to its line.
 const form = document.querySelector("[data-submit]"), text = form.elements.text;
-const problems = document.getElementById("problems"), fine = document.getElementById("fine");
-let timer = null, asking = 0;
+const problems = document.getElementById("problems"), valid = document.getElementById("valid");
+let timer = null, checks = 0;
 
 function go(line) {
   const lines = text.value.split("\n"), start = lines.slice(0, line - 1).join("\n").length + (line > 1 ? 1 : 0);
@@ -10,41 +10,41 @@ function go(line) {
   text.scrollTop = (line - 4) * Number.parseFloat(getComputedStyle(text).lineHeight);
 }
 
-function made(tag, content) {
+function make(tag, content) {
   const element = document.createElement(tag);
   element.append(...content);
   return element;
 }
 
-function told({ line, path, message }) {
+function problemBox({ line, path, message }) {
   const parts = [];
   if (line) {
-    const link = made("a", [`Line ${line}`]);
+    const link = make("a", [`Line ${line}`]);
     link.href = "#text";
     link.dataset.line = line;
     parts.push(link, path ? ", " : "");
   }
-  if (path) parts.push(made("code", [path]));
+  if (path) parts.push(make("code", [path]));
   parts.push(line || path ? ": " : "", message);
-  const box = made("div", [made("p", parts)]);
+  const box = make("div", [make("p", parts)]);
   box.className = "problem";
-  if (line) box.append(made("pre", [text.value.split("\n")[line - 1] ?? ""]));
+  if (line) box.append(make("pre", [text.value.split("\n")[line - 1] ?? ""]));
   return box;
 }
 
 async function check() {
-  const mine = ++asking;
-  const answer = await fetch("/api/v1/jobs/check", { method: "POST", body: text.value, headers: { "content-type": "application/yaml" } }).catch(() => null);
-  if (mine !== asking || !answer) return;
-  const found = await answer.json();
-  if (answer.ok) {
+  const mine = ++checks;
+  const response = await fetch("/api/v1/jobs/check", { method: "POST", body: text.value, headers: { "content-type": "application/yaml" } }).catch(() => null);
+  if (mine !== checks || !response) return;
+  const found = await response.json();
+  if (response.ok) {
     problems.replaceChildren();
-    fine.textContent = `Fine: ${found.kind} ${found.name}, ${found.runs.toLocaleString("en")} ${found.runs === 1 ? "run" : "runs"}${found.bytes ? `, about ${(found.bytes / 1e6).toFixed(found.bytes < 1e7 ? 1 : 0)} MB` : ""}.`;
+    valid.textContent = `Valid: ${found.kind} ${found.name}, ${found.runs.toLocaleString("en")} ${found.runs === 1 ? "run" : "runs"}${found.bytes ? `, about ${(found.bytes / 1e6).toFixed(found.bytes < 1e7 ? 1 : 0)} MB` : ""}.`;
     return;
   }
-  fine.textContent = "";
+  valid.textContent = "";
   const { error } = found;
-  problems.replaceChildren(...(error.problems.length ? error.problems : [{ message: error.message }]).map(told));
+  problems.replaceChildren(...(error.problems.length ? error.problems : [{ message: error.message }]).map(problemBox));
 }
 
 text.addEventListener("input", () => { clearTimeout(timer); timer = setTimeout(check, 700); });

@@ -1,10 +1,10 @@
-// The table of runs: choosing some to compare, and keys to move in it.
+// The table of runs: selecting runs to compare, and keys to move in it.
 const form = document.querySelector("[data-rows]");
 const search = document.querySelector("[data-focus]");
 
 function chosen() { return form.querySelectorAll("input[name=run]:checked").length; }
 
-function tell() {
+function update() {
   const button = form.querySelector("[data-compare]"), count = chosen();
   button.disabled = count < 2;
   button.textContent = count < 2 ? "Select two or more runs to compare" : `Compare ${count} runs`;
@@ -24,11 +24,11 @@ document.addEventListener("keydown", (event) => {
   if (event.key === "k") step(-1);
   if (event.key === "x") {
     const box = document.activeElement.closest("tr")?.querySelector("input[name=run]");
-    if (box) { box.checked = !box.checked; tell(); }
+    if (box) { box.checked = !box.checked; update(); }
   }
 });
 if (form) {
-  form.addEventListener("change", tell);
-  addEventListener("pageshow", tell);
-  tell();
+  form.addEventListener("change", update);
+  addEventListener("pageshow", update);
+  update();
 }

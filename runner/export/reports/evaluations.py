@@ -1,0 +1,59 @@
+"""The evaluations of a run as a table of text, for reports and pages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from runner.analysis.sections import Grid
+from runner.environments.naming import event_in_words, spoken
+from runner.recording.metrics import METRICS
+from runner.util import humanize
+
+
+@dataclass(frozen=True)
+class EvaluationTable:
+    """The evaluations of a run as text."""
+
+    explanation: str
+    grid: Grid
+
+
+def evaluation_table(
+    records: Sequence[Mapping[str, Any]], agents: Sequence[str], event_names: Sequence[str], is_job: bool
+) -> EvaluationTable:
+    """Return records of evaluations as a table; one of a loop leaves out metrics that it does not know."""
+    metrics = [
+        metric for metric in METRICS if is_job or any(record[metric.key] is not None for record in records)
+    ]
+    headings = ["episode"] if is_job else ["episode", "trials"]
+    for metric in metrics:
+        whose = [f" {spoken(agent)}" for agent in agents] if metric.per_agent and len(agents) > 1 else [""]
+        headings += [f"{metric.heading}{agent}" for agent in whose]
+    headings += [_event_heading(name) for name in event_names]
+    rows = []
+    for record in records:
+        cells = [f"{record['episode']:,}"] if is_job else [f"{record['episode']:,}", f"{record['trials']:,}"]
+        for metric in metrics:
+            value = record[metric.key]
+            cells += [humanize.number(each) for each in (value.values() if metric.per_agent else [value])]
+        cells += [f"{count:,}" for count in record["events"].values()]
+        if is_job:
+            cells.append("/".join(map(humanize.number, record["training"]["percent_filled"].values())))
+        rows.append(tuple(cells))
+    explanation = (
+        f"Each row: {records[0]['trials']} trials with the greedy policy after that number of training "
+        "episodes. Events are counted over all trials."
+        if is_job
+        else "Each row: the evaluation episodes of the loop after that number of training episodes. Events "
+        "are counted over all of them."
+    )
+    return EvaluationTable(explanation, Grid((*headings, *(["filled %"] if is_job else [])), rows))
+
+
+def _event_heading(event: str) -> str:
+    """Return an event as the heading of a column, the agent on a line of its own."""
+    agent, dot, _ = event.rpartition(".")
+    words = event_in_words(event)
+    return f"{words[: len(agent)]}\n{words[len(agent) + 1 :]}" if dot else words

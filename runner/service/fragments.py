@@ -1,0 +1,240 @@
+"""Parts of pages that take long to compute, for child processes: HTML, or JSON for a script.
+
+Analyses and exports are imported inside the functions: they load Numba and SciPy, which the process that
+answers requests does without.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import sys
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from runner.analysis.sections import Grid, Section
+from runner.analysis.step_reference import step_reference
+from runner.drawing import svg
+from runner.errors import RecordingError, RunnerError
+from runner.export.reports.rendering import Link, partials
+from runner.recording.reader import Recording, open_recording
+from runner.runs.run import Run
+from runner.service.addresses import after_step, link
+from runner.service.settings import without_folders
+
+if TYPE_CHECKING:
+    from runner.export.reports.episode import Episode
+    from runner.sweep.results import Results
+
+_STEPS_BEFORE: Final = 1
+"""Steps before the first one of a part, so that it includes the step that led there."""
+
+
+def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> bytes:
+    """Return a part of an episode as JSON for `replay.js`.
+
+    Args:
+        path: the recording.
+        which: (episode,) of training, or (training episodes before, trial) of an evaluation.
+        start: the first step.
+        steps: the largest number of steps.
+
+    Raises:
+        RecordingError: there is no such episode or step, or no steps were recorded.
+    """
+    from runner.export.reports.episode import payload, training_episode, trial
+
+    with open_recording(path) as recording:
+        recording.require_job("a replay in the page", "The Rerun viewer shows what it recorded.")
+        first = max(0, start - _STEPS_BEFORE)
+        episode: Episode
+        if len(which) == 1:
+            episode = training_episode(recording, which[0], steps, first)
+        else:
+            episode = trial(recording, which[0], which[1], steps, first)
+        data = payload(recording, [episode], svg.drawing_of(recording.mdp))
+        facts = {
+            "description": episode.outcome,
+            "length": episode.length,
+            "first": episode.first,
+            "before": list(episode.before),
+        }
+        data |= {"episode": data.pop("episodes")[0] | facts, "scene": recording.mdp.scene}
+        return json.dumps(data, separators=(",", ":"), ensure_ascii=False).encode()
+
+
+def random_policy(path: Path) -> bytes:
+    """Return a sentence on what a random policy achieves in a recording's environment; empty if unknown."""
+    from runner.analysis.summary import random_policy_sentence
+
+    with open_recording(path) as recording:
+        return random_policy_sentence(recording).encode()
+
+
+def typical_episode(path: Path) -> bytes:
+    """Return the address of the episode to show first, below that of the replay: `eval/3000/17`."""
+    from runner.export.reports.episode import last_episode, last_whole_evaluation, typical_trial
+
+    with open_recording(path) as recording:
+        if last_whole_evaluation(recording) is None:
+            return f"train/{last_episode(recording)}".encode()
+        after, number = typical_trial(recording)
+        return f"eval/{after}/{number}".encode()
+
+
+def maps(path: Path) -> bytes:
+    """Return the maps of policy and values at stages of learning, as HTML."""
+    from runner.export.reports.maps import maps_of, stages_of
+
+    with open_recording(path) as recording:
+        rows = []
+        drawing = svg.drawing_of(recording.mdp) if recording.is_job else None
+        if recording.is_job:
+            rows = maps_of(recording.mdp, recording.agents, stages_of(recording), _typical_start(recording))
+        return str(partials().maps(rows, drawing is not None and drawing.width > svg.BROAD)).encode()
+
+
+def _typical_start(recording: Recording) -> int:
+    from runner.export.reports.episode import trial, typical_trial
+
+    try:
+        return int(trial(recording, *typical_trial(recording)).states[0])
+    except RecordingError:
+        return int(recording.mdp.start.argmax())
+
+
+def difference(a: Run, b: Run) -> bytes:
+    """Return the difference of two runs as JSON.
+
+    Its keys: `lead`, `notes`, `first_step` (the first step that differs; may be null), `body` and `tables`.
+    """
+    from runner.analysis.diff import diff, with_seconds, without_ignored
+    from runner.export.reports.diff import ShownDivergence, difference_view
+
+    with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
+        view = difference_view(without_ignored(with_seconds(diff(ours, theirs), a, b), ()), ours, theirs)
+
+    def linked(shown: ShownDivergence) -> ShownDivergence:
+        runs = [a.run_id, b.run_id]
+        both = link("/compare/replay", {"run": runs, "at": step_reference(after_step(shown.step))})
+        at = step_reference(shown.step)
+        viewers = [
+            Link(f"{letter} in Rerun", link(f"/runs/{run}/rerun", {"at": at}))
+            for letter, run in zip("AB", runs, strict=True)
+        ]
+        return replace(shown, links=[Link("Both replays at this step", both), *viewers])
+
+    shown = partials()
+    body = shown.divergences(list(map(linked, view.divergences)), view.training, view.visits)
+    body += "".join(shown.section(other.title.lower(), other.title, other) for other in view.others)
+    found = {
+        "lead": view.lead,
+        "notes": view.notes,
+        "first_step": view.divergences[0].step if view.divergences else None,
+        "body": body,
+        "tables": shown.tables(view.tables, view.table_figures),
+    }
+    return json.dumps(found).encode()
+
+
+def timeline_step(run: Run, at: tuple[int, ...]) -> bytes:
+    """Return the step of the viewer's timeline at (episode, t) or (training episodes before, trial, t)."""
+    from runner.export.rerun.selection import Request, locate
+
+    return str(locate(run, Request(), at or None).time).encode()
+
+
+def load_sweep_libraries() -> None:
+    """Import the libraries that the pages of sweeps need, at a low priority where a thread can have one.
+
+    SciPy, scikit-learn and Optuna take seconds to load, which no request should have to wait for.
+    """
+
+    def load() -> None:
+        if sys.platform == "linux":  # elsewhere a priority is that of a whole process
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+        for module in ("scipy.stats", "sklearn.tree", "optuna.samplers", "runner.sweep.results"):
+            with contextlib.suppress(ImportError):  # the function that needs it explains how to install it
+                importlib.import_module(module)
+
+    thread = threading.Thread(target=load)
+    thread.start()
+    thread.join()
+
+
+@lru_cache(maxsize=1)
+def _results(name: str, recordings: Path, digest: str) -> Results:  # noqa: ARG001
+    """Return the results of a sweep in the state that the digest identifies."""
+    from runner.sweep.results import results_of
+    from runner.sweep.state import read_sweep
+
+    return results_of(read_sweep(name, recordings), recordings)
+
+
+def sweep_results(name: str, recordings: Path, digest: str) -> bytes:
+    """Return the ranking of a sweep as HTML, with links to its runs."""
+    from runner.sweep.results import ranking_sections
+
+    results = _results(name, recordings, digest)
+    ranking, *others = (_without_folders(each, recordings) for each in ranking_sections(results, None))
+    runs = {str(entry.number): _run_links(entry.runs) for entry in results.ranking}
+    grids = [
+        Grid((*grid.headings, "runs, by seed"), [(*row, runs[row[0]]) for row in grid.rows])
+        for grid in ranking.grids[:1]
+    ]
+    shown = partials()
+    html = shown.section("ranking", "Ranking", replace(ranking, grids=[*grids, *ranking.grids[1:]]))
+    html += "".join(shown.section(f"results-{i}", each.title, each) for i, each in enumerate(others))
+    return str(html + shown.best(results.best_yaml) if results.best_yaml else html).encode()
+
+
+def _run_links(runs: Mapping[Any, str]) -> str:
+    from markupsafe import Markup
+
+    links = [
+        Markup('<a href="/runs/{0}" title="{0}">{1}</a>').format(run, seed) for seed, run in runs.items()
+    ]
+    return Markup(" ").join(links)
+
+
+def sweep_importance(name: str, recordings: Path, digest: str) -> bytes:
+    """Return the importance of a sweep's parameters as HTML, empty if it is unknown."""
+    from runner.sweep.results import effects_sections
+
+    shown = partials()
+    sections = [
+        _without_folders(each, recordings) for each in effects_sections(_results(name, recordings, digest))
+    ]
+    return "".join(
+        shown.section(f"importance-{i}", each.title, each) for i, each in enumerate(sections)
+    ).encode()
+
+
+def _without_folders(section: Section, recordings: Path) -> Section:
+    return replace(section, sentences=[without_folders(text, recordings) for text in section.sentences])
+
+
+def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
+    """Return the charts of a sweep as HTML: its parameters, and learning curves of some of its trials."""
+    from runner.export.plots.curves import footnote, panel_plots
+    from runner.sweep.charts import picture_plots
+    from runner.sweep.page import sweep_legend
+    from runner.sweep.plots import learning, picture_of
+
+    results, shown, html = _results(name, recordings, digest), partials(), ""
+    with contextlib.suppress(RunnerError):  # no trial is finished yet, as the ranking says
+        picture = picture_of(results)
+        html = shown.charts("parameters", "Parameters", picture.footnote, picture_plots(picture))
+    try:
+        groups, panels = learning(results, recordings)
+        plots = panel_plots(panels, len(groups))
+        html += shown.charts("curves", "Learning curves", footnote(groups), plots, sweep_legend(groups))
+    except RunnerError as error:
+        html += shown.charts("curves", "Learning curves", without_folders(str(error), recordings), [])
+    return str(html).encode()
