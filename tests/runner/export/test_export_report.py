@@ -57,7 +57,7 @@ def test_replays_are_the_recorded_episodes_best_and_worst_among_them(recording, 
     assert shown["explored"] == steps["explored"].tolist()
     assert np.allclose(shown["reward"], steps["rewards"])
     if recording.mdp.scene is None:
-        assert "carries no scene" in page
+        assert "has no scene" in page
         assert shown["places"] == []
     else:
         places = Drawing(recording.mdp.scene).places(recording.mdp, states)
@@ -203,7 +203,7 @@ def test_without_a_scene_state_and_action_are_told(opened):
     slider = driver.find_element(By.CSS_SELECTOR, ".step")
     slider.send_keys(Keys.ARROW_RIGHT)
     told = driver.find_element(By.CSS_SELECTOR, ".replay").text
-    assert "carries no scene" in told
+    assert "has no scene" in told
     assert re.search(r"State\s+state \d", told)
     assert re.search(r"Last action\s+action \d", told)
 
