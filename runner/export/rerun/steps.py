@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 import rerun as rr
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from runner.drawing import palette
@@ -111,7 +112,7 @@ class _Grid(Sender):
         self._scene = scene
         self._labels = labels
         self._label_points = self._place_labels()
-        self._before = np.empty(0, np.int64)
+        self._before: NDArray[np.int64] | None = None
         """The last states of the batch before, as many as a trail may show."""
         shapes = [shape for _, shape in scene.shapes]
         self._half_sizes = np.array([shape.half_size for shape in shapes], np.float32).reshape(-1, 2)
@@ -174,16 +175,16 @@ class _Grid(Sender):
 
     def _trails(self, state: NDArray[np.int64], t: NDArray[Any]) -> NDArray[np.float32]:
         """Return the way of each mover in the last steps of the episode, [n, movers, TRAIL_STEPS + 1, 2]."""
-        states, before = np.concatenate((self._before, state)), len(self._before)
+        before = np.repeat(state[:1], TRAIL_STEPS) if self._before is None else self._before
+        states = np.concatenate((before, state))
         self._before = states[-TRAIL_STEPS:]
         # A point as one number of eight bytes: fewer and larger values to copy.
-        points = np.ascontiguousarray(self._scene.points[states, : len(self._scene.movers)]).view(np.int64)
-        here = np.arange(before, len(states))
-        steps = np.minimum(t, here)
-        lines = np.empty((len(here), points.shape[1], TRAIL_STEPS + 1, 1), np.int64)
-        for back in range(TRAIL_STEPS + 1):
-            lines[:, :, TRAIL_STEPS - back] = points[here - np.minimum(back, steps)]
-        return lines.view(np.float32)
+        points = self._scene.points[states, : len(self._scene.movers)].view(np.int64)[..., 0]
+        lines = np.ascontiguousarray(sliding_window_view(points, TRAIL_STEPS + 1, axis=0))
+        young = np.flatnonzero(t < TRAIL_STEPS)
+        back = np.minimum(np.arange(TRAIL_STEPS, -1, -1), t[young, None])
+        lines[young] = points[young[:, None] + TRAIL_STEPS - back].swapaxes(1, 2)
+        return lines[..., None].view(np.float32)
 
     def _send_sizes(self, batch: Batch) -> None:
         """Send the sizes of boxes wherever the grid may have been cleared; static ones would stay visible."""
