@@ -14,7 +14,7 @@ from runner.util.extras import require
 from runner.util.files import replacing, storage_errors
 
 
-def write_new(path: Path, force: bool, write: Callable[[Path], None]) -> None:
+def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
     """Have a file written beside its place, and put there when it is whole.
 
     Raises:

@@ -129,9 +129,9 @@ def _show(
             viewer.screenshot(path, location.time, screenshot, picture_size)
         click.echo(screenshot)
     elif web:
-        with viewer.web_viewer(path, viewer.check_port(port)) as (process, address):
+        with viewer.web_viewer(viewer.check_port(port), path) as (started, address):
             click.echo(address)
             say(f"The step is {location.time:,}: enter it at the lower right. Ctrl-C ends the viewer.")
-            process.wait()
+            started.process.wait()
     else:
         viewer.open_window(path, location.time, viewer.check_port(port))

@@ -5,14 +5,18 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
+import shutil
 import socket
 import subprocess
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
 
 from runner.errors import RunnerError
+from runner.export.places import write_new
 from runner.util.extras import missing
 
 if TYPE_CHECKING:
@@ -23,10 +27,10 @@ START_SECONDS: Final = 20.0
 SCREEN_SECONDS: Final = 0.5
 """A viewer that finds no screen has ended this long after it began to listen."""
 ANSWER_SECONDS: Final = 5.0
-SETTLE_SECONDS: Final = 4.0
-"""A viewer without a screen has drawn everything this long after it was told where to look."""
+DRAW_SECONDS: Final = 4.0
+"""A viewer without a screen has drawn everything this long after the step was set."""
 NOTICE_SECONDS: Final = 2.5
-"""After that, what the viewer says of itself in a corner is gone."""
+"""After this time, the viewer's notice in a corner has disappeared."""
 MESA_PACKAGES: Final = (
     "mesa-vulkan-drivers libgl1-mesa-dri libegl1 libxkbcommon-x11-0 libxcursor1 libxi6 libxrandr2 libx11-xcb1"
 )
@@ -39,7 +43,7 @@ class ViewerError(RunnerError):
 
 
 def require_rerun(purpose: str) -> None:
-    """Raise an error that says what is missing, if Rerun is not installed.
+    """Check that Rerun is installed.
 
     Raises:
         MissingExtra: it is not.
@@ -52,7 +56,7 @@ def viewer_program() -> Path:
     """Return the viewer's executable, which comes with the package.
 
     Raises:
-        ViewerError: it is not there.
+        ViewerError: it is missing.
     """
     import rerun_cli  # type: ignore[import-untyped,unused-ignore]
 
@@ -71,10 +75,10 @@ def free_port() -> int:
 
 
 def check_port(port: int) -> int:
-    """Return the port if it is free; 0 means any.
+    """Return the port if it is free, or any free port for 0.
 
     Raises:
-        ViewerError: something listens there.
+        ViewerError: something listens on it.
     """
     if not port:
         return free_port()
@@ -89,86 +93,143 @@ def check_port(port: int) -> int:
     return port
 
 
-def environment() -> dict[str, str]:
-    """Return the environment that viewers are started in: nothing is reported to anyone."""
-    return os.environ | {"RERUN_ANALYTICS": "0"}
-
-
-@contextlib.contextmanager
-def viewer(port: int, *options: str, log: Path | None = None) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a viewer that listens on loopback; it is ended when the block is left.
+def check_address(url: str) -> str:
+    """Return the address of a viewer if something listens there.
 
     Raises:
-        ViewerError: it ended at once.
+        RunnerError: it is no address of a viewer.
+        ViewerError: nothing listens there.
     """
-    arguments = [str(viewer_program()), "--bind", LOOPBACK, "--port", str(port), *options]
-    with contextlib.ExitStack() as stack:
-        output: Any = stack.enter_context(log.open("wb")) if log else subprocess.DEVNULL
-        process = subprocess.Popen(arguments, env=environment(), stdout=output, stderr=subprocess.STDOUT)
+    parts = urlsplit(url)
+    try:
+        if not parts.scheme.startswith("rerun") or parts.hostname is None:
+            raise ValueError
+        address = (parts.hostname, parts.port or (443 if parts.scheme.endswith("https") else 80))
+    except ValueError:
+        raise RunnerError(
+            f"--live-url: found {url!r}, expected a viewer's address such as "
+            "rerun+http://127.0.0.1:9876/proxy"
+        ) from None
+    try:
+        socket.create_connection(address, timeout=ANSWER_SECONDS).close()
+    except OSError as error:
+        raise ViewerError(
+            f"{url}: nothing answers there ({error.strerror or error}); start a viewer by `rerun`."
+        ) from error
+    return url
+
+
+class Viewer:
+    """A viewer that listens on loopback.
+
+    Args:
+        log: file for its output.
+        port: that it listens on.
+        options: of the viewer's command line.
+        detached: whether it survives the end of this program.
+
+    Raises:
+        ViewerError: it ended at once, or took too long to start.
+    """
+
+    def __init__(self, log: Path, port: int, *options: str, detached: bool = False) -> None:
+        self._log = log
+        self.url = f"rerun+http://{LOOPBACK}:{port}/proxy"
+        arguments = [str(viewer_program()), "--bind", LOOPBACK, "--port", str(port), *options]
+        environment = os.environ | {"RERUN_ANALYTICS": "0"}
+        with log.open("wb") as output:
+            self.process = subprocess.Popen(
+                arguments,
+                env=environment,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=detached,
+            )
         try:
-            wait_for(process, port, log)
-            yield process
-        finally:
-            process.terminate()
-            try:
-                process.wait(5)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            self.wait_for(port)
+        except BaseException:
+            self.end()
+            raise
 
+    def wait_for(self, port: int) -> None:
+        """Wait until it listens on a port.
 
-def wait_for(process: subprocess.Popen[bytes], port: int, log: Path | None = None) -> None:
-    """Wait until the viewer listens.
+        Raises:
+            ViewerError: it ended, or took too long.
+        """
+        deadline = time.monotonic() + START_SECONDS
+        while time.monotonic() < deadline and self.process.poll() is None:
+            with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), timeout=1):
+                return
+            time.sleep(0.05)
+        raise self.error("does not start")
 
-    Raises:
-        ViewerError: it ended, or took too long.
-    """
-    deadline = time.monotonic() + START_SECONDS
-    while time.monotonic() < deadline:
-        if process.poll() is not None:
-            break
-        with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), timeout=1):
-            return
-        time.sleep(0.05)
-    raise ViewerError(f"the Rerun viewer does not start{_reason(log)}")
+    def show(self, path: Path, step: int) -> ViewerClient:
+        """Open a file at a step, and return a client of the viewer.
 
+        Raises:
+            ViewerError: it does not answer.
+        """
+        from rerun.experimental import ViewerClient
 
-def _reason(log: Path | None) -> str:
-    """Return why a viewer did not start, as far as its output tells."""
-    text = log.read_text(errors="replace") if log and log.exists() else ""
-    if "graphics adapter" in text or "libEGL" in text or "Vulkan" in text or "libxkbcommon" in text:
-        return f": it finds no graphics. On Debian: apt-get install {MESA_PACKAGES}"
-    if "DISPLAY is set" in text:
-        return ": there is no screen here. Start one where there is, by `rerun`, and name its address."
-    last = [line for line in text.splitlines() if line.strip()][-1:]
-    return f": {last[0]}" if last else "."
+        try:
+            client = ViewerClient.connect(self.url)
+            client.open(path.resolve().as_uri())
+            client.set_time("step", sequence=step, play_state="paused")
+        except Exception as error:  # the transport raises various exceptions
+            has_ended = self.process.poll() is not None
+            raise self.error("ended" if has_ended else "does not answer") from error
+        return client
+
+    def error(self, what: str) -> ViewerError:
+        """Return the error that the viewer did something, with the reason as far as its output shows it."""
+        text = self._log.read_text(errors="replace")
+        if any(word in text for word in ("graphics adapter", "libEGL", "Vulkan", "libxkbcommon")):
+            reason = f": it finds no graphics. On Debian: apt-get install {MESA_PACKAGES}"
+        elif "DISPLAY is set" in text:
+            reason = ": there is no screen. Start `rerun` on a machine with one, and pass its address."
+        else:
+            reason = next((f": {line}" for line in reversed(text.splitlines()) if line.strip()), ".")
+        return ViewerError(f"the Rerun viewer {what}{reason}")
+
+    def end(self) -> None:
+        """End the viewer."""
+        self.process.terminate()
+        try:
+            self.process.wait(5)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
 
 
 @contextlib.contextmanager
-def headless(path: Path, step: int, size: str = "1600x900") -> Iterator[ViewerClient]:
-    """Give a viewer without a screen that shows a file at a step, when it has drawn.
+def viewer(port: int, *options: str) -> Iterator[Viewer]:
+    """Start a viewer that ends with the block.
 
     Raises:
         ViewerError: it cannot be started.
     """
-    import tempfile
-
-    from rerun.experimental import ViewerClient
-
     with tempfile.TemporaryDirectory() as folder:
-        port, log = free_port(), Path(folder) / "viewer.log"
-        with viewer(port, "--headless", "--hide-welcome-screen", "--window-size", size, log=log) as process:
-            client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
-            try:
-                client.open(path.resolve().as_uri())
-                client.set_time("step", sequence=step, play_state="paused")
-                time.sleep(SETTLE_SECONDS)
-            except Exception as error:  # the client raises whatever its transport does
-                ended = process.poll() is not None
-                raise ViewerError(
-                    f"the Rerun viewer {'ended' if ended else 'does not answer'}{_reason(log)}"
-                ) from error
-            yield client
+        started = Viewer(Path(folder) / "viewer.log", port, *options)
+        try:
+            yield started
+        finally:
+            started.end()
+
+
+@contextlib.contextmanager
+def headless(path: Path, step: int, size: str = "1600x900") -> Iterator[ViewerClient]:
+    """Start a viewer without a screen, and yield its client when it has drawn a file at a step.
+
+    Raises:
+        ViewerError: it cannot be started.
+    """
+    with viewer(free_port(), "--headless", "--hide-welcome-screen", "--window-size", size) as started:
+        client = started.show(path, step)
+        time.sleep(DRAW_SECONDS)
+        if started.process.poll() is not None:
+            raise started.error("ended")
+        yield client
 
 
 def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> None:
@@ -178,14 +239,6 @@ def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> 
         ViewerError: the viewer cannot be started, or draws nothing.
         StorageError: the picture cannot be written.
     """
-    import shutil
-    import tempfile
-
-    from runner.export.places import write_new
-
-    def keep(fresh: Path) -> None:
-        shutil.copyfile(drawn, fresh)
-
     with tempfile.TemporaryDirectory() as folder:
         drawn = Path(folder) / "screenshot.png"
         with headless(path, step, size) as client:
@@ -193,7 +246,7 @@ def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> 
             client.save_screenshot(str(drawn))
         if not drawn.exists():
             raise ViewerError(f"{picture}: the Rerun viewer has not drawn it.")
-        write_new(picture, True, keep)
+        write_new(picture, True, lambda temporary: shutil.copyfile(drawn, temporary))
 
 
 def live_window(port: int) -> str:
@@ -202,47 +255,13 @@ def live_window(port: int) -> str:
     Raises:
         ViewerError: it cannot be started.
     """
-    import tempfile
-
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "viewer.log"
-        arguments = [str(viewer_program()), "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
-        with log.open("wb") as output:
-            process = subprocess.Popen(
-                arguments, env=environment(), stdout=output, stderr=output, start_new_session=True
-            )
-        wait_for(process, port, log)
+        started = Viewer(log, port, "--hide-welcome-screen", detached=True)
         with contextlib.suppress(subprocess.TimeoutExpired):  # it listens before it looks for a screen
-            process.wait(SCREEN_SECONDS)
-            raise ViewerError(f"the Rerun viewer does not start{_reason(log)}")
-    return f"rerun+http://{LOOPBACK}:{port}/proxy"
-
-
-def check_address(url: str) -> str:
-    """Return the address of a viewer if something listens there.
-
-    Raises:
-        ViewerError: it is none, or nothing does.
-    """
-    from urllib.parse import urlsplit
-
-    parts = urlsplit(url)
-    try:
-        if not parts.scheme.startswith("rerun") or parts.hostname is None:
-            raise ValueError
-        place = (parts.hostname, parts.port or (443 if parts.scheme.endswith("https") else 80))
-    except ValueError:
-        raise RunnerError(
-            f"--live-url: found {url!r}, expected a viewer's address such as "
-            "rerun+http://127.0.0.1:9876/proxy"
-        ) from None
-    try:
-        socket.create_connection(place, timeout=ANSWER_SECONDS).close()
-    except OSError as error:
-        raise ViewerError(
-            f"{url}: nothing answers there ({error.strerror or error}); start a viewer by `rerun`."
-        ) from error
-    return url
+            started.process.wait(SCREEN_SECONDS)
+            raise started.error("does not start")
+    return started.url
 
 
 def open_window(path: Path, step: int, port: int) -> None:
@@ -251,36 +270,21 @@ def open_window(path: Path, step: int, port: int) -> None:
     Raises:
         ViewerError: the viewer cannot be started.
     """
-    import tempfile
-
-    from rerun.experimental import ViewerClient
-
-    with tempfile.TemporaryDirectory() as folder:
-        log = Path(folder) / "viewer.log"
-        with viewer(port, "--hide-welcome-screen", log=log) as process:
-            try:
-                client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
-                client.open(path.resolve().as_uri())
-                client.set_time("step", sequence=step, play_state="paused")
-            except Exception as error:  # the client raises whatever its transport does
-                raise ViewerError(f"the Rerun viewer cannot show the file{_reason(log)}") from error
-            process.wait()
-        if process.returncode:
-            raise ViewerError(f"the Rerun viewer ended with code {process.returncode}{_reason(log)}")
+    with viewer(port, "--hide-welcome-screen") as started:
+        started.show(path, step)
+        if code := started.process.wait():
+            raise started.error(f"ended with code {code}")
 
 
 @contextlib.contextmanager
-def web_viewer(path: Path, port: int) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """Serve a file and the web viewer on loopback; give the process and the address to open.
+def web_viewer(port: int, path: Path | None = None) -> Iterator[tuple[Viewer, str]]:
+    """Serve the web viewer on loopback, and a file; yield the viewer and the address to open.
 
     Raises:
         ViewerError: it cannot be started.
     """
-    import tempfile
-
     data = free_port()
-    with tempfile.TemporaryDirectory() as folder:
-        options = ("--serve-web", "--web-viewer-port", str(port), str(path.resolve()))
-        with viewer(data, *options, log=Path(folder) / "viewer.log") as process:
-            wait_for(process, port, Path(folder) / "viewer.log")
-            yield process, f"http://{LOOPBACK}:{port}/?url=rerun%2Bhttp://{LOOPBACK}:{data}/proxy"
+    files = [str(path.resolve())] if path else []
+    with viewer(data, "--serve-web", "--web-viewer-port", str(port), *files) as started:
+        started.wait_for(port)
+        yield started, f"http://{LOOPBACK}:{port}/?url=rerun%2Bhttp://{LOOPBACK}:{data}/proxy"

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import http.client
-import tempfile
 from dataclasses import dataclass
 from http import HTTPStatus
 from importlib import metadata
@@ -144,15 +143,11 @@ def _fetch_files(folder: Path) -> None:
     """Fetch the files from the executable, which serves them."""
     from runner.export.rerun import viewer
 
-    port, data = viewer.free_port(), viewer.free_port()
-    with tempfile.TemporaryDirectory() as place:
-        log = Path(place) / "viewer.log"
-        options = ("--serve-web", "--web-viewer-port", str(port))
-        with viewer.viewer(data, *options, log=log) as process:
-            viewer.wait_for(process, port, log)
-            for name in FILES:
-                with replacing(folder / name) as fresh:
-                    fresh.write_bytes(_fetch(port, name))
+    port = viewer.free_port()
+    with viewer.web_viewer(port):
+        for name in FILES:
+            with replacing(folder / name) as fresh:
+                fresh.write_bytes(_fetch(port, name))
 
 
 def _fetch(port: int, name: str) -> bytes:

@@ -79,11 +79,11 @@ def test_a_second_look_comes_from_the_cache(pictured):
     assert again.stat().st_ino == made
 
 
-def test_a_viewer_that_cannot_start_says_why(monkeypatch, tmp_path):
+def test_a_viewer_that_cannot_start_says_why(monkeypatch):
     monkeypatch.setattr(viewer, "viewer_program", lambda: "/bin/false")
     with (
         pytest.raises(RunnerError, match="does not start"),
-        viewer.viewer(viewer.free_port(), log=tmp_path / "log"),
+        viewer.viewer(viewer.free_port()),
     ):
         pass
 
