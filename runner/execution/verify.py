@@ -30,9 +30,10 @@ from runner.execution.session import Report, Session, recorder_for
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.blocks import message_record
-from runner.recording.consistency import Findings, Inconsistent, check_phase
+from runner.recording.consistency import Findings, check_phase
 from runner.recording.digest import ContentHash
 from runner.recording.integrity import check_integrity, may_be_cut, survey
+from runner.recording.loop_blocks import Inconsistent
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Report as BytesReport
 from runner.recording.reference import Reference

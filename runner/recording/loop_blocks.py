@@ -1,0 +1,207 @@
+"""The steps of a loop's recording in blocks, with the resets before them, for the check of consistency."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.recording import schema
+from runner.recording.reader import Recording
+from runner.recording.schema import NEVER
+
+_ROWS: Final = 4096
+"""Messages of varying size that are compared together."""
+_VALUES: Final = ("action", "observation", "next_observation", "seed", "seeded")
+"""The fields of such messages that are not compared."""
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+
+class Inconsistent(Exception):
+    """Something that does not follow from the rest: the message says what, and where."""
+
+
+@dataclass
+class Block:
+    """Steps of all environments, ordered by environment, and by time within each; cut into segments.
+
+    A segment is what a block holds of an episode.
+    """
+
+    first: int
+    times: int
+    """Steps of each environment."""
+    rows: NDArray[np.void]
+    number: Ints
+    """The number of each step."""
+    environment: Ints
+    opens: Bools
+    """Whether a step is the first of its environment in the block."""
+    resets: NDArray[np.void] | None
+    reset_rows: Ints
+    """The row that each reset comes before."""
+    over: Bools
+    """Whether a step terminated or truncated its episode."""
+    ends: Bools
+    """Whether an episode ended after a step."""
+
+    def __post_init__(self) -> None:
+        self.never = self.rows["t"] == NEVER
+        """Whether a step is a reset alone."""
+        self.was_reset = np.zeros(len(self.rows), np.bool_)
+        """Whether a reset came before a step."""
+        self.was_reset[self.reset_rows] = True
+        self.starts = self.opens | np.where(self.opens, False, np.roll(self.ends, 1)) | self.was_reset
+        self.segment = np.cumsum(self.starts) - 1
+        self.heads = np.flatnonzero(self.starts)
+        self.tails = np.append(self.heads[1:], len(self.rows)) - 1
+        self.owner = self.environment[self.heads]
+        self.opening = self.opens[self.heads]
+        self.continues = self.opening & ~self.was_reset[self.heads]
+        """Whether a segment continues an episode of the block before."""
+
+
+class Blocks:
+    """The blocks of a phase, each of whole steps of all environments.
+
+    Args:
+        recording: of a loop.
+        phase: `train` or `eval`.
+        complete: whether the recording was completed; else the blocks end at its last reset.
+    """
+
+    def __init__(self, recording: Recording, phase: str, complete: bool) -> None:
+        self._recording, self._phase, self._complete = recording, phase, complete
+        self._n = recording.environments
+        self.resets = Queue(records_of(recording, f"/{phase}/reset"))
+        self.episodes = Queue(records_of(recording, f"/{phase}/episode"))
+        self.steps = 0
+        """Steps in the blocks so far."""
+
+    def __iter__(self) -> Iterator[Block]:
+        stop = None
+        if not self._complete:  # the number of the step after the last recorded reset
+            blocks = records_of(self._recording, f"/{self._phase}/reset")
+            stop = max((int(block["step"][-1]) for block in blocks), default=0)
+        for rows in self._aligned(stop):
+            yield self._block(self.steps, rows)
+            self.steps += len(rows)
+
+    def _aligned(self, stop: int | None) -> Iterator[NDArray[np.void]]:
+        """Yield the steps up to number `stop`, as many of each environment in every block."""
+        left: NDArray[np.void] | None = None
+        done = 0
+        for block in records_of(self._recording, f"/{self._phase}/step"):
+            rows = block if left is None or not len(left) else np.concatenate([left, block])
+            if stop is not None:
+                rows = rows[: max(stop - done, 0)]
+            whole = len(rows) - len(rows) % self._n
+            left = rows[whole:]
+            if whole:
+                yield rows[:whole]
+            done += whole
+        if left is not None and len(left) and self._complete:
+            raise Inconsistent(
+                f"/{self._phase}/step: found {done + len(left)} steps, expected as many of each of the "
+                f"{self._n} environments"
+            )
+
+    def _block(self, first: int, rows: NDArray[np.void]) -> Block:
+        """Return steps with the resets before them."""
+        n, count, times = self._n, len(rows), len(rows) // self._n
+        order = np.arange(count).reshape(times, n).T.ravel()
+        rows = rows[order] if n > 1 else rows
+        opens = np.zeros(count, np.bool_)
+        opens[::times] = True
+        over = rows["terminated"] | rows["truncated"]
+        ends = over.copy()
+        if (
+            len(self._recording.agents) > 1 and n == 1
+        ):  # a game may end without an agent's end: its episode says so
+            for block in self.episodes.peek_while("last_step", first + count):
+                silent = ~(block["terminated"] | block["truncated"]) & (block["last_step"] >= first)
+                ends[block["last_step"][silent] - first] = True
+        resets, at = self.resets.take_while("step", first + count), np.empty(0, np.int64)
+        if resets is not None and len(resets):
+            step, environment = resets["step"], resets["environment"].astype(np.int64)
+            if ((environment >= n) | (step % n != 0) | (step < first)).any():
+                raise Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
+            at = environment * times + (step - first) // n
+        owner = np.repeat(np.arange(n), times)
+        return Block(first, times, rows, first + order, owner, opens, resets, at, over, ends)
+
+
+class Queue:
+    """The records of a topic in order, taken as they are needed."""
+
+    def __init__(self, blocks: Iterator[NDArray[np.void]]) -> None:
+        self._blocks = (block for block in blocks if len(block))
+        self._held: list[NDArray[np.void]] = []
+
+    def take(self, count: int) -> NDArray[np.void] | None:
+        """Return the next records, at most `count`; None if there are none."""
+        while sum(map(len, self._held)) < count and self._read():
+            continue
+        if not self._held:
+            return None
+        whole = np.concatenate(self._held)
+        self._held = [whole[count:]] if len(whole) > count else []
+        return whole[:count]
+
+    def take_while(self, name: str, stop: int) -> NDArray[np.void] | None:
+        """Return the next records whose field is below `stop`; the field never decreases."""
+        return self.take(sum(len(part) for part in self.peek_while(name, stop)))
+
+    def peek_while(self, name: str, stop: int) -> list[NDArray[np.void]]:
+        """Return the same records in parts, and leave them in the queue."""
+        while (not self._held or self._held[-1][name][-1] < stop) and self._read():
+            continue
+        parts = []
+        for part in self._held:
+            after = np.flatnonzero(part[name] >= stop)
+            parts.append(part[: after[0]] if after.size else part)
+            if after.size:
+                break
+        return parts
+
+    def _read(self) -> bool:
+        block = next(self._blocks, None)
+        if block is not None:
+            self._held.append(block)
+        return block is not None
+
+
+def records_of(recording: Recording, name: str) -> Iterator[NDArray[np.void]]:
+    """Yield the records of a topic in blocks; of messages of varying size all but the values of spaces.
+
+    Raises:
+        Inconsistent: messages of varying size are misnumbered, or have not one reward for each learner.
+    """
+    topic = recording.topic(name)
+    if topic in recording.dtypes:
+        yield from recording.blocks(topic)
+        return
+    learners, number = len(recording.agents), schema.NUMBERED_BY[topic.message]
+    kinds = {"rewards": ("f8", (learners,)), "terminated": "?", "truncated": "?"}
+    names = [field.name for field in topic.message.fields if field.name not in _VALUES]
+    dtype = np.dtype([*((name, kinds.get(name, "i8")) for name in names), ("log_time", "u8")])
+    rows: list[tuple[Any, ...]] = []
+    for expected, message in enumerate(recording.decoded(topic)):
+        if message[number] != expected:
+            raise Inconsistent(f"{name}: found {number} {message[number]}, expected {expected}")
+        if len(message.get("rewards", [None] * learners)) != learners:
+            raise Inconsistent(
+                f"{name}, {number} {expected}: found {len(message['rewards'])} rewards, expected {learners}"
+            )
+        values = (message[field] for field in dtype.names or ())
+        rows.append(tuple(tuple(value) if isinstance(value, list) else value for value in values))
+        if len(rows) == _ROWS:
+            yield np.array(rows, dtype)
+            rows = []
+    if rows:
+        yield np.array(rows, dtype)
