@@ -1,1 +1,1 @@
-"""What recordings tell: verification, tables at any step, and comparison. It reads, and writes nothing."""
+"""Reading recordings: evaluations, series of metrics, tables at any step, differences and comparisons."""

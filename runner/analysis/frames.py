@@ -38,16 +38,16 @@ Source = Run | Recording | str | os.PathLike[str]
 Phase = Literal["train", "eval"]
 
 _BEFORE: Final = ("step", "episode", "t", "state", "action", "next_state", "next_observation")
-_BEHIND: Final = ("terminated", "truncated", "explored", "acted", "agents_terminated", "agents_truncated")
-"""The fields of a step in the order of its columns: those before the rewards, and those behind them."""
+_AFTER: Final = ("terminated", "truncated", "explored", "acted", "agents_terminated", "agents_truncated")
+"""The fields of a step in the order of its columns: those before the rewards, and those after them."""
 
 
 def evaluations(run: Source) -> pd.DataFrame:
-    """Return a row for each evaluation: how the greedy policy did, and how training stood.
+    """Return a row for each evaluation: the results of the greedy policy, and the progress of training.
 
-    Columns: episode, success_percent (NaN where the environment does not say what success is),
-    mean_length, mean_penalties, ...; a column for each event, such as `taxi_1.drop_off`: how often it came
-    in all trials; `mean_return.AGENT` and `training.…` for training at that moment.
+    Columns: episode, success_percent (NaN where the environment does not define success),
+    mean_length, mean_penalties, ...; a column for each event, such as `taxi_1.drop_off`: its count
+    over all trials; `mean_return.AGENT`; and `training.…` for the progress of training.
 
     Raises:
         MissingExtra: pandas is not installed.
@@ -115,7 +115,7 @@ def steps(
 def transition_table(
     env_id: str = "dualtaxi:DualTaxi-v1", kwargs: Mapping[str, Any] | None = None, rewards: str = "team"
 ) -> pd.DataFrame:
-    """Return an environment's transition table in words: a row for each outcome that can happen.
+    """Return an environment's transition table, its states and actions described: a row for each outcome.
 
     Columns: state, action, probability, next_state, reward (of all agents together), is_over, and
     `reward.AGENT` where `rewards` is `individual`.
@@ -190,7 +190,7 @@ def step_columns(
     names = records.dtype.names or ()
     columns = _spread(_plain_columns(records, [name for name in _BEFORE if name in names]))
     columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in recording.agents])
-    return columns | _plain_columns(records, [name for name in _BEHIND if name in names])
+    return columns | _plain_columns(records, [name for name in _AFTER if name in names])
 
 
 # --- inside -------------------------------------------------------------------------------------------
@@ -198,7 +198,7 @@ def step_columns(
 
 @contextlib.contextmanager
 def _opened(run: Source) -> Iterator[Recording]:
-    """Give the run's recording, opened, if there is pandas; one that is open already stays open."""
+    """Yield the run's open recording, if pandas is installed; one that is open already stays open."""
     _frame([])
     if isinstance(run, Recording):
         yield run

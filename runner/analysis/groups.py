@@ -166,7 +166,7 @@ def _group(label: str, runs: Sequence[RunSeries]) -> Group:
     """Return a group of these runs, each once: of repetitions the last given, finished ones first."""
     best: dict[Hashable, RunSeries] = {}
     for run in runs:
-        # A job follows from its seed. Of loops only the content tells: workers of one training share a seed.
+        # A job follows from its seed; loops need their content, as workers of one training share a seed.
         identity = run.content_digest or run.run_id if is_loop(run) else run.seed
         key = (_content(run), identity)
         if key not in best or run.finished >= best[key].finished:

@@ -1,9 +1,9 @@
-"""The Q-table of a moment, told: size and fill, one state with its history, all of it as one array."""
+"""The Q-tables at a step: their size and fill, one state with its history, all values as one array."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,28 +15,56 @@ from runner.replay.history import history_of
 from runner.replay.tables import TableReplay, last_step, step_of_episode
 
 
-def at_moment(recording: Recording, step: int | None = None, episode: int | None = None) -> TableReplay:
-    """Return the tables after so many training steps, or episodes; the last there are unless told.
+class TableSummary(TypedDict):
+    """Size, fill and range of a learner's table."""
+
+    agent: str
+    states: int
+    actions: int
+    zero_cells: int
+    percent_filled: float
+    lowest: float
+    highest: float
+
+
+class ActionValue(TypedDict):
+    """The value of one action of a learner in a state, with its history."""
+
+    agent: str
+    action: int
+    action_in_words: str
+    value: float
+    policy: NotRequired[float]
+    """Probability of the action, where the algorithm learns a policy."""
+    greedy: bool
+    visits: int
+    changed_step: int | None
+    changed_episode: int | None
+
+
+def replay_at(recording: Recording, step: int | None = None, episode: int | None = None) -> TableReplay:
+    """Return the tables after a number of training steps, or episodes; by default after the last.
 
     Raises:
-        RecordingError: there is no such moment, or the steps before it are not recorded.
+        RecordingError: there is no such step, or the steps before it are not recorded.
     """
     if episode is not None:
         step = step_of_episode(recording, episode)
     return TableReplay(recording, last_step(recording) if step is None else step)
 
 
-def told_of(recording: Recording, replay: TableReplay, state: int | None = None) -> dict[str, Any]:
-    """Return what is told of the tables where a replay stands, as JSON can hold it.
+def describe_tables(recording: Recording, replay: TableReplay, state: int | None = None) -> dict[str, Any]:
+    """Return `run`, `step` and a summary of the `tables` at the step of a replay, as JSON can hold it.
+
+    With a state also `state`, `state_in_words`, its `visits`, and `values`, an `ActionValue` for each action.
 
     Raises:
         RunnerError: there is no such state.
         RecordingError: the steps are not recorded, which a state's history needs.
     """
-    told: dict[str, Any] = {"run": recording.run_id, "step": replay.step}
-    pairs = zip(replay.agents, replay.tables, strict=True)
-    told["tables"] = [summary_of(agent, values) for agent, values in pairs]
-    return told if state is None else told | state_of(recording, replay, state)
+    tables = [summarize(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]
+    summary = {"run": recording.run_id, "step": replay.step, "tables": tables}
+    return summary if state is None else summary | _describe_state(recording, replay, state)
 
 
 def one_array(tables: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -46,56 +74,50 @@ def one_array(tables: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """
     if len(tables) == 1:
         return tables[0]
-    whole = np.full((len(tables), len(tables[0]), max(values.shape[1] for values in tables)), np.nan)
-    for i, values in enumerate(tables):
-        whole[i, :, : values.shape[1]] = values
+    whole = np.full((len(tables), len(tables[0]), max(q.shape[1] for q in tables)), np.nan)
+    for i, q in enumerate(tables):
+        whole[i, :, : q.shape[1]] = q
     return whole
 
 
-def summary_of(agent: str, values: NDArray[np.float64]) -> dict[str, Any]:
-    """Return size, fill and range of a learner's table, as JSON can hold them."""
-    zeros = int(values.size - (values != 0).sum())
+def summarize(agent: str, q: NDArray[np.float64]) -> TableSummary:
+    """Return size, fill and range of a learner's table [states, actions]."""
+    zeros = int(q.size - np.count_nonzero(q))
     return {
         "agent": agent,
-        "states": values.shape[0],
-        "actions": values.shape[1],
+        "states": q.shape[0],
+        "actions": q.shape[1],
         "zero_cells": zeros,
-        "percent_filled": 100.0 * (values.size - zeros) / values.size,
-        "lowest": float(values.min()),
-        "highest": float(values.max()),
+        "percent_filled": 100.0 * (q.size - zeros) / q.size,
+        "lowest": float(q.min()),
+        "highest": float(q.max()),
     }
 
 
-def state_of(recording: Recording, replay: TableReplay, state: int) -> dict[str, Any]:
-    """Return the values of a state where the replay stands, their history, and its words.
-
-    Raises:
-        RunnerError: there is no such state.
-        RecordingError: the steps are not recorded.
-    """
+def _describe_state(recording: Recording, replay: TableReplay, state: int) -> dict[str, Any]:
     mdp = recording.mdp
     if state >= mdp.states:
         raise RunnerError(f"state: found {state}, expected one of 0 to {mdp.states - 1}.")
     history = history_of(recording, state, replay.step)
     joint, own = actions_in_words(mdp), action_names(mdp)
-    values = []
+    values: list[ActionValue] = []
     for i, (agent, held) in enumerate(zip(replay.agents, replay.held, strict=True)):
         q = held["q"]
         names = joint if q.shape[1] == mdp.joint_actions else own[i] if own else range(q.shape[1])
         for action, name in enumerate(names):
             changed = int(history.changed_step[i, action])
-            values.append(
-                {
-                    "agent": agent,
-                    "action": action,
-                    "action_in_words": str(name),
-                    "value": float(q[state, action]),
-                    **({"policy": float(held["policy"][state, action])} if "policy" in held else {}),
-                    "greedy": bool(replay.greedy[i, state] == action),
-                    "visits": int(history.visits[i, action]),
-                    "changed_step": None if changed < 0 else changed,
-                    "changed_episode": None if changed < 0 else int(history.changed_episode[i, action]),
-                }
-            )
+            value: ActionValue = {
+                "agent": agent,
+                "action": action,
+                "action_in_words": str(name),
+                "value": float(q[state, action]),
+                "greedy": bool(replay.greedy[i, state] == action),
+                "visits": int(history.visits[i, action]),
+                "changed_step": None if changed < 0 else changed,
+                "changed_episode": None if changed < 0 else int(history.changed_episode[i, action]),
+            }
+            if "policy" in held:
+                value["policy"] = float(held["policy"][state, action])
+            values.append(value)
     words = str(states_in_words(mdp)[state])
     return {"state": state, "state_in_words": words, "visits": int(history.visits[0].sum()), "values": values}

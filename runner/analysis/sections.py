@@ -1,4 +1,4 @@
-"""Sections of sentences and tables: what text, Markdown and pages have in common."""
+"""Sections of sentences and tables, from which text, Markdown and pages are rendered."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class Section:
-    """A title, and what is said under it."""
+    """A title with sentences and tables."""
 
     title: str
     sentences: list[str] = field(default_factory=list)

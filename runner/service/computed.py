@@ -126,13 +126,13 @@ def q_table(path: Path, step: int | None, episode: int | None, state: int | None
         RecordingError: there is no such moment, or the steps before it are not recorded.
         RunnerError: there is no such state.
     """
-    from runner.analysis.qtable import at_moment, one_array, told_of
+    from runner.analysis.qtable import describe_tables, one_array, replay_at
 
     with open_recording(path) as recording:
         recording.require_job("a Q-table", "A loop's arrays are in its recording.")
-        replay = at_moment(recording, step, episode)
+        replay = replay_at(recording, step, episode)
         if form == "json":
-            return as_json(told_of(recording, replay, state))
+            return as_json(describe_tables(recording, replay, state))
         stream = io.BytesIO()
         np.save(stream, one_array(replay.tables))
         return stream.getvalue()

@@ -3,13 +3,13 @@
     groups, notes = grouped([read_series(recording) for recording in recordings])
     comparison = compare(groups, [("success_percent", "")], Moment("last"), notes)
 
-What a number means is said in `runner.analysis.compare.statistics`.
+`runner.analysis.compare.statistics` explains the numbers.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -32,7 +32,7 @@ Measured = dict[Seed, tuple[list[str], float]]
 
 @dataclass(frozen=True)
 class GroupResult:
-    """One group's values of one metric, a seed each; those that no seed has are not here."""
+    """One group's values of one metric, one for each seed that has any."""
 
     label: str
     seeds: list[Seed]
@@ -49,7 +49,7 @@ class GroupResult:
 
     @property
     def n(self) -> int:
-        """How many seeds."""
+        """Number of seeds."""
         return len(self.values)
 
 
@@ -68,10 +68,7 @@ class PairResult:
     iqm: Estimate
     """Of the same differences."""
     simultaneous: Estimate
-    """The same IQM, with an interval that holds together with those of all pairs and metrics compared.
-
-    Without an interval where there is one pair of one metric only.
-    """
+    """The same IQM with an interval that holds together with all others; nan for a single pair."""
     improvement: Estimate
     """Probability that a run of A is better than one of B; higher, where nobody can say what is better."""
     wins: int
@@ -88,7 +85,7 @@ class MetricResult:
 
     metric: str
     line: str
-    """Whose, such as taxi_1; empty if it is of the run."""
+    """An agent such as taxi_1, or another line of the metric; empty if it has one line."""
     title: str
     unit: str
     higher_is_better: bool | None
@@ -105,7 +102,7 @@ class MetricResult:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What comes out of comparing groups."""
+    """The result of comparing groups."""
 
     moment: str
     groups: dict[str, list[str]]
@@ -123,97 +120,85 @@ def compare(
         groups: of runs.
         metrics: (metric, line) pairs, as `runner.analysis.series` names them.
         moment: at which the metrics are read.
-        notes: what is to be said beside what is noted here.
+        notes: sentences to add to the comparison's own.
 
     Raises:
         MissingExtra: SciPy is not installed.
     """
     statistics.require_scipy()
     results = [_metric(groups, metric, line, moment) for metric, line in metrics]
+    pairs = [pair for metric in results for pair in metric.pairs]
+    if len(pairs) > 1:  # their intervals are widened to hold together
+        widened = iter(statistics.simultaneous([pair.differences for pair in pairs]))
+        results = [
+            replace(metric, pairs=[replace(pair, simultaneous=next(widened)) for pair in metric.pairs])
+            for metric in results
+        ]
     return Comparison(
         moment=moment.described,
         groups={group.label: [run.run_id for run in group.runs] for group in groups},
-        metrics=_with_simultaneous_intervals(results),
-        notes=[*notes, *_worlds(groups), *_untested(metrics), *_identical(groups), *_few(groups)],
+        metrics=results,
+        notes=[*notes, *_notes(groups, metrics)],
     )
 
 
-def _with_simultaneous_intervals(metrics: list[MetricResult]) -> list[MetricResult]:
-    """Return the metrics with the intervals of all their pairs widened to hold together; one needs none."""
-    pairs = [pair for metric in metrics for pair in metric.pairs]
-    if len(pairs) < 2:
-        return metrics
-    widened = iter(statistics.simultaneous([pair.differences for pair in pairs]))
-    return [
-        replace(metric, pairs=[replace(pair, simultaneous=next(widened)) for pair in metric.pairs])
-        for metric in metrics
-    ]
-
-
-def _identical(groups: Sequence[Group]) -> list[str]:
-    """Return a note for each two groups whose runs have the same content."""
+def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]]) -> Iterator[str]:
+    """Yield what limits the comparison of these groups: environments, metrics, equal contents, few seeds."""
+    environments = {
+        group.label: run.config["env"]["id"]
+        for group in groups
+        for run in group.runs
+        if not is_loop(run) and "env" in run.config
+    }
+    if len(set(environments.values())) > 1:
+        where = ", ".join(f"{env_id} in {label}" for label, env_id in environments.items())
+        yield f"the environments differ ({where}): their figures do not measure the same"
+    if all(metric.startswith("training.") for metric, _ in metrics):
+        yield "training is compared, as last reported; --at area takes the mean over all of it"
     digests = {
         group.label: sorted((run.seed or 0, run.content_digest) for run in group.runs)
         for group in groups
         if all(run.content_digest for run in group.runs)
     }
-    return [
-        f"{a} and {b} are identical: their runs have the same content, seed by seed"
-        for a, b in itertools.combinations(digests, 2)
-        if digests[a] == digests[b]
-    ]
-
-
-def _worlds(groups: Sequence[Group]) -> list[str]:
-    """Return a note if the groups were not trained in the same environment."""
-    jobs = [(group.label, run.config) for group in groups for run in group.runs if not is_loop(run)]
-    told = {label: config["env"]["id"] for label, config in jobs if "env" in config}
-    if len(set(told.values())) < 2:
-        return []
-    where = ", ".join(f"{env_id} in {label}" for label, env_id in told.items())
-    return [f"the environments differ ({where}): their figures do not measure the same"]
-
-
-def _untested(metrics: Sequence[tuple[str, str]]) -> list[str]:
-    if not all(metric.startswith("training.") for metric, _ in metrics):
-        return []
-    return ["training is compared, as last reported; --at area takes the mean over all of it"]
-
-
-def _few(groups: Sequence[Group]) -> list[str]:
+    for a, b in itertools.combinations(digests, 2):
+        if digests[a] == digests[b]:
+            yield f"{a} and {b} are identical: their runs have the same content, seed by seed"
     seeds = {group.label: len({_seed(run) for run in group.runs}) for group in groups}
     few = [group for group in groups if seeds[group.label] < statistics.FEW_SEEDS]
-    if not few:
-        return []
-    told = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
-    loops = all(is_loop(run) for group in few for run in group.runs)
-    more = "record more, each with a seed of its own" if loops else "`--set 'seeds={count: 10}'` runs ten"
-    return [
-        f"fewer than {statistics.FEW_SEEDS} seeds in {told}: bootstrap intervals of so few are too narrow "
-        f"(at 4 seeds one of 95 % covers 86 % of the time), so take them as a hint; {more}"
-    ]
+    if few:
+        listed_groups = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
+        loops = all(is_loop(run) for group in few for run in group.runs)
+        more = "record more, each with a seed of its own" if loops else "`--set 'seeds={count: 10}'` runs ten"
+        yield (
+            f"fewer than {statistics.FEW_SEEDS} seeds in {listed_groups}: bootstrap intervals of so few are "
+            "too narrow (at 4 seeds one of 95 % covers 86 % of the time), so take them as a hint; " + more
+        )
 
 
 def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> MetricResult:
     notes: list[str] = []
-    found = [(group.label, _values(group, metric, line, moment, groups, notes)) for group in groups]
+    found = {group.label: _values(group, metric, line, moment, groups, notes) for group in groups}
+    present = {label: values for label, values in found.items() if values}
     title, unit = title_of(metric)
-    better = False if moment.level is not None else higher_is_better(metric, groups)
+    better = higher_is_better(metric, groups)
+    notes += _uneven_ends(groups, metric, line) if moment.kind == "last" else []
     if moment.level is not None:
-        title, unit = f"{title}: first at {moment.level:g}", "training episodes"
+        better, title, unit = False, f"{title}: first at {moment.level:g}", "training episodes"
+        for label, values in present.items():
+            reached = sum(value < statistics.NEVER for _, value in values.values())
+            notes.append(f"{label}: {reached} of {len(values)} seeds reach it")
     sign = -1.0 if better is False else 1.0
-    present = [(label, values) for label, values in found if values]
-    thresholds = _thresholds([run[1] for _, values in present for run in values.values()], sign)
+    thresholds = _thresholds([value for values in present.values() for _, value in values.values()], sign)
     return MetricResult(
         metric,
         line,
         title,
         unit,
         better,
-        [_group(label, values, thresholds, sign) for label, values in present],
-        [_pair(*a, *b, sign) for a, b in itertools.combinations(present, 2)],
+        [_group(label, values, thresholds, sign) for label, values in present.items()],
+        [_pair(*a, *b, sign) for a, b in itertools.combinations(present.items(), 2)],
         thresholds.tolist(),
-        [*notes, *_ends(groups, metric, line, moment), *_reached(present, moment)],
+        notes,
     )
 
 
@@ -223,14 +208,14 @@ def _seed(run: RunSeries) -> Seed:
 
 
 def _order(seed: Seed) -> tuple[bool, Seed]:
-    """Return what seeds are sorted by: numbers first."""
+    """Return the sort key of a seed: numbers come first."""
     return isinstance(seed, str), seed
 
 
 def _values(
     group: Group, metric: str, line: str, moment: Moment, groups: Sequence[Group], notes: list[str]
 ) -> Measured:
-    """Return the values of a group; says in `notes` which runs are left out."""
+    """Return the values of a group; `notes` gets the runs that are left out."""
     found: dict[Seed, list[tuple[str, float]]] = {}
     without: dict[str, list[str]] = {}
     for run in group.runs:
@@ -240,8 +225,8 @@ def _values(
         else:
             found.setdefault(_seed(run), []).append((run.run_id, value))
     notes += [f"{group.label}, left out: {listed(runs)} ({reason})" for reason, runs in without.items()]
-    if any(len(runs) > 1 for runs in found.values()):
-        count = sum(map(len, found.values()))
+    count = sum(map(len, found.values()))
+    if count > len(found):
         notes.append(
             f"{group.label}: {count} runs of {len(found)} seeds, each seed with the mean of its runs"
         )
@@ -251,34 +236,22 @@ def _values(
     }
 
 
-def _ends(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> list[str]:
-    """Return a note if the last evaluation comes after other numbers of episodes in the groups."""
-    if moment.kind != "last":
-        return []
+def _uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
+    """Return a note if the last evaluation comes after different numbers of episodes in the groups."""
     curves = [
         (group.label, points)
         for group in groups
         for run in group.runs
         if run.finished and (points := points_of(run, metric, line, aligned=True))
     ]
-    told = {label: max(points) for label, points in curves}
-    if len(set(told.values())) < 2:
+    last = {label: max(points) for label, points in curves}
+    if len(set(last.values())) < 2:
         return []
-    ends = ", ".join(f"after {end:,} episodes in {label}" for label, end in told.items())
-    last = "report of training" if metric.startswith("training.") else "evaluation"
+    ends = ", ".join(f"after {end:,} episodes in {label}" for label, end in last.items())
+    what = "report of training" if metric.startswith("training.") else "evaluation"
     shared = set.intersection(*(set(points) for _, points in curves))
-    again = f"; --at {max(shared)} compares after as many" if shared else ""
-    return [f"the last {last} is {ends}{again}"]
-
-
-def _reached(present: Sequence[tuple[str, Measured]], moment: Moment) -> list[str]:
-    """Return how many runs of each group reach the level, if it is about one."""
-    if moment.level is None:
-        return []
-    counts = {
-        label: sum(value < statistics.NEVER for _, value in values.values()) for label, values in present
-    }
-    return [f"{label}: {counts[label]} of {len(values)} seeds reach it" for label, values in present]
+    hint = f"; --at {max(shared)} compares after as many" if shared else ""
+    return [f"the last {what} is {ends}{hint}"]
 
 
 def _thresholds(values: Sequence[float], sign: float) -> Values:

@@ -1,4 +1,4 @@
-"""When a metric is read: at the last or best evaluation, after so many episodes, over all, at a crossing."""
+"""When a metric is read: at the last or best evaluation, after some episodes, over all, at a crossing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def higher_is_better(metric: str, groups: Sequence[Group]) -> bool | None:
 
 @dataclass(frozen=True)
 class Moment:
-    """A moment, or a way to sum a curve up in one number.
+    """A moment, or a way to reduce a curve to one number.
 
     last: the last evaluation. best: the best of all. area: the mean of the curve by the trapezoid rule,
     over the episodes that every run has. episode: the evaluation after `number` training episodes.
@@ -36,7 +36,7 @@ class Moment:
 
     @property
     def described(self) -> str:
-        """The moment in words."""
+        """A description of the moment."""
         return {
             "last": "at the last evaluation",
             "best": "at each run's best evaluation",
@@ -49,7 +49,7 @@ class Moment:
 
 
 def moment_of(at: str, target: str | None, chosen: Sequence[str]) -> tuple[Moment, Sequence[str]]:
-    """Return the moment asked for, and the metrics: a target names its own.
+    """Return the moment that options stand for, and the metrics: a target names its own.
 
     Args:
         at: `last`, `best`, `area`, or a number of training episodes.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 
@@ -12,9 +13,9 @@ from runner.analysis.compare.statistics import Estimate
 from runner.analysis.sections import Grid, Section
 from runner.util.humanize import listed
 
-_LEVELS = 5
-"""So many points of a performance profile are printed."""
-EXPLANATION = (
+_MAX_LEVELS: Final = 5
+"""Points of a performance profile that are printed."""
+EXPLANATION: Final = (
     "IQM: interquartile mean, of the middle half of the seeds. In brackets: 95 % percentile bootstrap "
     "intervals (Agarwal et al. 2021). Differences are taken seed by seed, as runs of one seed share their "
     "draws. P: the probability that a run of A does better than one of B, over all pairs of their seeds, "
@@ -25,10 +26,10 @@ EXPLANATION = (
 
 
 def sections(comparison: Comparison) -> list[Section]:
-    """Return what is to be said of a comparison."""
+    """Return the text of a comparison."""
     rows = [(label, str(len(ids)), listed(ids)) for label, ids in comparison.groups.items()]
-    said = [*in_short(comparison), *(f"Note: {note}." for note in comparison.notes)]
-    first = Section("Groups", said, [Grid(("group", "runs", ""), rows)])
+    sentences = [*summary(comparison), *(f"Note: {note}." for note in comparison.notes)]
+    first = Section("Groups", sentences, [Grid(("group", "runs", ""), rows)])
     return [
         first,
         *(metric_section(metric) for metric in comparison.metrics),
@@ -36,15 +37,15 @@ def sections(comparison: Comparison) -> list[Section]:
     ]
 
 
-def in_short(comparison: Comparison) -> list[str]:
-    """Return what came out of the first metric, a sentence for each pair of groups."""
+def summary(comparison: Comparison) -> list[str]:
+    """Return the outcome of the first metric, a sentence for each pair of groups."""
     for metric in comparison.metrics:
         if metric.pairs:
-            return [_told(metric, pair) for pair in metric.pairs if pair.seeds]
+            return [_pair_in_words(metric, pair) for pair in metric.pairs if pair.seeds]
     return []
 
 
-def _told(metric: MetricResult, pair: PairResult) -> str:
+def _pair_in_words(metric: MetricResult, pair: PairResult) -> str:
     word = "higher" if metric.higher_is_better is None else "better"
     if pair.ties == len(pair.seeds):
         return f"{metric.title}, in {metric.unit}: {pair.a} and {pair.b} are equal at all {pair.ties} seeds."
@@ -62,14 +63,14 @@ def _told(metric: MetricResult, pair: PairResult) -> str:
 
 
 def metric_section(metric: MetricResult, profile: bool = True) -> Section:
-    """Return what is to be said of one metric.
+    """Return the text of one metric.
 
     Args:
-        metric: which.
+        metric: the result.
         profile: also a few points of the performance profile.
     """
     better = {True: "higher is better", False: "lower is better", None: "neither is better as such"}
-    whose = f", {metric.line.replace('_', ' ')}" if metric.line else ""
+    line = f", {metric.line.replace('_', ' ')}" if metric.line else ""
     grids = [Grid(("", "n", "median", "IQM", "95 %"), [_group(group) for group in metric.groups])]
     if metric.pairs:
         word = "higher" if metric.higher_is_better is None else "better"
@@ -83,27 +84,27 @@ def metric_section(metric: MetricResult, profile: bool = True) -> Section:
         grids.append(Grid(headings, [_pair(pair, together) for pair in metric.pairs]))
     if profile and len(metric.thresholds) > 1:
         grids.append(_profile(metric))
-    said = [f"{metric.name}, in {metric.unit}; {better[metric.higher_is_better]}."]
-    said += [f"Note: {note}." for note in (*metric.notes, *unpaired(metric.pairs))]
-    return Section(metric.title + whose, said, grids)
+    sentences = [f"{metric.name}, in {metric.unit}; {better[metric.higher_is_better]}."]
+    sentences += [f"Note: {note}." for note in (*metric.notes, *unpaired(metric.pairs))]
+    return Section(metric.title + line, sentences, grids)
 
 
 def unpaired(pairs: Sequence[PairResult]) -> list[str]:
     """Return which seeds are left out of the pairs, a sentence each."""
-    said = []
+    sentences = []
     for pair in pairs:
         for own, other, seeds in ((pair.a, pair.b, pair.left_out_a), (pair.b, pair.a, pair.left_out_b)):
             if without := [seed for seed in seeds if isinstance(seed, str)]:
-                said.append(
+                sentences.append(
                     f"{pair.a} against {pair.b} without {listed(without)} of {own}: only runs with a seed "
                     "can be paired"
                 )
             if numbers := [str(seed) for seed in seeds if not isinstance(seed, str)]:
                 left_out = listed(numbers)
-                said.append(
+                sentences.append(
                     f"{pair.a} against {pair.b} without seed {left_out}, which {own} has and {other} has not"
                 )
-    return said
+    return sentences
 
 
 def _group(group: GroupResult) -> tuple[str, ...]:
@@ -126,7 +127,7 @@ def _pair(pair: PairResult, together: bool) -> tuple[str, ...]:
 
 def _profile(metric: MetricResult) -> Grid:
     """Return a few points of the performance profile."""
-    at = np.unique(np.linspace(0, len(metric.thresholds) - 1, _LEVELS).round().astype(int)).tolist()
+    at = np.unique(np.linspace(0, len(metric.thresholds) - 1, _MAX_LEVELS).round().astype(int)).tolist()
     sign = "at most" if metric.higher_is_better is False else "at least"
     rows = [(group.label, *(f"{100 * group.profile[k]:.0f} %" for k in at)) for group in metric.groups]
     return Grid((f"share of runs {sign}", *(number(metric.thresholds[k]) for k in at)), rows)

@@ -42,10 +42,10 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
       dualtaxi show @latest
       dualtaxi show k3v9m2xq --json
     """
-    from runner.analysis.summary import described
+    from runner.analysis.summary import describe_run
 
     run = restored(find(run_name, recordings))
-    values = described(run, say)
+    values = describe_run(run, say)
     if as_json:
         print_json(values)
     else:

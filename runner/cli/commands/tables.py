@@ -73,7 +73,7 @@ def qtable_command(
         raise click.UsageError("--step and --episode exclude each other: choose one.")
     import numpy as np
 
-    from runner.analysis.qtable import at_moment, one_array, told_of
+    from runner.analysis.qtable import describe_tables, one_array, replay_at
     from runner.recording.reader import open_recording
 
     if output is not None:
@@ -84,8 +84,8 @@ def qtable_command(
         compilation_notice(),
         stage_line("replaying recorded steps"),
     ):
-        replay = at_moment(recording, step, episode)
-        values = told_of(recording, replay, state)
+        replay = replay_at(recording, step, episode)
+        values = describe_tables(recording, replay, state)
         array = one_array(replay.tables)
     if output is not None:
 

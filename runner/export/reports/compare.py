@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 from runner.analysis.compare import Comparison, MetricResult
-from runner.analysis.compare.sections import EXPLANATION, in_short, metric_section
+from runner.analysis.compare.sections import EXPLANATION, metric_section, summary
 from runner.analysis.groups import Group
 from runner.analysis.sections import Grid
 from runner.export.plots.comparisons import intervals_svg, letter, profile_svg
@@ -77,7 +77,7 @@ def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
     return render(
         ComparisonView(
             title=" against ".join(labels) if len(labels) < 4 else f"{len(labels)} groups of runs compared",
-            lead=in_short(comparison),
+            lead=summary(comparison),
             notes=comparison.notes,
             legend=[
                 LegendEntry(letter(i), f"{group.label}: {len(group.runs)} run{'s'[: len(group.runs) - 1]}")

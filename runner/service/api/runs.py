@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from runner.analysis.summary import described
+from runner.analysis.summary import describe_run
 from runner.recording.labels import MAX_NOTE, MAX_TAGS
 from runner.runs.catalogue.columns import DEFAULT_JSON, columns_of
 from runner.runs.catalogue.columns import as_json as row_as_json
@@ -129,7 +129,7 @@ def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
     """Return all about a run but its series; what `run.json` says if its recording cannot be read."""
     problems: list[str] = []
     error = run.summary.error
-    told = described(run, problems.append)
+    told = describe_run(run, problems.append)
     series = {name: told.pop(name) for name in ("eval", "train", "optimality")}
     del told["path"]
     return told | {

@@ -12,7 +12,7 @@ import pytest
 import runner
 from runner.analysis.compare import compare, statistics
 from runner.analysis.compare.moments import Moment
-from runner.analysis.compare.sections import in_short, sections
+from runner.analysis.compare.sections import sections, summary
 from runner.analysis.groups import grouped, groups_of, metrics_of
 from runner.analysis.sections import markdown
 from runner.analysis.series import RunSeries
@@ -144,7 +144,7 @@ def test_workers_of_one_training_are_one_value_of_their_seed():
     assert [group.values for group in metric.groups] == [[3.0], [3.0]]
     assert [len(group.run_ids) for group in metric.groups] == [2, 3]
     assert "2 runs of 1 seeds, each seed with the mean of its runs" in metric.notes[0]
-    assert "are equal at all 1 seeds" in in_short(compared)[0]
+    assert "are equal at all 1 seeds" in summary(compared)[0]
 
 
 def test_identical_groups_are_said_to_be_identical():
@@ -153,7 +153,7 @@ def test_identical_groups_are_said_to_be_identical():
 
     same = result(digested(two_groups([10, 20, 30], [10, 20, 30])))
     assert "are identical: their runs have the same content, seed by seed" in same.notes[0]
-    assert "a and b are equal at all 3 seeds" in in_short(same)[0]
+    assert "a and b are equal at all 3 seeds" in summary(same)[0]
 
 
 def test_equal_values_have_an_interval_of_no_width():
@@ -358,7 +358,7 @@ def test_a_longer_episode_is_not_worse_in_a_loop_whose_environment_has_no_goal()
         ("mean_return", True),
         ("mean_length", None),
     ]
-    assert "a, lr=0.1 is better than a, lr=0.2 at 1 of 1 seeds" in in_short(compared)[0]
+    assert "a, lr=0.1 is better than a, lr=0.2 at 1 of 1 seeds" in summary(compared)[0]
 
 
 def test_loops_without_evaluation_are_compared_by_their_training():
