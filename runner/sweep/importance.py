@@ -1,10 +1,9 @@
-"""What mattered in a search: shares of variance of parameters and of their pairs (functional ANOVA).
+"""Which parameters mattered: shares of variance of parameters and of their pairs (functional ANOVA).
 
 F. Hutter, H. Hoos and K. Leyton-Brown, "An efficient approach for assessing hyperparameter importance",
 ICML 2014: random forests predict the objective at every point of a grid, and the variance over the grid is
-taken apart into that of each parameter on its own (main effects) and of each two of them beyond that
-(interactions). Shares are of the whole variance and are not normalised: what they leave is due to three and
-more.
+divided into that of each parameter alone (main effects) and of each pair beyond that (interactions). Shares
+are not normalized: the rest is due to three and more parameters.
 """
 
 from __future__ import annotations
@@ -19,30 +18,28 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import MissingExtra
 from runner.sweep.model import Range
+from runner.util.extras import require
 
 FORESTS: Final = 30
 TREES: Final = 32
 RESAMPLES: Final = 200
 MAX_POINTS: Final = 20_000
-"""Points of the grid that forests predict; it is coarser where there are many parameters."""
+"""Points of the grid that forests predict; the grid is coarser for many parameters."""
 MAX_LEVELS: Final = 12
 MIN_TRIALS: Final = 4
 
 
 @dataclass(frozen=True)
 class Effect:
-    """What one parameter, or two together beyond what each does alone, has to do with the objective."""
+    """The effect of one parameter, or of two together beyond what each does alone, on the objective."""
 
     parameters: tuple[str, ...]
     share: float
-    """Of the variance; from forests, the median over them."""
+    """Share of the variance; from forests, the median over them."""
     low: float
     high: float
-    """The interval in which 95 % of the forests have it, each of resampled trials; of a whole grid, 95 % of
-    the resamples of its seeds.
-    """
+    """The interval of 95 % of the forests, each of resampled trials; of a whole grid, of resampled seeds."""
 
 
 def effects_of(
@@ -50,20 +47,17 @@ def effects_of(
     trials: Sequence[Mapping[str, Any]],
     values: Sequence[float],
 ) -> list[Effect]:
-    """Return main effects and interactions, the largest first; none if too little is known.
+    """Return main effects and interactions, the largest first; empty for too few trials.
 
     Args:
-        parameters: by path: what was tried.
+        parameters: the values tried, by path.
         trials: the values of the parameters in each completed trial.
-        values: the objective of each, finite.
+        values: the objective of each trial, finite.
 
     Raises:
         MissingExtra: scikit-learn is not installed.
     """
-    try:
-        import sklearn.tree  # noqa: F401
-    except ImportError as error:
-        raise MissingExtra("scikit-learn", "sweep", "what mattered in a sweep") from error
+    require("sklearn.tree", extra="sweep", purpose="the importance of a sweep's parameters")
     names = list(parameters)
     if len(trials) < MIN_TRIALS or len(set(values)) < 2 or 2 ** len(names) > MAX_POINTS:
         return []
@@ -73,29 +67,29 @@ def effects_of(
     known, objective = _coded(parameters, trials), np.asarray(values, np.float64)
     shape = tuple(len(own) for own in levels.values())
     rng = np.random.default_rng(0)
-    found: list[dict[tuple[int, ...], float]] = []
+    all_shares: list[dict[tuple[int, ...], float]] = []
     for forest in range(FORESTS):
         drawn = rng.integers(0, len(trials), len(trials))
         predicted = forest_prediction(known[drawn], objective[drawn], coded, forest)
         shares = shares_of_variance(predicted.reshape(shape))
         if shares:
-            found.append(shares)
-    return _summed_up(names, found)
+            all_shares.append(shares)
+    return _effects(names, all_shares)
 
 
 def forest_prediction(
     x: NDArray[np.float64], y: NDArray[np.float64], points: NDArray[np.float64], seed: int
 ) -> NDArray[np.float64]:
-    """Return what a random forest of `TREES` trees predicts.
+    """Return the predictions of a random forest of `TREES` trees.
 
-    The result is that of `sklearn.ensemble.RandomForestRegressor` to the last bit, for two thirds of its
-    time: with the few trials of a sweep, its bookkeeping takes longer than its trees.
+    They equal those of `sklearn.ensemble.RandomForestRegressor` to the last bit, in two thirds of its time:
+    with the few trials of a sweep, its overhead takes longer than its trees.
 
     Args:
         x: [trials, columns].
         y: [trials].
         points: [points, columns].
-        seed: of the forest.
+        seed: the seed of the forest.
 
     Returns:
         [points].
@@ -106,7 +100,7 @@ def forest_prediction(
     features, target = x.astype(np.float32), y[:, np.newaxis]
     grid, count = points.astype(np.float32), len(y)
     total = np.zeros(len(points))
-    tree_seeds = np.random.RandomState(seed)  # the generator that scikit-learn takes for an integer
+    tree_seeds = np.random.RandomState(seed)  # as scikit-learn makes of an integer
     with sklearn.config_context(assume_finite=True, skip_parameter_validation=True):
         for tree_seed in [tree_seeds.randint(np.iinfo(np.int32).max) for _ in range(TREES)]:
             drawn = np.random.RandomState(tree_seed).randint(0, count, count, dtype=np.int32)
@@ -120,11 +114,11 @@ def forest_prediction(
 def effects_of_grid(
     parameters: Mapping[str, Range | list[Any]], seed_values: Sequence[Sequence[float]]
 ) -> list[Effect]:
-    """Return main effects and interactions of a grid whose points were all completed: no forest is needed.
+    """Return main effects and interactions of a grid whose points were all completed, without a forest.
 
     Args:
-        parameters: by path.
-        seed_values: of each point, the last parameter changing fastest: the objective at each seed, finite.
+        parameters: the values of the grid, by path.
+        seed_values: the objective at each seed, finite, of each point; the last parameter changes fastest.
             The interval is over resampled seeds.
     """
     shape = tuple(each.steps + 1 if isinstance(each, Range) else len(each) for each in parameters.values())
@@ -134,7 +128,7 @@ def effects_of_grid(
     for _ in range(RESAMPLES):
         medians = [np.median(rng.choice(own, len(own))) for own in map(np.asarray, seed_values)]
         resampled.append(shares_of_variance(np.array(medians).reshape(shape)))
-    effects = _summed_up(list(parameters), [shares for shares in resampled if shares]) if exact else []
+    effects = _effects(list(parameters), [shares for shares in resampled if shares]) if exact else []
     names = list(parameters)
     shares = {tuple(names[axis] for axis in axes): share for axes, share in exact.items()}
     effects = [replace(effect, share=shares[effect.parameters]) for effect in effects]
@@ -142,10 +136,10 @@ def effects_of_grid(
 
 
 def shares_of_variance(values: NDArray[np.float64]) -> dict[tuple[int, ...], float]:
-    """Return the share of the variance over a full grid of each axis, (i,), and of each two, (i, j).
+    """Return the share of the variance over a full grid of each axis, (i,), and of each pair, (i, j).
 
-    The interaction of two axes is what their joint means vary beyond the two main effects. Empty if the
-    values do not vary.
+    The interaction of two axes is the variance of their joint means beyond the two main effects. Empty if
+    the values do not vary.
     """
     total = float(values.var())
     axes = range(values.ndim)
@@ -162,19 +156,20 @@ def shares_of_variance(values: NDArray[np.float64]) -> dict[tuple[int, ...], flo
     return shares
 
 
-def _summed_up(names: Sequence[str], found: Sequence[Mapping[tuple[int, ...], float]]) -> list[Effect]:
-    if not found:
+def _effects(names: Sequence[str], all_shares: Sequence[Mapping[tuple[int, ...], float]]) -> list[Effect]:
+    """Return the median and the interval of each share, the largest first."""
+    if not all_shares:
         return []
     effects = []
-    for axes in found[0]:
-        shares = [shares[axes] for shares in found]
+    for axes in all_shares[0]:
+        shares = [each[axes] for each in all_shares]
         low, middle, high = np.quantile(shares, [0.025, 0.5, 0.975]).tolist()
         effects.append(Effect(tuple(names[axis] for axis in axes), middle, low, high))
     return sorted(effects, key=lambda effect: -effect.share)
 
 
 def _levels(parameter: Range | list[Any], parameters: int) -> list[Any]:
-    """Return values that stand for a parameter in the grid, evenly over it; all of them if there is room."""
+    """Return the values of a parameter in the grid, evenly spaced; all of them if they are few."""
     most = max(2, min(MAX_LEVELS, int(MAX_POINTS ** (1 / parameters) + 1e-9)))
     if not isinstance(parameter, Range):
         chosen = np.unique(np.linspace(0, len(parameter) - 1, min(most, len(parameter))).round().astype(int))
@@ -189,7 +184,7 @@ def _levels(parameter: Range | list[Any], parameters: int) -> list[Any]:
 def _coded(
     parameters: Mapping[str, Range | list[Any]], points: Sequence[Mapping[str, Any]]
 ) -> NDArray[np.float64]:
-    """Return points as columns of numbers: those of a range as they are, or a column for each choice."""
+    """Return points as columns of numbers: one for a range, or one for each choice."""
     columns = []
     for name, parameter in parameters.items():
         if isinstance(parameter, Range):

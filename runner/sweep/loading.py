@@ -1,10 +1,10 @@
-"""A sweep file to a `Sweep`; whatever is wrong is told at once, with line and key."""
+"""A sweep file to a `Sweep`; all problems are reported at once, with line and key."""
 
 from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -18,23 +18,22 @@ from runner.config.model import SECTION_OF
 from runner.config.problems import found, problems_in, refuse
 from runner.config.schema import Schema, without_references
 from runner.config.shipped import config_path
-from runner.errors import EnvironmentNotUsable, Located
+from runner.errors import EnvironmentNotUsable
 from runner.sweep.model import Range, Sweep, SweepFile
 
-MAX_NAME = 50
-"""Of a sweep's name, which stands in a tag of its runs."""
+MAX_NAME: Final = 50
+"""The longest name of a sweep, which is part of a tag of its runs."""
 _LEARNERS: Final = {"mode", "tables", "rewards"}
-_COMBINATIONS: Final = 64
-"""So many are tried to find values that go together."""
+_MAX_COMBINATIONS: Final = 64
+"""The most combinations that are tried to find values that are valid together."""
 
 
 def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
     """Return the sweep that a YAML file describes.
 
     Args:
-        path: the file, or the name of a shipped sweep such as `modes`; the file's name without the ending
-            names the sweep, unless it says another.
-        name: what the sweep is called instead.
+        path: the file, or the name of a shipped sweep such as `modes`.
+        name: the name of the sweep, instead of the name in the file or that of the file without its ending.
 
     Raises:
         ConfigError: the file cannot be read, or does not describe a sweep. The message has a line for each
@@ -49,8 +48,8 @@ def from_text(text: str, source: str) -> Sweep:
     """Return the sweep that the text of a file describes, which cannot name another file as its base.
 
     Args:
-        text: what stands in the file.
-        source: the file's name, for messages; without its ending it names the sweep, as for `load_sweep`.
+        text: the contents of the file.
+        source: the file's name, for messages and as the default name of the sweep.
 
     Raises:
         ConfigError: as for `load_sweep`.
@@ -59,10 +58,10 @@ def from_text(text: str, source: str) -> Sweep:
 
 
 def from_values(values: Mapping[str, Any]) -> Sweep:
-    """Return the sweep that plain values describe, as `Sweep.to_mapping` gives them.
+    """Return the sweep that plain values describe, as `Sweep.to_mapping` returns them.
 
     Raises:
-        ConfigError: they do not.
+        ConfigError: they do not describe a sweep.
     """
     return _sweep(Document(dict(values)), None, "sweep", Path())
 
@@ -85,7 +84,7 @@ def _schema() -> Schema:
     return without_references(SweepFile.model_json_schema())
 
 
-def _sweep(document: Document, name: str | None, stem: str, beside: Path | None) -> Sweep:
+def _sweep(document: Document, name: str | None, stem: str, folder: Path | None) -> Sweep:
     if not isinstance(document.value, Mapping):
         problem = Problem(
             (), f"found {found(document.value)}, expected keys and values, such as base and trials"
@@ -99,46 +98,42 @@ def _sweep(document: Document, name: str | None, stem: str, beside: Path | None)
     except ValidationError as error:
         problems = [*document.problems, *problems_in(error, document.value, _schema())]
     if problems:
-        raise _all_of([refuse(problems, document), *_mistakes_in_base(document, stem)])
+        errors = [refuse(problems, document)]
+        if isinstance(document.value.get("base"), Mapping):
+            try:
+                experiment_in(_below(document, "base"), (), stem, named_by=repr(stem))
+            except ConfigError as error:
+                errors.append(error)
+        raise _combined(errors)
     called = name or file.name or stem
     if len(called) > MAX_NAME:
         raise ConfigError(
             f"name: found {len(called)} characters, expected at most {MAX_NAME}: runs carry it."
         )
-    base, values = _base(file, document, called, beside)
+    base, values = _base(file, document, called, folder)
     spelled = file.model_copy(update={"name": called, "base": values})
     sweep = Sweep(called, spelled, base)
     _check_parameters(sweep, document)
     return sweep
 
 
-def _mistakes_in_base(document: Document, name: str) -> list[ConfigError]:
-    """Return the error of a base that stands in the file itself, if there is one."""
-    if not isinstance(document.value.get("base"), Mapping):
-        return []
-    try:
-        experiment_in(_below(document, "base"), (), name, named_by=repr(name))
-    except ConfigError as error:
-        return [error]
-    return []
-
-
-def _all_of(errors: list[ConfigError]) -> ConfigError:
-    """Return one error with the problems of several."""
-    problems = [problem for error in errors for problem in error.problems]
-    return ConfigError("\n".join(map(str, errors)), problems)
+def _combined(errors: Sequence[ConfigError]) -> ConfigError:
+    """Return one error with the lines and problems of several, each once."""
+    lines = dict.fromkeys(line for error in errors for line in str(error).split("\n"))
+    problems = dict.fromkeys(problem for error in errors for problem in error.problems)
+    return ConfigError("\n".join(lines), tuple(problems))
 
 
 def _base(
-    file: SweepFile, document: Document, name: str, beside: Path | None
+    file: SweepFile, document: Document, name: str, folder: Path | None
 ) -> tuple[ExperimentConfig, dict[str, Any]]:
     """Return the base with the sweep's name, seeds and recording, and the values that trials start from."""
     if isinstance(file.base, str):
-        if beside is None:
-            message = f"found the path {file.base!r}, expected the configuration itself: no file is beside it"
+        if folder is None:
+            message = f"found the path {file.base!r}, expected the configuration itself: there is no folder"
             raise refuse([Problem(("base",), message)], document)
-        path = beside / file.base
-        load(path)  # reports every mistake at its place in that file
+        path = folder / file.base
+        load(path)  # reports every problem at its place in that file
         within = read_yaml(read_text(path), str(path))
     else:
         within = _below(document, "base")
@@ -159,10 +154,10 @@ def _base(
 def _start_of_trials(
     base: ExperimentConfig, given: Mapping[str, Any], parameters: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the base as plain values, without the defaults that a parameter of the sweep decides anew.
+    """Return the base as plain values, without the defaults that depend on a parameter of the sweep.
 
-    The default of `exploration` follows from the learners, and an algorithm's own section from the algorithm:
-    where these are searched over, each trial gets the default that goes with its values.
+    The default of `exploration` depends on the learners, and the section of an algorithm on the algorithm:
+    where these are searched over, each trial gets the default for its values.
     """
     values = base.to_mapping()
     followers = {"exploration": _LEARNERS} | {key: {"algorithm"} for key in SECTION_OF}
@@ -179,9 +174,8 @@ def _below(document: Document, key: str) -> Document:
 
 
 def _check_parameters(sweep: Sweep, document: Document) -> None:
-    """Try every end and choice of each parameter, beside some values of the others that it goes with."""
-    lines: dict[str, None] = {}
-    located: dict[Located, None] = {}
+    """Try every bound and choice of each parameter, with values of the others that are valid with it."""
+    errors = []
     for path, parameter in sweep.file.parameters.items():
         for number, sample in enumerate(_samples(parameter)):
             try:
@@ -189,23 +183,22 @@ def _check_parameters(sweep: Sweep, document: Document) -> None:
                 if number == 0 or path.startswith("env."):
                     _check_environment(experiment, path, document)
             except ConfigError as error:
-                lines |= dict.fromkeys(str(error).split("\n"))
-                located |= dict.fromkeys(error.problems)
-    if lines:
-        raise ConfigError("\n".join(lines), tuple(located))
+                errors.append(error)
+    if errors:
+        raise _combined(errors)
 
 
 def _fitting(sweep: Sweep, path: str, sample: object, document: Document) -> ExperimentConfig:
-    """Return an experiment with a value of a parameter, the others at the first values that go with it.
+    """Return an experiment with a value of a parameter, and the first values of the others valid with it.
 
     Raises:
-        ConfigError: none of those that were tried do.
+        ConfigError: none of the combinations that were tried is valid.
     """
     samples = {
         key: [sample] if key == path else list(_samples(each)) for key, each in sweep.file.parameters.items()
     }
     problem = None
-    for values in itertools.islice(itertools.product(*samples.values()), _COMBINATIONS):
+    for values in itertools.islice(itertools.product(*samples.values()), _MAX_COMBINATIONS):
         try:
             return _placed(sweep, dict(zip(samples, values, strict=True)), document)
         except ConfigError as error:
@@ -222,7 +215,7 @@ def _samples(parameter: Range | list[Any]) -> Iterator[Any]:
 
 
 def _placed(sweep: Sweep, values: Mapping[str, Any], document: Document) -> ExperimentConfig:
-    """Return the base with values, whose mistakes are told at the parameters' places."""
+    """Return the base with values; errors name the places of the parameters."""
     within = Document(sweep.start_of_trials)
     places = {path: document.place(("parameters", path)) for path in values}
     put(

@@ -1,4 +1,4 @@
-"""What a sweep file may say, and the sweep that it means."""
+"""The contents of a sweep file, and the sweep that it describes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Range(Section):
     low: Number = Field(description="The lowest value.")
     high: Number = Field(description="The highest value.")
     log: bool = Field(default=False, description="Draw evenly in the logarithm, for values over magnitudes.")
-    step: Number | None = Field(default=None, description="Only low, low + step, ...; a grid needs it.")
+    step: Number | None = Field(default=None, description="Only low, low + step, ...; required by a grid.")
 
     @model_validator(mode="after")
     def _is_a_range(self) -> Self:
@@ -61,18 +61,18 @@ class Range(Section):
 
     @property
     def steps(self) -> int:
-        """How many whole steps there are from `low` up to `high`."""
+        """The number of whole steps from `low` up to `high`."""
         low, high, step = (Decimal(str(number)) for number in (self.low, self.high, self.step or 1))
         return int((high - low) / step)
 
     def at(self, number: int) -> int | float:
-        """Return the value after so many steps, as one would write it: 0.3, not 0.1 + 0.2."""
+        """Return the value after this number of steps, in decimal arithmetic: 0.3, not 0.1 + 0.2."""
         value = Decimal(str(self.low)) + number * Decimal(str(self.step or 1))
         return int(value) if self.whole else float(value)
 
     @property
     def last(self) -> int | float:
-        """The highest value, which whole steps come to."""
+        """The highest value that whole steps reach."""
         return self.high if self.step is None else self.at(self.steps)
 
 
@@ -86,11 +86,11 @@ _Choices = Annotated[list[Any], Field(min_length=1)]
 Parameter = Annotated[
     Annotated[_Choices, Tag("array")] | Annotated[Range, Tag("Range")], Discriminator(_parameter_kind)
 ]
-"""What is tried: each of a list, or numbers of a range."""
+"""The values to try: each of a list, or numbers of a range."""
 
 
 class Objective(Section):
-    """What a trial is judged by: the median over its seeds of a metric at a moment."""
+    """The value of a trial: the median over its seeds of a metric at a moment."""
 
     metric: str = Field(
         default="success_percent",
@@ -100,11 +100,13 @@ class Objective(Section):
     )
     at: At = Field(
         default="last",
-        description="The last evaluation; the best one; area: the mean over training, by area under the "
-        "curve; first_over: after how many episodes `level` is first reached.",
+        description="last: the last evaluation. best: the best one. area: the mean over training, by area "
+        "under the curve. first_over: the number of episodes until `level` is first reached.",
     )
-    level: float | None = Field(default=None, description="For first_over.")
-    direction: Direction = Field(default="maximize", description="What is better: more, or less.")
+    level: float | None = Field(default=None, description="The level for first_over.")
+    direction: Direction = Field(
+        default="maximize", description="Whether larger or smaller values are better."
+    )
 
     @model_validator(mode="after")
     def _level_goes_with_first_over(self) -> Self:
@@ -123,28 +125,29 @@ class Objective(Section):
         return 1.0 if self.direction == "maximize" else -1.0
 
     @property
-    def described(self) -> str:
-        """The objective in words: `exact.success_percent, last, maximize`."""
+    def description(self) -> str:
+        """The objective as text: `exact.success_percent, last, maximize`."""
         at = f"first at {self.level:g}" if self.at == "first_over" else self.at
         return f"{self.metric}, {at}, {self.direction}"
 
 
 class Pruning(Section):
-    """When a run is given up: its best reading so far is worse than what most trials had by then."""
+    """When a run is stopped early: its best reading so far is worse than that of most trials by then."""
 
-    after: Count = Field(description="No run is given up before so many training episodes.")
-    trials: Count = Field(default=5, description="Nor before so many trials are finished.")
+    after: Count = Field(description="Number of training episodes before a run may be pruned.")
+    trials: Count = Field(default=5, description="Number of finished trials before any run may be pruned.")
     percentile: Annotated[float, Field(gt=0, lt=100)] = Field(
-        default=50.0, description="Worse than this share of the finished trials, in percent; 50: the median."
+        default=50.0,
+        description="Prune runs that are worse than this share of the finished trials, in percent.",
     )
 
 
 class Limits(Section):
-    """Where a sweep stops; it can be gone on with after they were raised."""
+    """Limits at which a sweep stops; it can be resumed after they are raised."""
 
-    runs: Count | None = Field(default=None, description="The most runs.")
-    seconds: Annotated[float, Field(gt=0)] | None = Field(default=None, description="The longest time.")
-    disk: Count | None = Field(default=None, description="The most bytes of all its recordings.")
+    runs: Count | None = Field(default=None, description="Maximum number of runs.")
+    seconds: Annotated[float, Field(gt=0)] | None = Field(default=None, description="Maximum time.")
+    disk: Count | None = Field(default=None, description="Maximum bytes of all its recordings.")
 
 
 _Base = Annotated[
@@ -157,39 +160,40 @@ class SweepFile(Section):
     """A sweep as a YAML file describes it."""
 
     name: Name | None = Field(
-        default=None, description="What it is called: the file's name without its ending."
+        default=None, description="Name of the sweep; the name of the file without its ending unless given."
     )
     base: _Base = Field(
-        description="The experiment: a configuration, or the path of one, seen from this file."
+        description="The experiment: a configuration, or the path of one, relative to this file."
     )
-    strategy: Strategy = Field(description="Which values are tried: all of a grid, or as many as `trials`.")
+    strategy: Strategy = Field(description="Which values are tried: all of a grid, or `trials` of a search.")
     parameters: Annotated[dict[str, Parameter], Field(min_length=1)] = Field(
         description="By path of the configuration, such as evaluation.trials: a list, or low and high."
     )
     trials: Annotated[int, Field(ge=1, le=MAX_TRIALS)] | None = Field(
-        default=None, description="How many; a grid tries all of its points."
+        default=None, description="Number of trials; a grid tries all of its points."
     )
     batch: Annotated[int, Field(ge=1, le=10_000)] = Field(
         default=10,
-        description="How many trials are suggested at once; a generation, if genetic. What is suggested "
-        "follows from the batches before, so that it does not depend on the number of workers.",
+        description="Number of trials suggested at once; a generation, if genetic. Suggestions depend on the "
+        "batches before, and therefore not on the number of workers.",
     )
     seeds: SeveralSeeds = Field(
-        default=(0,), description="Each trial is run with each: a list, or the first and how many."
+        default=(0,), description="Seeds of every trial: a list, or the first and the number of them."
     )
     repeats: bool = Field(
         default=False,
-        description="Whether tpe may suggest values that it has suggested before, as it did in sweeps begun "
-        "before there was this key.",
+        description="Whether tpe may suggest values again, as in sweeps from before this key existed.",
     )
-    search_seed: Seed = Field(default=0, description="What the suggestions follow from.")
-    objective: Objective = Field(default=Objective(), description="What is looked for.")
-    pruning: Pruning | None = Field(default=None, description="Hopeless runs are given up; null: never.")
-    limits: Limits = Field(default=Limits(), description="Where it stops.")
+    search_seed: Seed = Field(default=0, description="Seed of the search.")
+    objective: Objective = Field(default=Objective(), description="The value to optimize.")
+    pruning: Pruning | None = Field(
+        default=None, description="When to stop runs that fall behind; null: never."
+    )
+    limits: Limits = Field(default=Limits(), description="Limits at which the sweep stops.")
     recording: dict[str, Any] = Field(
         default_factory=lambda: {"steps": "none"},
-        description="Put over the base's `recording`; by default steps are left out, to be recorded where "
-        "one wants to look (dualtaxi rerecord).",
+        description="Overrides of the base's `recording`. By default steps are not recorded; `dualtaxi "
+        "rerecord` records those of single runs later.",
     )
 
     @model_validator(mode="after")
@@ -216,7 +220,7 @@ class SweepFile(Section):
 
     @property
     def grid_points(self) -> int:
-        """How many points the parameters have together, those without steps one a whole number."""
+        """The number of points of the grid of all parameters."""
         return math.prod(
             parameter.steps + 1 if isinstance(parameter, Range) else len(parameter)
             for parameter in self.parameters.values()
@@ -229,23 +233,23 @@ class Sweep:
 
     name: str
     file: SweepFile
-    """As described, with the base spelled out; without the defaults that a parameter decides anew."""
+    """The file with the whole base, without the defaults that depend on a parameter of the sweep."""
     base: ExperimentConfig
-    """Its seeds and its recording are the sweep's."""
+    """The experiment, with the sweep's seeds and recording."""
 
     @property
     def objective(self) -> Objective:
-        """What is looked for."""
+        """The value to optimize."""
         return self.file.objective
 
     @property
     def seeds(self) -> tuple[int, ...]:
-        """Each trial's."""
+        """The seeds of every trial."""
         return self.base.seeds
 
     @property
     def start_of_trials(self) -> dict[str, Any]:
-        """The base as plain values, into which a trial's values are put."""
+        """The base as plain values, which a trial's values override."""
         assert isinstance(self.file.base, dict)
         return self.file.base
 
@@ -253,17 +257,16 @@ class Sweep:
         """Return the experiment with these values of the parameters.
 
         Raises:
-            ConfigError: they do not go together.
+            ConfigError: they contradict each other.
         """
         changes = [f"{path}={json.dumps(value)}" for path, value in self.applicable(values).items()]
         return from_mapping(self.start_of_trials, changes)
 
     def applicable(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return the values without those in the section of another algorithm than the one they name."""
-        algorithm = values.get("algorithm", self.base.algorithm)
-        others = {key for key, section in SECTION_OF.items() if section.algorithm != algorithm}
         if "algorithm" not in values:
-            others = set()  # then it is a mistake, which the configuration reports
+            return dict(values)  # the configuration reports sections of other algorithms
+        others = {key for key, section in SECTION_OF.items() if section.algorithm != values["algorithm"]}
         return {path: value for path, value in values.items() if path.partition(".")[0] not in others}
 
     def to_mapping(self) -> dict[str, Any]:

@@ -126,7 +126,7 @@ def _nothing_to_draw(results: Results) -> str:
     finished = sum(entry.state == "finished" for entry in results.ranking)
     objective = results.sweep.objective
     why = (
-        f"none of its {finished:,} finished trials came to {objective.described}"
+        f"none of its {finished:,} finished trials came to {objective.description}"
         if finished
         else "it has no finished trial yet"
     )

@@ -290,7 +290,7 @@ def _print_plan(sweep: Sweep, plan: Plan, as_json: bool) -> None:
         "sweep": f"{sweep.name}, {sweep.file.strategy}",
         "runs": runs,
         **values,
-        "objective": sweep.objective.described,
+        "objective": sweep.objective.description,
         "disk": f"about {size(plan.bytes)}, {size(plan.bytes_a_run)} per run",
     }
     draw(facts(rows))

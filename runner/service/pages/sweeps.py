@@ -88,7 +88,7 @@ def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
             runs = _tagged(catalogue, name)
             parameters = ", ".join(sweep.file.parameters)
             found.append(
-                ListedSweep(name, "", sweep.file.strategy, parameters, sweep.objective.described, runs)
+                ListedSweep(name, "", sweep.file.strategy, parameters, sweep.objective.description, runs)
             )
     return page(request, SweepsView(found))
 

@@ -124,7 +124,7 @@ def test_values_tried_again_are_shown_once(tmp_path):
     swept(tmp_path, sweep)
     results = results_of(sweep, tmp_path)
     assert len(results.ranking) == 2
-    assert sum(1 + len(entry.again) for entry in results.ranking) == 8
+    assert sum(1 + len(entry.duplicates) for entry in results.ranking) == 8
 
 
 def test_a_level_never_reached_is_left_out_of_the_picture(tmp_path):
