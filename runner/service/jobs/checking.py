@@ -17,9 +17,15 @@ from runner.config import from_text
 from runner.config.document import Document, Problem, read_yaml
 from runner.config.loading import MAX_BYTES
 from runner.config.problems import refuse
+from runner.environments.loading import load_mdp
 from runner.errors import ConfigError, RunnerError
+from runner.execution.estimate import estimate, step_limit
+from runner.execution.initial_tables import resolve_initial_q
 from runner.service.jobs.store import Kind
 from runner.service.processes import Busy, ProcessPool
+from runner.sweep import state, sweeps_in
+from runner.sweep.loading import from_text as sweep_from_text
+from runner.sweep.search import Search, require_optuna
 from runner.util.processes import OutOfMemory, ProcessDied, TimedOut
 
 PROCESSES: Final = 2
@@ -69,10 +75,6 @@ def check(text: str, source: str, recordings: Path) -> CheckedJob:
 
 
 def _check_config(text: str, source: str, document: Document, recordings: Path) -> CheckedJob:
-    from runner.environments.loading import load_mdp
-    from runner.execution.estimate import estimate, step_limit
-    from runner.execution.initial_tables import resolve_initial_q
-
     config = from_text(text, source)
     _refuse_paths({("initial_q",): document.value.get("initial_q")}, document)
     with _problems_at(("env",), document):
@@ -94,10 +96,6 @@ def _problems_at(key: tuple[str, ...], document: Document) -> Iterator[None]:
 
 
 def _check_sweep(text: str, source: str, document: Document, recordings: Path) -> CheckedJob:
-    from runner.sweep import state, sweeps_in
-    from runner.sweep.loading import from_text as sweep_from_text
-    from runner.sweep.search import Search, require_optuna
-
     require_optuna()
     sweep = sweep_from_text(text, source)
     base, parameters = document.value["base"], document.value["parameters"]

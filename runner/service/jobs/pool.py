@@ -19,13 +19,16 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any, Final, Self
 
+from runner.config import from_mapping
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.runs.run import new_run_id
+from runner.service.jobs.channel import JobSpec, Outcome
 from runner.service.jobs.checking import DEFAULT_SOURCE, CheckedJob, JobChecker
 from runner.service.jobs.store import Job, JobStateConflict, JobStore, now
-from runner.service.jobs.worker import JobSpec, Outcome, work
+from runner.service.jobs.worker import work
 from runner.service.logs import LOG
+from runner.sweep.cluster import require_ray
 
 STOP_SECONDS: Final = 15.0
 """How long a worker may take to close its recording before it is killed."""
@@ -93,8 +96,6 @@ class JobPool:
         self, recordings: Path, workers: int, *, max_unfinished: int = 1000, ray: str | None = None
     ) -> None:
         if ray is not None:
-            from runner.sweep.cluster import require_ray
-
             require_ray()
         self.recordings, self.workers, self._ray = recordings.absolute(), workers, ray
         self.store = JobStore(self.recordings, max_unfinished)
@@ -307,8 +308,6 @@ class JobPool:
         """Return the run id of each seed, stored before the run exists: so no run is started twice."""
         if job.kind == "sweep":
             return {}
-        from runner.config import from_mapping
-
         run_ids = self.store.run_ids(job.number, started=False)
         seeds = [seed for seed in from_mapping(values).seeds if seed not in run_ids]
         missing = {seed: new_run_id(self.recordings) for seed in seeds}

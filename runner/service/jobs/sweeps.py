@@ -6,9 +6,8 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
-from runner.service.jobs.worker import (
+from runner.service.jobs.channel import (
     OTHER_OWNER_SECONDS,
     REPORT_SECONDS,
     JobSpec,
@@ -16,11 +15,13 @@ from runner.service.jobs.worker import (
     PipeChannel,
     wait_for_owners,
 )
-
-if TYPE_CHECKING:
-    from runner.sweep.local import Workers
-    from runner.sweep.running import SweepStatus
-    from runner.sweep.task import Result, Task
+from runner.sweep import state, sweeps_in
+from runner.sweep.cluster import RayWorkers
+from runner.sweep.loading import from_values
+from runner.sweep.local import LocalWorkers, Workers
+from runner.sweep.plan import limit_of, plan_of, require_disk
+from runner.sweep.running import INTERRUPTED, SweepStatus, run_sweep
+from runner.sweep.task import Result, Task
 
 
 def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
@@ -29,11 +30,6 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
     Raises:
         RunnerError: it cannot be run, or another process runs it.
     """
-    from runner.sweep import state, sweeps_in
-    from runner.sweep.loading import from_values
-    from runner.sweep.plan import limit_of, plan_of, require_disk
-    from runner.sweep.running import INTERRUPTED, run_sweep
-
     sweep = from_values(spec.values)
     with _locked_sweep(spec, channel.stop):
         exists = spec.name in sweeps_in(spec.recordings)
@@ -72,8 +68,6 @@ def _locked_sweep(spec: JobSpec, stop: Callable[[], bool]) -> Iterator[None]:
     Raises:
         RunnerError: one still runs it after a minute.
     """
-    from runner.sweep import state
-
     deadline = time.monotonic() + OTHER_OWNER_SECONDS
     with contextlib.ExitStack() as stack:
         while True:
@@ -91,13 +85,9 @@ def _locked_sweep(spec: JobSpec, stop: Callable[[], bool]) -> Iterator[None]:
 def _workers(spec: JobSpec, channel: PipeChannel, runs: int) -> Iterator[Workers]:
     """Yield what runs the sweep's tasks: processes of this machine within the slots, or a cluster."""
     if spec.ray is not None:
-        from runner.sweep.cluster import RayWorkers
-
         with RayWorkers(None, spec.ray, runs) as remote:
             yield remote
         return
-    from runner.sweep.local import LocalWorkers
-
     with LocalWorkers(runs) as local:
         yield SlottedWorkers(local, channel)
 

@@ -1,0 +1,117 @@
+"""The specification of a job, and the worker's end of the pipe to the server."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final, Literal, Protocol
+
+from runner.errors import RunnerError
+from runner.runs.run import Run, run_at
+
+REPORT_SECONDS: Final = 0.25
+OTHER_OWNER_SECONDS: Final = 60.0
+"""Time limit for another owner to release a run; on another host it counts as dead after 15 s."""
+
+
+@dataclass(frozen=True)
+class JobSpec:
+    """What a worker process needs to know of a job."""
+
+    number: int
+    kind: str
+    name: str
+    values: dict[str, Any]
+    """The configuration or sweep, every value present."""
+    run_ids: dict[int, str]
+    """The run ids reserved for a configuration, by seed."""
+    recordings: Path
+    accept_changes: bool
+    """Whether to resume runs that were started by other code."""
+    retry: bool
+    """Whether to repeat failed runs of a sweep."""
+    ray: str | None
+    """The address of the Ray cluster that runs the job; None for this machine."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of a job."""
+
+    state: Literal["finished", "interrupted", "failed"]
+    error: str = ""
+
+
+class JobChannel(Protocol):
+    """Where a run sends its messages, and learns that it must stop."""
+
+    def send(self, kind: str, data: Any) -> None:
+        """Send a message to the server."""
+
+    def stop(self) -> bool:
+        """Return whether the run must stop."""
+
+
+class PipeChannel:
+    """The worker's end of the pipe to the server.
+
+    The server sends how many processes the job may use, and when to stop. If the server dies, the worker
+    stops as well: it closes its recording, so that the next server of the folder can resume it.
+    """
+
+    def __init__(self, pipe: Connection) -> None:
+        self.slots = 1
+        """How many processes may train at once."""
+        self._pipe = pipe
+        self._parent = os.getppid()
+        self._stopping = threading.Event()
+        self._lock = threading.Lock()
+        threading.Thread(target=self._receive, name="channel", daemon=True).start()
+
+    def send(self, kind: str, data: Any) -> None:
+        """Send a message to the server; nothing happens if it is gone."""
+        with self._lock, contextlib.suppress(OSError):
+            self._pipe.send((kind, data))
+
+    def stop(self) -> bool:
+        """Return whether the job must stop."""
+        return self._stopping.is_set() or os.getppid() != self._parent
+
+    def request_stop(self, *_: object) -> None:
+        """Stop the job; also a handler of signals."""
+        self._stopping.set()
+
+    def _receive(self) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                kind, value = self._pipe.recv()
+                if kind == "slots":
+                    self.slots = value
+                else:
+                    self.request_stop()
+        self.request_stop()
+
+
+def wait_for_owners(runs: Iterable[Run], stop: Callable[[], bool]) -> None:
+    """Wait until no process owns one of these runs: the workers of a server that was killed are stopping.
+
+    Raises:
+        RunnerError: one is still owned after a minute.
+    """
+    deadline = time.monotonic() + OTHER_OWNER_SECONDS
+    for run in runs:
+        while run.status == "running" and not stop():
+            if time.monotonic() > deadline:
+                owner = run.file.owner
+                raise RunnerError(
+                    f"run {run.run_id} is still running (process {owner.get('pid')} on {owner.get('host')}); "
+                    "resume the job when that has ended."
+                )
+            time.sleep(REPORT_SECONDS)
+            run = run_at(run.folder)  # noqa: PLW2901
