@@ -1,31 +1,35 @@
-"""The application: what all requests pass, the routes, and what lives as long as the service."""
+"""The application: middleware, routes, health, and what lives as long as the service."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
+import shutil
 from collections.abc import AsyncIterator
 from http import HTTPStatus
-from typing import Any, Final
+from typing import Final
 
 import anyio
 import anyio.to_thread
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel
 
 from runner.errors import RunnerError
-from runner.service import health, login, pages
+from runner.service import login, pages
 from runner.service.api import comparing, files, jobs, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
+from runner.service.dependencies import CatalogueOf, SettingsOf
 from runner.service.fragments import load_sweep_libraries
 from runner.service.guard import Guard
 from runner.service.jobs.pool import JobPool
 from runner.service.logs import LOG, AccessLog
-from runner.service.problems import add_error_handlers, answers
+from runner.service.problems import add_error_handlers, error_docs
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
-from runner.service.security import Tokens
-from runner.service.sessions import Sessions
 from runner.service.settings import Settings
+from runner.service.tokens import Sessions, Tokens
 from runner.service.upload_model import Upload, UploadLimits
 from runner.service.uploads import Uploads
 from runner.sweep import sweeps_in
@@ -35,7 +39,19 @@ API: Final = "/api/v1"
 THREADS: Final = 8
 """Requests that are worked on at the same time; the others wait."""
 PROCESSES: Final = 2
-"""Comparisons, pictures and exports that are made at the same time, each in a process of its own."""
+"""Comparisons, plots and exports that are computed at the same time, each in a process of its own."""
+MIN_FREE_BYTES: Final = 100_000_000
+"""Free disk space below which the service is not ready: it could not store a recording."""
+
+health = APIRouter(tags=["health"])
+
+
+class Ready(BaseModel):
+    """Whether the service can do its work."""
+
+    ready: bool
+    checks: dict[str, bool]
+    """Each thing that it needs, and whether that is so."""
 
 
 def create_app(settings: Settings) -> FastAPI:
@@ -46,17 +62,17 @@ def create_app(settings: Settings) -> FastAPI:
     """
     tokens = Tokens(settings.tokens)
     if settings.needs_token and not tokens.all():
-        why = (
+        option = (
             "--require-token" if settings.is_loopback else f"{settings.host}, which other machines can reach,"
         )
         raise RunnerError(
-            f"host: found {why} and no token; expected one. Make it by `dualtaxi token create NAME`, or "
+            f"host: found {option} and no token; expected one. Create it by `dualtaxi token create NAME`, or "
             "serve on 127.0.0.1 without --require-token."
         )
     app = FastAPI(
         title="dualtaxi",
         version=__version__,
-        summary="Recorded reinforcement-learning runs: listed, read, compared, uploaded, done.",
+        summary="Recorded reinforcement-learning runs: list, read, compare, upload, submit.",
         openapi_url=f"{API}/openapi.json",
         docs_url=None,
         redoc_url=None,
@@ -69,20 +85,12 @@ def create_app(settings: Settings) -> FastAPI:
     app.state.tokens = tokens
     app.state.sessions = Sessions(tokens)
     app.add_middleware(
-        Guard, settings=settings, tokens=tokens, sessions=app.state.sessions, refused=pages.refused
+        Guard, settings=settings, tokens=tokens, sessions=app.state.sessions, refusal=pages.refused
     )
     app.add_middleware(AccessLog)
     add_error_handlers(app)
     pages.add_error_handlers(app)
-    app.include_router(_api(), prefix=API)
-    app.include_router(health.router)
-    app.include_router(login.router)
-    app.include_router(pages.router)
-    return app
-
-
-def _api() -> APIRouter:
-    general = answers(
+    general = error_docs(
         HTTPStatus.BAD_REQUEST,
         HTTPStatus.UNAUTHORIZED,
         HTTPStatus.FORBIDDEN,
@@ -93,53 +101,75 @@ def _api() -> APIRouter:
         HTTPStatus.TOO_MANY_REQUESTS,
         HTTPStatus.INSUFFICIENT_STORAGE,
     )
-    api = APIRouter(responses=general)
     for part in (runs, reading, replay, comparing, files, jobs, uploads):
-        api.include_router(part.router)
-    return api
+        app.include_router(part.router, prefix=API, responses=general)
+    for router in (health, login.router, pages.router):
+        app.include_router(router)
+    return app
 
 
 @contextlib.asynccontextmanager
-async def _lifespan(app: FastAPI) -> AsyncIterator[dict[str, Any]]:
+async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     """Open what lives as long as the service, and close it in the opposite order."""
     anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
     app.state.stopping.clear()
-    async with contextlib.AsyncExitStack() as stack:
+    settings: Settings = app.state.settings
+    limits = settings.limits
+
+    def log_upload(upload: Upload) -> None:
+        app.state.catalogue.changed()
+        fields = {"state": upload.state, "run_id": upload.run_id}
+        LOG.info("upload", extra=fields | {"bytes": upload.size, "problem": upload.problem})
+
+    with contextlib.ExitStack() as stack:
         stack.callback(app.state.catalogue.close)
         app.state.catalogue.prepare()
-        settings: Settings = app.state.settings
         app.state.jobs = stack.enter_context(
-            JobPool(
-                settings.recordings[0],
-                settings.workers,
-                max_unfinished=settings.limits.jobs,
-                ray=settings.ray,
-            )
+            JobPool(settings.recordings[0], settings.workers, max_unfinished=limits.jobs, ray=settings.ray)
         )
         app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
-        app.state.uploads = stack.enter_context(
-            Uploads(
-                settings.recordings[0],
-                UploadLimits(max_bytes=settings.limits.upload_bytes),
-                lambda upload: _uploaded(app, upload),
-            )
-        )
+        upload_limits = UploadLimits(max_bytes=limits.upload_bytes)
+        app.state.uploads = stack.enter_context(Uploads(settings.recordings[0], upload_limits, log_upload))
         app.state.processes = stack.enter_context(
-            ProcessPool(PROCESSES, settings.limits.work_seconds, settings.limits.work_bytes)
+            ProcessPool(PROCESSES, limits.work_seconds, limits.work_bytes)
         )
         app.state.sweep_processes = stack.enter_context(
-            ProcessPool(1, settings.limits.work_seconds, settings.limits.work_bytes, is_reused=True)
+            ProcessPool(1, limits.work_seconds, limits.work_bytes, is_reused=True)
         )
         if any(sweeps_in(folder) for folder in settings.recordings):
             app.state.sweep_processes.submit(load_sweep_libraries)
-        LOG.info("started", extra=settings.told())
-        yield {}
+        LOG.info("started", extra=settings.log_fields())
+        yield
         app.state.stopping.set()
         LOG.info("stopping")
 
 
-def _uploaded(app: FastAPI, upload: Upload) -> None:
-    """Say what became of an upload."""
-    app.state.catalogue.changed()
-    facts = {"state": upload.state, "run_id": upload.run_id, "bytes": upload.size, "problem": upload.problem}
-    LOG.info("upload", extra=facts)
+@health.get("/healthz", summary="Whether the service responds.")
+async def healthz() -> dict[str, str]:
+    """Respond."""
+    return {"status": "ok"}
+
+
+@health.get(
+    "/readyz",
+    response_model=Ready,
+    responses={int(HTTPStatus.SERVICE_UNAVAILABLE): {"model": Ready, "description": "It cannot."}},
+    summary="Whether the service can do its work.",
+)
+def readyz(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Response:
+    """Check that runs can be read, and recordings and jobs accepted."""
+    folder = settings.recordings[0]
+    try:
+        has_space = shutil.disk_usage(folder).free > MIN_FREE_BYTES
+    except OSError:
+        has_space = False
+    checks = {
+        "not_stopping": not request.app.state.stopping.is_set(),
+        "recordings_can_be_written": os.access(folder, os.R_OK | os.W_OK | os.X_OK),
+        "disk_has_space": has_space,
+        "runs_can_be_listed": catalogue.can_list(),
+        "jobs_can_be_started": request.app.state.jobs.is_working,
+    }
+    ready = all(checks.values())
+    status = HTTPStatus.OK if ready else HTTPStatus.SERVICE_UNAVAILABLE
+    return JSONResponse({"ready": ready, "checks": checks}, status)

@@ -1,4 +1,4 @@
-"""A request that is refused."""
+"""The errors of the service, each with the status of its response."""
 
 from __future__ import annotations
 
@@ -7,9 +7,69 @@ from http import HTTPStatus
 from runner.errors import RunnerError
 
 
-class Refused(RunnerError):
-    """A request is refused with a status of its own."""
+class RequestError(RunnerError):
+    """A request cannot be answered; the response has this status and these headers."""
+
+    status = HTTPStatus.BAD_REQUEST
+    headers: dict[str, str] = {}  # noqa: RUF012 - replaced, never changed
+
+
+class Refused(RequestError):
+    """A request is refused with a status that is given for it alone."""
 
     def __init__(self, status: HTTPStatus, message: str, headers: dict[str, str] | None = None) -> None:
         super().__init__(message)
         self.status, self.headers = status, headers or {}
+
+
+class Unauthorized(RequestError):
+    """A token or session is missing or wrong."""
+
+    status = HTTPStatus.UNAUTHORIZED
+    headers = {"www-authenticate": "Bearer"}  # noqa: RUF012
+
+
+class Busy(RequestError):
+    """Too many calls wait for a child process."""
+
+    status = HTTPStatus.SERVICE_UNAVAILABLE
+    headers = {"retry-after": "5"}  # noqa: RUF012
+
+    def __init__(self, message: str = "the service is busy; try again.") -> None:
+        super().__init__(message)
+
+
+class QueueFull(RequestError):
+    """The maximum number of unfinished jobs is reached."""
+
+    status = HTTPStatus.TOO_MANY_REQUESTS
+
+
+class JobNotFound(RequestError):
+    """No job has this number."""
+
+    status = HTTPStatus.NOT_FOUND
+
+
+class JobStateConflict(RequestError):
+    """The job's state does not allow the operation."""
+
+    status = HTTPStatus.CONFLICT
+
+
+class UploadConflict(RequestError):
+    """The upload is not in the state that the request assumes; ask for its offset, and continue there."""
+
+    status = HTTPStatus.CONFLICT
+
+
+class UploadTooLarge(RequestError):
+    """More bytes than the server accepts, or than were announced."""
+
+    status = HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+
+
+class TooManyUploads(RequestError):
+    """The maximum number of open uploads is reached; try again later."""
+
+    status = HTTPStatus.TOO_MANY_REQUESTS

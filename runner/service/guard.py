@@ -1,46 +1,39 @@
-"""What every request passes first and every answer last: host, token, origin, size and pace of its body."""
+"""Middleware for every request: host, token, origin, security headers, and size and pace of the body.
+
+On a loopback host, reading needs no token, and writing needs the same origin or a token: no page of another
+site can write. On any other host everything needs a token. Starlette has no middleware for these rules, see
+docs/decisions/own-guard.md.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import ipaddress
+import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
-from http.cookies import CookieError, SimpleCookie
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 from urllib.parse import urlencode
 
 from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from runner.errors import RunnerError
-from runner.service.errors import Refused
+from runner.service.errors import Refused, Unauthorized
 from runner.service.problems import status_of
-from runner.service.security import (
-    SAFE_METHODS,
-    Token,
-    Tokens,
-    is_allowed_host,
-    is_embedded_elsewhere,
-    is_same_origin,
-    unauthorized,
-)
-from runner.service.sessions import COOKIE, Sessions
+from runner.service.settings import Settings
+from runner.service.tokens import COOKIE, Sessions, Token, Tokens
 
-if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
-
-    from runner.service.settings import Settings
-
-Refusal = Callable[[Request, RunnerError], Response]
-"""Returns the answer to a request that is refused."""
+SAFE_METHODS: Final = ("GET", "HEAD", "OPTIONS")
 OPEN_PATHS: Final = ("/healthz", "/readyz", "/login", "/logout", "/static/")
-"""What needs no token: these, and what is below those that end in a slash."""
+"""Paths that need no token: these, and those below the ones that end in a slash."""
 UPLOADS: Final = "/api/v1/uploads"
-"""Below it what is sent by PATCH may be as long as a recording."""
-LEAST_RATE: Final = 1000
+"""A body of PATCH below this path may be as long as a recording."""
+MIN_RATE: Final = 1000
 """Bytes a second of a body, on average; slower clients are cut off."""
 POLICY: Final = (
     "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
@@ -54,118 +47,133 @@ _HEADERS: Final = {
     "cross-origin-resource-policy": "same-origin",
     "cache-control": "private, no-cache",
 }
-"""Of every answer that has none of its own."""
+"""Headers of every response that does not set its own."""
 
 
 class Guard:
-    """Refuses what may not be, before any route is looked for; so no route can forget to."""
+    """Refuses requests before they are routed, so that no route can forget to.
+
+    Args:
+        app: the application.
+        settings: those of the service.
+        tokens: the access tokens.
+        sessions: the sessions of browsers.
+        refusal: makes the response to a request that is refused.
+    """
 
     def __init__(
-        self, app: ASGIApp, settings: Settings, tokens: Tokens, sessions: Sessions, refused: Refusal
+        self,
+        app: ASGIApp,
+        settings: Settings,
+        tokens: Tokens,
+        sessions: Sessions,
+        refusal: Callable[[Request, RunnerError], Response],
     ) -> None:
         self._app, self._settings = app, settings
-        self._tokens, self._sessions, self._refused = tokens, sessions, refused
+        self._tokens, self._sessions, self._refusal = tokens, sessions, refusal
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        headers = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]]
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        request = Request(scope)
         try:
-            self._check(scope, headers)
+            self._check(request)
         except RunnerError as error:
-            await self._answer(error, scope, dict(headers))(scope, receive, _with_headers(send))
+            await self._refuse(request, error)(scope, receive, send_with_headers)
             return
         limits = self._settings.limits
-        streamed = scope["method"] == "PATCH" and scope["path"].startswith(UPLOADS)
-        most = limits.upload_bytes if streamed else limits.body_bytes
-        body = Body(receive, most, limits.idle_seconds)
-        await self._app(scope, body.receive, _with_headers(send))
+        is_upload = request.method == "PATCH" and scope["path"].startswith(UPLOADS)
+        max_bytes = limits.upload_bytes if is_upload else limits.body_bytes
+        body = Body(receive, max_bytes, limits.idle_seconds)
+        await self._app(scope, body.receive, send_with_headers)
 
-    def _check(self, scope: Scope, listed: list[tuple[str, str]]) -> None:
+    def _check(self, request: Request) -> None:
         """Refuse a request that names another host, lacks a token, or comes from another site.
 
         Raises:
-            Refused: it does.
+            RequestError: it does.
         """
-        headers = dict(listed)
-        hosts = [value for name, value in listed if name == "host"]
+        headers = request.headers
+        hosts = headers.getlist("host")
         if len(hosts) != 1 or not is_allowed_host(hosts[0], self._settings.hosts):
             raise Refused(
                 HTTPStatus.MISDIRECTED_REQUEST,
                 f"host: found {', '.join(hosts) or 'none'}, expected an address, localhost or a name that "
                 "was allowed by --allow-host.",
             )
-        reads = scope["method"] in SAFE_METHODS
-        if not is_open(scope["path"]):
-            token = self._token(headers)
-            scope["state"] = {**scope.get("state", {}), "token": token}
-            if token is not None and not reads and not token.can_write:
+        is_read = request.method in SAFE_METHODS
+        path = request.scope["path"]
+        if not any(path.startswith(each) if each.endswith("/") else path == each for each in OPEN_PATHS):
+            token = request.state.token = self._token(request)
+            if token is not None and not is_read and not token.can_write:
                 raise Refused(HTTPStatus.FORBIDDEN, "token: found one for reading, expected one for writing.")
             if token is None and self._settings.needs_token:
-                raise unauthorized("token: found none, expected `Authorization: Bearer TOKEN`, or a login.")
+                raise Unauthorized("token: found none, expected `Authorization: Bearer TOKEN`, or a login.")
             if "authorization" in headers:
                 return  # which no page of another site can make a browser send
-        if reads and is_embedded_elsewhere(headers):
+        if is_read and is_embedded_elsewhere(headers):
             raise Refused(
                 HTTPStatus.FORBIDDEN, "origin: found a page of another site, expected the service's own."
             )
-        if not reads and not is_same_origin(headers):
+        if not is_read and not is_same_origin(headers):
             raise Refused(
                 HTTPStatus.FORBIDDEN,
                 "origin: found another than the service's own, or none; expected the same, or a token. "
-                "A program without one says `Origin: http://HOST:PORT`.",
+                "A program without one sends `Origin: http://HOST:PORT`.",
             )
 
-    def _token(self, headers: dict[str, str]) -> Token | None:
-        """Return the token that a request brings, or that its session stands for; None if it has none.
+    def _token(self, request: Request) -> Token | None:
+        """Return the token of a request, or of its session; None if it has none.
 
         Raises:
-            Refused: it is a wrong one.
+            Unauthorized: it is a wrong one.
         """
-        kind, _, secret = headers.get("authorization", "").partition(" ")
-        if kind:
-            if kind.lower() != "bearer" or not secret.strip():
-                raise unauthorized(f"authorization: found {kind[:20]!r}, expected `Bearer TOKEN`.")
+        scheme, _, secret = request.headers.get("authorization", "").partition(" ")
+        if scheme:
+            if scheme.lower() != "bearer" or not secret.strip():
+                raise Unauthorized(f"authorization: found {scheme[:20]!r}, expected `Bearer TOKEN`.")
             token = self._tokens.find(secret.strip())
             if token is None:
-                raise unauthorized("token: found one that is unknown, or was revoked.")
+                raise Unauthorized("token: found one that is unknown, or was revoked.")
             return token
-        session = _cookie(headers) if self._settings.needs_token else ""
+        session = request.cookies.get(COOKIE) if self._settings.needs_token else None
         if not session:
             return None
         token = self._sessions.token_of(session)
         if token is None:
-            raise unauthorized("session: it has ended; log in again.")
+            raise Unauthorized("session: it has ended; log in again.")
         return token
 
-    def _answer(self, error: RunnerError, scope: Scope, headers: dict[str, str]) -> Response:
-        """Return how a request is refused: a browser that asks for a page is led to the login."""
-        status = status_of(error)
-        pages = "text/html" in headers.get("accept", "") and not scope["path"].startswith("/api/")
-        if pages and status == HTTPStatus.UNAUTHORIZED and scope["method"] == "GET":
-            asked = scope["path"] + (
-                f"?{scope['query_string'].decode('latin-1')}" if scope["query_string"] else ""
-            )
-            return RedirectResponse(f"/login?{urlencode({'next': asked})}", HTTPStatus.SEE_OTHER)
-        return self._refused(Request(scope), error)
-
-
-def is_open(path: str) -> bool:
-    """Return whether a path needs no token."""
-    return any(path.startswith(part) if part.endswith("/") else path == part for part in OPEN_PATHS)
+    def _refuse(self, request: Request, error: RunnerError) -> Response:
+        """Return the response to a request that is refused; a browser is redirected to the login."""
+        path = request.scope["path"]  # a URL would be made with the Host header, which may be the problem
+        is_page = "text/html" in request.headers.get("accept", "") and not path.startswith("/api/")
+        if is_page and status_of(error) == HTTPStatus.UNAUTHORIZED and request.method == "GET":
+            query = request.scope["query_string"].decode("latin-1")
+            target = f"{path}?{query}" if query else path
+            return RedirectResponse(f"/login?{urlencode({'next': target})}", HTTPStatus.SEE_OTHER)
+        return self._refusal(request, error)
 
 
 class Body:
-    """A request's body on its way in, within limits of size and pace."""
+    """The body of a request, within limits of size and pace."""
 
-    def __init__(self, receive: Receive, most: int, idle_seconds: float) -> None:
-        self._receive, self._most, self._idle = receive, most, idle_seconds
+    def __init__(self, receive: Receive, max_bytes: int, idle_seconds: float) -> None:
+        self._receive, self._max_bytes, self._idle = receive, max_bytes, idle_seconds
         self._began, self._length, self._more = time.monotonic(), 0, True
 
     async def receive(self) -> Message:
-        """Return the next part of it; what comes behind its end is waited for as long as it takes.
+        """Return its next part; after its end there is no limit on waiting.
 
         Raises:
             HTTPException: it is too long, or too slow.
@@ -179,13 +187,13 @@ class Body:
             raise self._too_slow() from None
         self._more = message.get("more_body", False)
         self._length += len(message.get("body", b""))
-        if self._length > self._most:
+        if self._length > self._max_bytes:
             raise HTTPException(
                 HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-                f"body: found more than {self._most:,} bytes, expected at most so many.",
+                f"body: found more than the maximum of {self._max_bytes:,} bytes.",
                 {"connection": "close"},
             )
-        if self._more and time.monotonic() - self._began > self._idle + self._length / LEAST_RATE:
+        if self._more and time.monotonic() - self._began > self._idle + self._length / MIN_RATE:
             raise self._too_slow()
         return message
 
@@ -194,20 +202,40 @@ class Body:
         return HTTPException(HTTPStatus.REQUEST_TIMEOUT, message, {"connection": "close"})
 
 
-def _cookie(headers: dict[str, str]) -> str:
+def is_allowed_host(header: str, hosts: tuple[str, ...]) -> bool:
+    """Return whether a Host header names this service.
+
+    Any address does: a site whose name was made to point at this machine still sends its own name.
+    """
+    name = re.sub(r":\d{1,5}$", "", header) if not header.endswith("]") else header
+    name = name.strip("[]").lower().rstrip(".")
+    if name in ("localhost", *hosts):
+        return True
     try:
-        found = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-    except CookieError:
-        return ""
-    return found.value if found else ""
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
-def _with_headers(send: Send) -> Any:
-    async def sending(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            headers = MutableHeaders(scope=message)
-            for name, value in _HEADERS.items():
-                headers.setdefault(name, value)
-        await send(message)
+def is_embedded_elsewhere(headers: Mapping[str, str]) -> bool:
+    """Return whether a page of another site loads this as a part of itself, according to the browser.
 
-    return sending
+    It could not read the response, but make the service work; following a link is another matter.
+    """
+    site, mode = headers.get("sec-fetch-site"), headers.get("sec-fetch-mode")
+    return site in ("cross-site", "same-site") and mode != "navigate"
+
+
+def is_same_origin(headers: Mapping[str, str]) -> bool:
+    """Return whether a page of this service sends a request, according to the browser; or a program.
+
+    No page can make a browser send a wrong `Origin` or `Sec-Fetch-Site`.
+    """
+    site, origin = headers.get("sec-fetch-site"), headers.get("origin")
+    if site is not None and site != "same-origin":
+        return False
+    if origin is not None:
+        scheme, _, host = origin.partition("://")
+        return scheme in ("http", "https") and host.lower() == headers.get("host", "").lower()
+    return site == "same-origin"

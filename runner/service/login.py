@@ -1,24 +1,22 @@
-"""Logging in: a token, typed once into a page, begins a session of the browser; logging out ends it."""
+"""Logging in: a token, typed into a page once, begins a session of the browser; logging out ends it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
 from runner.export.reports.rendering import View
+from runner.service.errors import Unauthorized
 from runner.service.pages.rendering import Form, message_of, page
 from runner.service.problems import status_of
-from runner.service.security import Tokens, unauthorized
-from runner.service.sessions import COOKIE, SESSION_SECONDS, Sessions
+from runner.service.tokens import COOKIE, SESSION_SECONDS, Sessions, Tokens
 
 router = APIRouter(include_in_schema=False)
-TOKEN_COOKIE: Final = "dualtaxi_token"
-"""Held the token itself in earlier versions; browsers are told to forget it."""
 
 
 @dataclass(frozen=True)
@@ -33,28 +31,27 @@ class LoginView(View):
 @router.get("/login")
 def ask(request: Request, next: Annotated[str, Query(max_length=4000)] = "/") -> Response:  # noqa: A002
     """Ask for a token."""
-    answer = page(request, LoginView(next))
-    if TOKEN_COOKIE in request.cookies:
-        answer.delete_cookie(TOKEN_COOKIE, **_cookie_of(request))
-    return answer
+    return page(request, LoginView(next))
 
 
 @router.post("/login")
 def login(request: Request, sent: Form) -> Response:
-    """Begin a session if the token is right, and lead to where its owner was going."""
-    secret, where = (sent.get(name, "").strip() for name in ("token", "next"))
+    """Begin a session if the token is right, and redirect to the page that was requested."""
+    secret, target = (sent.get(name, "").strip() for name in ("token", "next"))
     tokens: Tokens = request.app.state.tokens
     sessions: Sessions = request.app.state.sessions
     try:
         token = tokens.find(secret)
         if token is None:
-            raise unauthorized("token: found one that is unknown, or was revoked.")
+            raise Unauthorized("token: found one that is unknown, or was revoked.")
         session = sessions.begin(token)
     except RunnerError as error:
-        return page(request, LoginView(where, message_of(error, request)), status_of(error))
-    answer = RedirectResponse(where if is_local(where) else "/", HTTPStatus.SEE_OTHER)
-    answer.set_cookie(COOKIE, session, max_age=SESSION_SECONDS, **_cookie_of(request))
-    return answer
+        return page(request, LoginView(target, message_of(error, request)), status_of(error))
+    # No other site, however it is written.
+    is_local = target.startswith("/") and not target.startswith(("//", "/\\")) and target.isprintable()
+    response = RedirectResponse(target if is_local else "/", HTTPStatus.SEE_OTHER)
+    response.set_cookie(COOKIE, session, max_age=SESSION_SECONDS, **_cookie_options(request))
+    return response
 
 
 @router.post("/logout")
@@ -63,15 +60,10 @@ def logout(request: Request) -> Response:
     sessions: Sessions = request.app.state.sessions
     if session := request.cookies.get(COOKIE):
         sessions.end(session)
-    answer = RedirectResponse("/login", HTTPStatus.SEE_OTHER)
-    answer.delete_cookie(COOKIE, **_cookie_of(request))
-    return answer
+    response = RedirectResponse("/login", HTTPStatus.SEE_OTHER)
+    response.delete_cookie(COOKIE, **_cookie_options(request))
+    return response
 
 
-def is_local(where: str) -> bool:
-    """Return whether this is a path of the service: no other site, however written."""
-    return where.startswith("/") and not where.startswith(("//", "/\\")) and where.isprintable()
-
-
-def _cookie_of(request: Request) -> dict[str, Any]:
+def _cookie_options(request: Request) -> dict[str, Any]:
     return {"httponly": True, "samesite": "lax", "secure": request.url.scheme == "https"}

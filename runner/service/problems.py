@@ -1,10 +1,11 @@
-"""What goes wrong, as an answer: one form, with a message that says what to do.
+"""Error responses: one form, with a message that says what to do.
 
 {"error": {"message": "...", "problems": [{"path": "query.limit", "line": null, "message": "..."}]}}
 """
 
 from __future__ import annotations
 
+import errno
 from http import HTTPStatus
 from typing import Any, Final
 
@@ -24,28 +25,20 @@ from runner.errors import (
     RunNotFound,
     StorageError,
 )
-from runner.service.errors import Refused
-from runner.service.jobs.store import JobNotFound, JobStateConflict, QueueFull
+from runner.service.errors import RequestError
 from runner.service.logs import LOG
 from runner.service.settings import Settings
-from runner.service.upload_model import Conflict, TooLarge, TooMany
 from runner.util.processes import CallFailed
 
 _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
     CallFailed: HTTPStatus.SERVICE_UNAVAILABLE,
     ConfigError: HTTPStatus.UNPROCESSABLE_ENTITY,
-    Conflict: HTTPStatus.CONFLICT,
     Diverged: HTTPStatus.CONFLICT,
     EnvironmentNotUsable: HTTPStatus.UNPROCESSABLE_ENTITY,
     MissingExtra: HTTPStatus.NOT_IMPLEMENTED,
-    JobNotFound: HTTPStatus.NOT_FOUND,
-    JobStateConflict: HTTPStatus.CONFLICT,
-    QueueFull: HTTPStatus.TOO_MANY_REQUESTS,
     RecordingError: HTTPStatus.CONFLICT,
     RunNotFound: HTTPStatus.NOT_FOUND,
     StorageError: HTTPStatus.INSUFFICIENT_STORAGE,
-    TooLarge: HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-    TooMany: HTTPStatus.TOO_MANY_REQUESTS,
 }
 
 
@@ -53,7 +46,7 @@ class Problem(BaseModel):
     """One thing that is wrong."""
 
     path: str | None = None
-    """The key, parameter or field it is with."""
+    """The key, parameter or field that has it."""
     line: int | None = None
     """The line of a configuration."""
     message: str
@@ -67,31 +60,31 @@ class ErrorBody(BaseModel):
 
 
 class ErrorResponse(BaseModel):
-    """The body of every answer that is an error."""
+    """The body of every error response."""
 
     error: ErrorBody
 
 
-def answers(*statuses: HTTPStatus) -> dict[int | str, dict[str, Any]]:
-    """Return how a route's errors are documented."""
+def error_docs(*statuses: HTTPStatus) -> dict[int | str, dict[str, Any]]:
+    """Return the OpenAPI documentation of a route's errors."""
     return {int(status): {"model": ErrorResponse, "description": status.phrase} for status in statuses}
 
 
-def content(*media: str) -> dict[int | str, dict[str, Any]]:
-    """Return how the media types of a route's answer are documented."""
+def media_docs(*media: str) -> dict[int | str, dict[str, Any]]:
+    """Return the OpenAPI documentation of the media types of a route's response."""
     return {200: {"content": {kind: {} for kind in media}}}
 
 
 def status_of(error: RunnerError) -> HTTPStatus:
-    """Return the status that an error is answered with."""
-    if isinstance(error, Refused):
+    """Return the status of the response to an error."""
+    if isinstance(error, RequestError):
         return error.status
     kinds = (kind for kind in type(error).__mro__ if kind in _STATUS)
     return next((_STATUS[kind] for kind in kinds), HTTPStatus.BAD_REQUEST)
 
 
 def error_body(error: RunnerError, settings: Settings) -> ErrorBody:
-    """Return an error's message, and the problems of a configuration each with its line and key."""
+    """Return an error's message, and the problems of a configuration with their lines and keys."""
     message = settings.without_folders("\n".join([str(error), *getattr(error, "__notes__", [])]))
     if not isinstance(error, ConfigError):
         return ErrorBody(message=message)
@@ -106,13 +99,13 @@ def error_body(error: RunnerError, settings: Settings) -> ErrorBody:
     return ErrorBody(message=message, problems=problems)
 
 
-def refusal(status: HTTPStatus, trouble: ErrorBody, headers: dict[str, str] | None = None) -> Response:
-    """Return the answer that is an error."""
-    return JSONResponse({"error": trouble.model_dump()}, status, headers)
+def json_error(status: HTTPStatus, body: ErrorBody, headers: dict[str, str] | None = None) -> Response:
+    """Return an error response."""
+    return JSONResponse({"error": body.model_dump()}, status, headers)
 
 
 def add_error_handlers(app: FastAPI) -> None:
-    """Have every error of the application answered in the one form."""
+    """Make every error of the application a response in the one form."""
     app.add_exception_handler(RunnerError, _runner_error)
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(RequestValidationError, _invalid)
@@ -120,26 +113,26 @@ def add_error_handlers(app: FastAPI) -> None:
     app.add_exception_handler(Exception, _unexpected)
 
 
-def refused(request: Request, error: RunnerError) -> Response:
-    """Return the answer to a request that ends in one of the project's errors."""
-    headers = error.headers if isinstance(error, Refused) else None
-    return refusal(status_of(error), error_body(error, request.app.state.settings), headers)
+def error_response(request: Request, error: RunnerError) -> Response:
+    """Return the response to a request that raised one of the project's errors."""
+    headers = error.headers if isinstance(error, RequestError) else None
+    return json_error(status_of(error), error_body(error, request.app.state.settings), headers)
 
 
 async def _runner_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RunnerError)
-    return refused(request, error)
+    return error_response(request, error)
 
 
 async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     status = HTTPStatus(error.status_code)
-    told = {
+    messages = {
         HTTPStatus.NOT_FOUND: f"there is nothing at {request.url.path}.",
-        HTTPStatus.METHOD_NOT_ALLOWED: f"{request.method} cannot be done at {request.url.path}.",
+        HTTPStatus.METHOD_NOT_ALLOWED: f"{request.method} is not supported at {request.url.path}.",
     }
-    message = told.get(status, str(error.detail))
-    return refusal(status, ErrorBody(message=message), dict(error.headers or {}))
+    message = messages.get(status, str(error.detail))
+    return json_error(status, ErrorBody(message=message), dict(error.headers or {}))
 
 
 async def _invalid(request: Request, error: Exception) -> Response:  # noqa: ARG001
@@ -148,20 +141,18 @@ async def _invalid(request: Request, error: Exception) -> Response:  # noqa: ARG
         Problem(path=".".join(map(str, found["loc"])), message=str(found["msg"])) for found in error.errors()
     ]
     message = "; ".join(f"{problem.path}: {problem.message}" for problem in problems)
-    return refusal(HTTPStatus.UNPROCESSABLE_ENTITY, ErrorBody(message=message, problems=problems))
+    return json_error(HTTPStatus.UNPROCESSABLE_ENTITY, ErrorBody(message=message, problems=problems))
 
 
 async def _system_error(request: Request, error: Exception) -> Response:
-    import errno
-
     assert isinstance(error, OSError)
     if error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None)):
-        message = f"the disk is full ({error.strerror}); free some of it: `dualtaxi du` tells what uses it."
-        return refusal(HTTPStatus.INSUFFICIENT_STORAGE, ErrorBody(message=message))
+        message = f"the disk is full ({error.strerror}); free some of it: `dualtaxi du` lists what uses it."
+        return json_error(HTTPStatus.INSUFFICIENT_STORAGE, ErrorBody(message=message))
     return await _unexpected(request, error)
 
 
 async def _unexpected(request: Request, error: Exception) -> Response:
     LOG.error("error", exc_info=error, extra={"path": request.url.path, "method": request.method})
-    message = "something unexpected went wrong; the service's log tells what."
-    return refusal(HTTPStatus.INTERNAL_SERVER_ERROR, ErrorBody(message=message))
+    message = "something unexpected went wrong; see the service's log."
+    return json_error(HTTPStatus.INTERNAL_SERVER_ERROR, ErrorBody(message=message))

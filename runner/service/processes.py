@@ -13,11 +13,10 @@ import asyncio
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from http import HTTPStatus
 from multiprocessing import forkserver
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
-from runner.service.errors import Refused
+from runner.service.errors import Busy
 from runner.util.processes import CallFailed, ChildProcess, ProcessDied, start_method
 
 Args = ParamSpec("Args")
@@ -36,13 +35,6 @@ PRELOADED: Final = (
     "runner.service.computed",
 )
 """Modules that every process has from its start, where processes can be forked."""
-
-
-class Busy(Refused):
-    """Too many calls are waiting."""
-
-    def __init__(self, message: str = "the service is busy; try again.") -> None:
-        super().__init__(HTTPStatus.SERVICE_UNAVAILABLE, message, {"retry-after": "5"})
 
 
 class ProcessPool:

@@ -7,25 +7,13 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from runner.errors import MAX_MESSAGE, RunnerError
+from runner.errors import MAX_MESSAGE
 from runner.recording.labels import MAX_NOTE, MAX_TAGS
 
 State = Literal["receiving", "verifying", "stored", "refused"]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Size = Annotated[int, Field(ge=0, lt=1 << 62)]
 Text = Annotated[str, Field(max_length=100)]
-
-
-class Conflict(RunnerError):
-    """The upload is not in the state that the request assumes; ask for its offset, and continue there."""
-
-
-class TooLarge(RunnerError):
-    """More bytes than the server accepts, or than were announced."""
-
-
-class TooMany(RunnerError):
-    """The maximum number of open uploads is reached; try again later."""
 
 
 @dataclass(frozen=True)

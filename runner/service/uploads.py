@@ -24,14 +24,12 @@ from typing import Final, Self
 
 from runner.errors import RunNotFound, StorageError
 from runner.runs.run import run_of_id
+from runner.service.errors import TooManyUploads, UploadConflict, UploadTooLarge
 from runner.service.jobs.store import lock_folder
 from runner.service.logs import LOG
 from runner.service.upload_model import (
     Announcement,
     Completion,
-    Conflict,
-    TooLarge,
-    TooMany,
     Upload,
     UploadLimits,
 )
@@ -124,7 +122,7 @@ class Uploads:
         is stored at once.
 
         Raises:
-            TooLarge, TooMany: it is not accepted.
+            UploadTooLarge, TooManyUploads: it is not accepted.
             StorageError: the disk has no room.
         """
         self._forget()
@@ -155,7 +153,7 @@ class Uploads:
     ) -> Iterator[Callable[[bytes | bytearray], None]]:
         """Yield a function that appends bytes; what it has written stays, however the block ends.
 
-        The function raises `TooLarge` for more bytes than announced, of which it writes none, and
+        The function raises `UploadTooLarge` for more bytes than announced, of which it writes none, and
         `StorageError` if the disk is full, apart from the reserve, or fails.
 
         Args:
@@ -165,17 +163,19 @@ class Uploads:
             length: the announced number of bytes; None if unknown.
 
         Raises:
-            Conflict: the bytes do not follow, or another request sends some right now.
-            TooLarge: they would be too many.
+            UploadConflict: the bytes do not follow, or another request sends some right now.
+            UploadTooLarge: they would be too many.
             StorageError: the disk has no room.
         """
         with self._exclusive(upload_id, owner) as upload:
             received = self.offset(upload)
             if upload.state != "receiving" or offset != received:
-                raise Conflict(f"found bytes from {offset:,} on, expected {received:,} ({upload.state}).")
+                raise UploadConflict(
+                    f"found bytes from {offset:,} on, expected {received:,} ({upload.state})."
+                )
             limit = self.limits.max_bytes if upload.size is None else upload.size
             if offset + (length or 0) > limit:
-                raise TooLarge(f"found {offset + (length or 0):,} bytes, expected at most {limit:,}.")
+                raise UploadTooLarge(f"found {offset + (length or 0):,} bytes, expected at most {limit:,}.")
             self._require_free(length or 0)
             with _disk_errors():
                 stream = self._body(upload_id).open("ab", buffering=0)
@@ -183,7 +183,7 @@ class Uploads:
             def write(data: bytes | bytearray) -> None:
                 nonlocal received
                 if received + len(data) > limit:
-                    raise TooLarge("found more bytes than the upload was announced to have.")
+                    raise UploadTooLarge("found more bytes than the upload was announced to have.")
                 self._require_free(len(data))
                 received += len(data)
                 view = memoryview(data)
@@ -198,19 +198,19 @@ class Uploads:
         """Finish an upload: it is synced to disk, and queued for verification. Returns its new state.
 
         Raises:
-            Conflict: bytes are missing, or another digest was announced or completed.
+            UploadConflict: bytes are missing, or another digest was announced or completed.
         """
         with self._exclusive(upload_id, owner) as upload:
             if upload.state != "receiving":
                 if upload.completion is not None and upload.completion.digest != completion.digest:
-                    raise Conflict("the upload was completed with another digest; begin another one.")
+                    raise UploadConflict("the upload was completed with another digest; begin another one.")
                 return upload
             if (received := self.offset(upload)) != completion.size:
-                raise Conflict(
+                raise UploadConflict(
                     f"found {received:,} bytes, expected the {completion.size:,} of the completion."
                 )
             if upload.announced.digest not in (None, completion.digest):
-                raise Conflict("found another digest than the one announced; begin another upload.")
+                raise UploadConflict("found another digest than the one announced; begin another upload.")
             with _disk_errors():
                 sync(self._body(upload_id))
             changes = {"state": "verifying", "completion": completion, "problem": ""}
@@ -223,11 +223,11 @@ class Uploads:
         """Forget an upload, and remove what was received.
 
         Raises:
-            Conflict: it is being received or verified.
+            UploadConflict: it is being received or verified.
         """
         with self._exclusive(upload_id, owner) as upload:
             if upload.state == "verifying":
-                raise Conflict("the upload is being verified; wait for its end.")
+                raise UploadConflict("the upload is being verified; wait for its end.")
             self._remove(upload)
 
     @contextlib.contextmanager
@@ -236,7 +236,7 @@ class Uploads:
         with self._lock:
             upload = self.get(upload_id, owner)
             if upload_id in self._in_use:
-                raise Conflict("another request sends to this upload; wait for its end.")
+                raise UploadConflict("another request sends to this upload; wait for its end.")
             self._in_use.add(upload_id)
         try:
             yield upload
@@ -280,15 +280,15 @@ class Uploads:
     def _require_room(self, owner: str, size: int | None) -> None:
         limits = self.limits
         if (size or 0) > limits.max_bytes:
-            raise TooLarge(f"found {size:,} bytes, expected at most {limits.max_bytes:,}.")
+            raise UploadTooLarge(f"found {size:,} bytes, expected at most {limits.max_bytes:,}.")
         owners = [upload.owner for upload in self.all() if upload.state in ("receiving", "verifying")]
         if owners.count(owner) >= limits.max_open_each:
-            raise TooMany(
+            raise TooManyUploads(
                 f"{limits.max_open_each:,} of your uploads are open, the maximum of a client; complete or "
                 "delete some."
             )
         if len(owners) >= limits.max_open:
-            raise TooMany(f"{limits.max_open:,} uploads are open; try again when some are done.")
+            raise TooManyUploads(f"{limits.max_open:,} uploads are open; try again when some are done.")
         self._require_free(size or 0)
 
     def _require_free(self, size: int) -> None:
@@ -338,7 +338,10 @@ class Uploads:
                 if upload.state != "verifying" and days > limit:
                     forgotten.append(upload)
         for upload in forgotten:
-            with contextlib.suppress(Conflict, RunNotFound), self._exclusive(upload.upload_id, upload.owner):
+            with (
+                contextlib.suppress(UploadConflict, RunNotFound),
+                self._exclusive(upload.upload_id, upload.owner),
+            ):
                 self._remove(upload)
 
     def _changed(self, upload: Upload) -> float:

@@ -7,8 +7,8 @@ import click
 from runner.cli import Group
 from runner.cli.options import json_option
 from runner.cli.output import draw, print_json, say, table
-from runner.service.security import READ, WRITE, Tokens
 from runner.service.settings import tokens_file
+from runner.service.tokens import READ, WRITE, Tokens
 
 
 @click.group("token", cls=Group)

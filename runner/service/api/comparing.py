@@ -18,12 +18,12 @@ from runner.service.dependencies import (
     recording_state,
     timed_recording_state,
 )
-from runner.service.problems import answers
+from runner.service.problems import error_docs
 from runner.service.response_cache import ALWAYS
 
 router = APIRouter(
     tags=["comparing"],
-    responses=answers(
+    responses=error_docs(
         HTTPStatus.BAD_REQUEST,
         HTTPStatus.NOT_FOUND,
         HTTPStatus.CONFLICT,

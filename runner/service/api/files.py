@@ -14,12 +14,12 @@ from runner.runs.run import Run
 from runner.service import computed
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.errors import Refused
-from runner.service.problems import answers
+from runner.service.problems import error_docs
 
 router = APIRouter(
     prefix="/runs/{run}",
     tags=["files"],
-    responses=answers(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
 )
 MEDIA: Final = "application/octet-stream"
 BLOCK: Final = 1 << 20
@@ -49,7 +49,7 @@ def recording(run: RecordedRun, if_none_match: IfNoneMatch = None) -> Response:
 @router.get(
     "/replay.rrd",
     response_class=Response,
-    responses=FILE | answers(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED),
+    responses=FILE | error_docs(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED),
     summary="The run for the Rerun viewer, made on demand.",
 )
 async def replay(

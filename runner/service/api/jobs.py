@@ -15,11 +15,11 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 
 from runner.service.dependencies import JobsOf
-from runner.service.errors import Refused
+from runner.service.errors import JobNotFound, Refused
 from runner.service.jobs.checking import DEFAULT_SOURCE
 from runner.service.jobs.pool import JobPool, QueueStatus
-from runner.service.jobs.store import Job, JobNotFound, Kind, State
-from runner.service.problems import answers, content
+from runner.service.jobs.store import Job, Kind, State
+from runner.service.problems import error_docs, media_docs
 
 LOOK_SECONDS: Final = 0.25
 """Between two looks at what is new; a look costs next to nothing."""
@@ -126,7 +126,7 @@ Text = Annotated[str, Depends(text_of)]
     "/jobs",
     status_code=HTTPStatus.CREATED,
     response_model=JobResponse,
-    responses=answers(HTTPStatus.CONFLICT),
+    responses=error_docs(HTTPStatus.CONFLICT),
     openapi_extra=_YAML,
     summary="Submit a configuration or a sweep.",
 )
@@ -175,7 +175,10 @@ def list_jobs(
 
 
 @router.get(
-    "/jobs/{number}", response_model=JobResponse, responses=answers(HTTPStatus.NOT_FOUND), summary="One job."
+    "/jobs/{number}",
+    response_model=JobResponse,
+    responses=error_docs(HTTPStatus.NOT_FOUND),
+    summary="One job.",
 )
 def one(jobs: JobsOf, number: Number) -> JobResponse:
     """Tell of a job."""
@@ -185,7 +188,7 @@ def one(jobs: JobsOf, number: Number) -> JobResponse:
 @router.get(
     "/jobs/{number}/submitted",
     response_class=Response,
-    responses=content("text/plain") | answers(HTTPStatus.NOT_FOUND),
+    responses=media_docs("text/plain") | error_docs(HTTPStatus.NOT_FOUND),
     summary="The text of a job, as it was submitted.",
 )
 def submitted(jobs: JobsOf, number: Number) -> Response:
@@ -196,7 +199,7 @@ def submitted(jobs: JobsOf, number: Number) -> Response:
 @router.post(
     "/jobs/{number}/cancel",
     response_model=JobResponse,
-    responses=answers(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
+    responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Cancel a job; what it has recorded is kept.",
 )
 def cancel(jobs: JobsOf, number: Number) -> JobResponse:
@@ -207,7 +210,7 @@ def cancel(jobs: JobsOf, number: Number) -> JobResponse:
 @router.post(
     "/jobs/{number}/resume",
     response_model=JobResponse,
-    responses=answers(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
+    responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Go on with a job that failed or was cancelled.",
 )
 def resume(
@@ -223,7 +226,7 @@ def resume(
     "/jobs/{number}/events",
     response_class=StreamingResponse,
     responses={
-        **answers(HTTPStatus.NOT_FOUND),
+        **error_docs(HTTPStatus.NOT_FOUND),
         200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}},
         204: {"description": "The job is over, and everything was told."},
     },

@@ -21,7 +21,7 @@ from runner.service.dependencies import (
     recording_state,
 )
 from runner.service.errors import Refused
-from runner.service.problems import answers, content
+from runner.service.problems import error_docs, media_docs
 from runner.service.response_cache import ALWAYS
 
 if TYPE_CHECKING:
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 router = APIRouter(
     prefix="/runs/{run}",
     tags=["reading"],
-    responses=answers(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
 )
-BUSY = answers(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED)
+BUSY = error_docs(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED)
 """What else may become of work in a process of its own."""
 ARROW = "application/vnd.apache.arrow.stream"
 MEDIA = {"svg": "image/svg+xml", "png": "image/png", "pdf": "application/pdf"}
@@ -173,7 +173,7 @@ async def optimality(
 @router.get(
     "/{table}/{phase}.arrow",
     response_class=Response,
-    responses=content(ARROW) | BUSY,
+    responses=media_docs(ARROW) | BUSY,
     summary="Steps or episodes by range, as Arrow.",
 )
 async def arrow(
@@ -245,7 +245,7 @@ async def q_table(
 @router.get(
     "/qtable.npy",
     response_class=Response,
-    responses=content("application/octet-stream") | BUSY,
+    responses=media_docs("application/octet-stream") | BUSY,
     summary="The Q-table at any step, whole.",
 )
 async def q_table_whole(
@@ -264,7 +264,7 @@ async def q_table_whole(
 @router.get(
     "/plot.{form}",
     response_class=Response,
-    responses=content(*MEDIA.values()) | BUSY,
+    responses=media_docs(*MEDIA.values()) | BUSY,
     summary="Every metric in one figure.",
 )
 async def plot(

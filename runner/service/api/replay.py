@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from runner.service import fragments
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
-from runner.service.problems import answers
+from runner.service.problems import error_docs
 
 if TYPE_CHECKING:
     from runner.runs.run import Run
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 router = APIRouter(
     prefix="/runs/{run}/replay",
     tags=["reading"],
-    responses=answers(
+    responses=error_docs(
         HTTPStatus.BAD_REQUEST,
         HTTPStatus.NOT_FOUND,
         HTTPStatus.CONFLICT,

@@ -20,7 +20,7 @@ from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json
 from runner.service.dependencies import CacheOf, CatalogueOf, FoundRun, SettingsOf
 from runner.service.errors import Refused
-from runner.service.problems import answers
+from runner.service.problems import error_docs
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index
@@ -43,7 +43,7 @@ class RunsPage(BaseModel):
 @router.get(
     "/runs",
     response_model=RunsPage,
-    responses=answers(HTTPStatus.BAD_REQUEST),
+    responses=error_docs(HTTPStatus.BAD_REQUEST),
     summary="List the runs that fit a filter, the newest first.",
 )
 async def list_runs(
@@ -117,7 +117,7 @@ class Described(BaseModel, extra="allow"):
 @router.get(
     "/runs/{run}",
     response_model=Described,
-    responses=answers(HTTPStatus.NOT_FOUND),
+    responses=error_docs(HTTPStatus.NOT_FOUND),
     summary="All about a run.",
 )
 def one_run(run: FoundRun, settings: SettingsOf) -> Response:
@@ -145,7 +145,7 @@ def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
 @router.patch(
     "/runs/{run}",
     response_model=Labelled,
-    responses=answers(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
     summary="Rename, tag, and note.",
 )
 def label_run(run: FoundRun, labels: Labels, catalogue: CatalogueOf) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from pydantic import BaseModel
 from starlette.requests import ClientDisconnect
 
 from runner.service.errors import Refused
-from runner.service.problems import answers
-from runner.service.security import Token
+from runner.service.problems import error_docs
+from runner.service.tokens import Token
 from runner.service.upload_model import Announcement, Completion, State, Upload
 from runner.service.uploads import Uploads
 
@@ -71,7 +71,7 @@ def owner_of(request: Request) -> str:
 UploadsOf = Annotated[Uploads, Depends(uploads_of)]
 OwnerOf = Annotated[str, Depends(owner_of)]
 UploadId = Annotated[str, Path(pattern="^[0-9a-f]{32}$", description="The id from the first response.")]
-_IN_ORDER: Final = answers(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
+_IN_ORDER: Final = error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
 _BYTES: Final = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
 
 
@@ -103,7 +103,7 @@ def begin(
 
 @router.get(
     "/uploads/{upload_id}",
-    responses=answers(HTTPStatus.NOT_FOUND),
+    responses=error_docs(HTTPStatus.NOT_FOUND),
     summary="Return the state of an upload; wait for its verification.",
 )
 async def one(

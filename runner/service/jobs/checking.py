@@ -21,8 +21,9 @@ from runner.environments.loading import load_mdp
 from runner.errors import ConfigError, RunnerError
 from runner.execution.estimate import estimate, step_limit
 from runner.execution.initial_tables import resolve_initial_q
+from runner.service.errors import Busy
 from runner.service.jobs.store import Kind
-from runner.service.processes import Busy, ProcessPool
+from runner.service.processes import ProcessPool
 from runner.sweep import state, sweeps_in
 from runner.sweep.loading import from_text as sweep_from_text
 from runner.sweep.search import Search, require_optuna

@@ -23,9 +23,10 @@ from runner.config import from_mapping
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.runs.run import new_run_id
+from runner.service.errors import JobStateConflict
 from runner.service.jobs.channel import JobSpec, Outcome
 from runner.service.jobs.checking import DEFAULT_SOURCE, CheckedJob, JobChecker
-from runner.service.jobs.store import Job, JobStateConflict, JobStore, now
+from runner.service.jobs.store import Job, JobStore, now
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
 from runner.sweep.cluster import require_ray

@@ -33,6 +33,7 @@ from runner.client.jobs import OVER
 from runner.config.document import read_yaml, write_yaml
 from runner.errors import RunnerError, StorageError
 from runner.runs.locking import acquired
+from runner.service.errors import JobNotFound, QueueFull
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -47,18 +48,6 @@ LOCK_FILE: Final = f"{FOLDER}/queue.lock"
 MAX_EVENTS: Final = 50_000
 """Stored events of a job; beyond them only its states are stored."""
 EVENTS_PER_READ: Final = 2000
-
-
-class QueueFull(RunnerError):
-    """The maximum number of unfinished jobs is reached."""
-
-
-class JobNotFound(RunnerError):
-    """No job has this number."""
-
-
-class JobStateConflict(RunnerError):
-    """The job's state does not allow the operation."""
 
 
 @dataclass(frozen=True)

@@ -142,7 +142,7 @@ def add_error_handlers(app: FastAPI) -> None:
 
 def refused(request: Request, error: RunnerError) -> Response:
     """Return the response to a request that is refused before it is routed."""
-    return _error_page(request, problems.refused(request, error))
+    return _error_page(request, problems.error_response(request, error))
 
 
 def _error_page(request: Request, response: Response) -> Response:

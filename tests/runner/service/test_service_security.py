@@ -22,9 +22,9 @@ from runner.errors import RunnerError
 from runner.runs.resolve import find_run
 from runner.service import logs
 from runner.service.app import create_app
-from runner.service.guard import POLICY
-from runner.service.security import READ, WRITE, Tokens, is_allowed_host, is_same_origin
+from runner.service.guard import POLICY, is_allowed_host, is_same_origin
 from runner.service.settings import Limits, tokens_file
+from runner.service.tokens import READ, WRITE, Tokens
 
 RUNS, RUN = "/api/v1/runs", "/api/v1/runs/first"
 OWN = {"Origin": "http://localhost"}
@@ -193,7 +193,7 @@ def test_a_session_survives_a_restart_and_ends_with_its_token_or_its_time(
     assert status() == 404, "logged in: there is no such page"
     with monkeypatch.context() as later:
         now = time.time()
-        later.setattr("runner.service.sessions.time.time", lambda: now + 8 * 86_400)
+        later.setattr("runner.service.tokens.time.time", lambda: now + 8 * 86_400)
         assert status() == 401
     tokens.revoke("laptop")
     assert status() == 401

@@ -8,8 +8,9 @@ import peewee
 import pytest
 
 from runner.errors import RunnerError, StorageError
+from runner.service.errors import JobNotFound, QueueFull
 from runner.service.jobs import store as stores
-from runner.service.jobs.store import JobNotFound, JobStore, QueueFull
+from runner.service.jobs.store import JobStore
 
 CONFIG = {"episodes": 3, "env": {"kwargs": {"limit": float("inf")}}}
 

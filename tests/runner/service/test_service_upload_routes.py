@@ -8,8 +8,8 @@ import pytest
 from blake3 import blake3
 
 from runner.runs.run import list_runs
-from runner.service.security import Tokens
 from runner.service.settings import Limits
+from runner.service.tokens import Tokens
 
 UPLOADS = "/api/v1/uploads"
 PIECE = {"Content-Type": "application/octet-stream"}

@@ -23,14 +23,12 @@ from runner.export.mcap import export_mcap
 from runner.recording.labels import Labels, change_labels
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
+from runner.service.errors import TooManyUploads, UploadConflict, UploadTooLarge
 from runner.service.upload_model import (
     Announcement,
     Completion,
-    Conflict,
     RunDetails,
     RunLabels,
-    TooLarge,
-    TooMany,
     UploadLimits,
 )
 from runner.service.uploads import FOLDER, Uploads
@@ -286,38 +284,38 @@ def test_a_client_that_lies_or_errs_gets_no_further(uploads, lake):
         uploads.get(upload.upload_id, BEN)
     with pytest.raises(RunNotFound), uploads.receive("../" + upload.upload_id, ANNA, 0, 1):
         pass
-    with pytest.raises(Conflict, match="expected 0"), uploads.receive(upload.upload_id, ANNA, 7, 1):
+    with pytest.raises(UploadConflict, match="expected 0"), uploads.receive(upload.upload_id, ANNA, 7, 1):
         pass
-    with pytest.raises(TooLarge), uploads.receive(upload.upload_id, ANNA, 0, len(data) + 1):
+    with pytest.raises(UploadTooLarge), uploads.receive(upload.upload_id, ANNA, 0, len(data) + 1):
         pass
     with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
-        with pytest.raises(TooLarge):
+        with pytest.raises(UploadTooLarge):
             write(data + b"more")
-        with pytest.raises(Conflict), uploads.receive(upload.upload_id, ANNA, 0, 1):
+        with pytest.raises(UploadConflict), uploads.receive(upload.upload_id, ANNA, 0, 1):
             pass
-        with pytest.raises(Conflict):
+        with pytest.raises(UploadConflict):
             uploads.complete(upload.upload_id, ANNA, completion(data))
-        with pytest.raises(Conflict):
+        with pytest.raises(UploadConflict):
             uploads.delete(upload.upload_id, ANNA)
     assert uploads.offset(upload) == 0
-    with pytest.raises(Conflict, match="found 0 bytes"):
+    with pytest.raises(UploadConflict, match="found 0 bytes"):
         uploads.complete(upload.upload_id, ANNA, completion(data))
     with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
         write(data)
     other = completion(data).model_copy(update={"digest": "0" * 64})
-    with pytest.raises(Conflict, match="another digest"):
+    with pytest.raises(UploadConflict, match="another digest"):
         uploads.complete(upload.upload_id, ANNA, other)
 
 
 def test_what_is_too_much_is_not_taken(lake, tmp_path):
     uploads = Uploads(tmp_path / "runs", UploadLimits(max_bytes=1_000, max_open=2))
-    with pytest.raises(TooLarge, match="1,000"):
+    with pytest.raises(UploadTooLarge, match="1,000"):
         uploads.begin(ANNA, Announcement(size=1_001))
     first, _ = uploads.begin(ANNA, Announcement())
-    with uploads.receive(first.upload_id, ANNA, 0, None) as write, pytest.raises(TooLarge):
+    with uploads.receive(first.upload_id, ANNA, 0, None) as write, pytest.raises(UploadTooLarge):
         write(bytes(1_001))
     uploads.begin(ANNA, Announcement())
-    with pytest.raises(TooMany):
+    with pytest.raises(TooManyUploads):
         uploads.begin(BEN, Announcement())
     uploads.delete(first.upload_id, ANNA)
     uploads.begin(BEN, Announcement())
@@ -432,9 +430,9 @@ def test_one_client_cannot_hold_all_uploads(tmp_path):
     uploads = Uploads(tmp_path / "runs", UploadLimits(max_open=3, max_open_each=2))
     for _ in range(2):
         uploads.begin(ANNA, Announcement())
-    with pytest.raises(TooMany, match="2 of your uploads are open"):
+    with pytest.raises(TooManyUploads, match="2 of your uploads are open"):
         uploads.begin(ANNA, Announcement())
     uploads.begin(BEN, Announcement())
-    with pytest.raises(TooMany, match="3 uploads are open"):
+    with pytest.raises(TooManyUploads, match="3 uploads are open"):
         uploads.begin(BEN, Announcement())
     uploads.close()

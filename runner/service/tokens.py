@@ -1,0 +1,243 @@
+"""Access tokens, and the browser sessions that stand for them.
+
+A *token* is 256 random bits. A file of the user's has its SHA-256 and its scopes; slow hashes and limits on
+attempts are for secrets that people choose. A *session* is 256 random bits in a cookie; a file next to that
+of the tokens has their SHA-256, and the id of the token. So logins survive a restart, a session ends with its
+token, and neither file gives anybody access.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import hmac
+import re
+import secrets
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+
+from filelock import FileLock
+
+from runner.errors import RunnerError, StorageError
+from runner.util.files import read_object, storage_errors, write_object
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Record = TypeVar("Record", bound="DataclassInstance")
+
+READ: Final = "read"
+WRITE: Final = "write"
+SCOPES: Final = (READ, WRITE)
+PREFIX: Final = "dualtaxi_"
+"""What a token begins with, so that it is recognised where it does not belong."""
+MAX_TOKENS: Final = 1000
+SESSIONS_FILE: Final = "sessions.json"
+COOKIE: Final = "dualtaxi_session"
+SESSION_SECONDS: Final = 7 * 86_400
+MAX_SESSIONS: Final = 1000
+"""The oldest sessions end when there are more."""
+_NAME: Final = re.compile(r"[\w.@ -]{1,64}")
+_MAX_FILE_BYTES: Final = 1 << 20
+_LOCK_SECONDS: Final = 10
+
+
+@dataclass(frozen=True)
+class Token:
+    """What is stored of a token."""
+
+    id: str
+    name: str
+    scopes: tuple[str, ...]
+    created: str
+    sha256: str
+
+    @property
+    def can_write(self) -> bool:
+        """Whether it allows more than reading."""
+        return WRITE in self.scopes
+
+    def as_json(self) -> dict[str, Any]:
+        """Return its public fields: never the hash."""
+        return {"id": self.id, "name": self.name, "scopes": list(self.scopes), "created": self.created}
+
+
+@dataclass(frozen=True)
+class Session:
+    """What is stored of a session."""
+
+    sha256: str
+    token_id: str
+    expires: float
+    """In seconds since 1970."""
+
+
+class _RecordsFile(Generic[Record]):
+    """A file `{"KEY": [record, ...]}`, readable by its owner only, that several processes may change.
+
+    Args:
+        path: the file; it need not exist.
+        key: the name of the records.
+        parse: returns a record from its JSON object; raises `ValueError`, `KeyError`, `TypeError` or
+            `AttributeError` if it is none.
+    """
+
+    def __init__(self, path: Path, key: str, parse: Callable[[Any], Record]) -> None:
+        self.path = path
+        self._key, self._parse = key, parse
+        self._version: tuple[int, int, int] | None = None
+        self._records: tuple[Record, ...] = ()
+
+    def all(self) -> tuple[Record, ...]:
+        """Return the records; the file is read again when it has changed.
+
+        Raises:
+            StorageError: the file exists and cannot be read as one of them.
+        """
+        try:
+            stat = self.path.stat()
+            version = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+            if version != self._version:
+                entries = read_object(self.path, _MAX_FILE_BYTES)[self._key]
+                self._records, self._version = tuple(self._parse(entry) for entry in entries), version
+        except FileNotFoundError:
+            self._records, self._version = (), None
+        except OSError as error:
+            raise StorageError(f"{self.path}: cannot be read ({error.strerror}).") from error
+        except (ValueError, KeyError, TypeError, AttributeError):
+            message = f"{self.path}: found no file of {self._key}; remove it, and create them again."
+            raise StorageError(message) from None
+        return self._records
+
+    def change(self, change: Callable[[tuple[Record, ...]], Iterable[Record]]) -> None:
+        """Replace the records by the result of a function, while no other process changes them.
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        with storage_errors(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            with FileLock(self.path.with_suffix(".lock"), timeout=_LOCK_SECONDS):
+                records = [dataclasses.asdict(record) for record in change(self.all())]
+                write_object(self.path, {self._key: records}, mode=0o600)
+
+
+class Tokens:
+    """The tokens in a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = _RecordsFile(path, "tokens", _parse_token)
+        self.path = path
+
+    def all(self) -> tuple[Token, ...]:
+        """Return all tokens, the oldest first.
+
+        Raises:
+            StorageError: the file exists and cannot be read as one of tokens.
+        """
+        return self._file.all()
+
+    def find(self, secret: str) -> Token | None:
+        """Return the token of a secret; None if there is none. Takes the same time in both cases."""
+        digest = _digest(secret)
+        matching = [token for token in self.all() if hmac.compare_digest(token.sha256, digest)]
+        return matching[-1] if matching else None
+
+    def create(self, name: str, scopes: tuple[str, ...]) -> tuple[Token, str]:
+        """Return a new token and its secret, which is not stored.
+
+        Raises:
+            RunnerError: the name or a scope is invalid, or there are too many tokens.
+            StorageError: the file cannot be written.
+        """
+        if not _NAME.fullmatch(name):
+            raise RunnerError(f"token: found the name {name!r}, expected 1 to 64 letters, digits, _ . @ -")
+        secret = PREFIX + secrets.token_urlsafe(32)
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        token = Token(secrets.token_hex(4), name, scopes, now, _digest(secret))
+
+        def add(tokens: tuple[Token, ...]) -> tuple[Token, ...]:
+            if len(tokens) >= MAX_TOKENS:
+                raise RunnerError(f"token: there are {MAX_TOKENS} tokens; revoke some.")
+            return (*tokens, token)
+
+        self._file.change(add)
+        return token, secret
+
+    def revoke(self, name: str) -> Token:
+        """Remove the token with an id or a name, at once also for a running service; return it.
+
+        Raises:
+            RunnerError: there is none, or there are several of the name.
+            StorageError: the file cannot be written.
+        """
+        matching = [token for token in self.all() if name in (token.id, token.name)]
+        if len(matching) != 1:
+            known = ", ".join(f"{token.id} ({token.name})" for token in self.all()) or "none"
+            raise RunnerError(f"token: {name!r} names {len(matching)} tokens, expected one of {known}.")
+        self._file.change(lambda tokens: [token for token in tokens if token.id != matching[0].id])
+        return matching[0]
+
+
+class Sessions:
+    """The browser sessions of the tokens in a file."""
+
+    def __init__(self, tokens: Tokens) -> None:
+        self._tokens = tokens
+        self._file = _RecordsFile(tokens.path.with_name(SESSIONS_FILE), "sessions", _parse_session)
+
+    def begin(self, token: Token) -> str:
+        """Return the secret of a new session of a token.
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        secret = secrets.token_urlsafe(32)
+        session = Session(_digest(secret), token.id, time.time() + SESSION_SECONDS)
+        self._file.change(lambda sessions: [*self._current(sessions), session][-MAX_SESSIONS:])
+        return secret
+
+    def token_of(self, secret: str) -> Token | None:
+        """Return the token of a session; None if it has ended, or its token was revoked.
+
+        Raises:
+            StorageError: a file cannot be read.
+        """
+        digest = _digest(secret)  # compared as a hash, so the time it takes reveals nothing of the secret
+        for session in self._current(self._file.all()):
+            if session.sha256 == digest:
+                return next((token for token in self._tokens.all() if token.id == session.token_id), None)
+        return None
+
+    def end(self, secret: str) -> None:
+        """End a session, if it exists.
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        digest = _digest(secret)
+        self._file.change(lambda sessions: [old for old in self._current(sessions) if old.sha256 != digest])
+
+    def _current(self, sessions: tuple[Session, ...]) -> list[Session]:
+        """Return the sessions that have not ended and whose token exists."""
+        ids, now = {token.id for token in self._tokens.all()}, time.time()
+        return [session for session in sessions if session.token_id in ids and session.expires > now]
+
+
+def _parse_token(entry: Any) -> Token:
+    token = Token(**entry | {"scopes": tuple(entry["scopes"])})
+    if not set(token.scopes) <= set(SCOPES) or len(token.sha256) != 64:
+        raise ValueError("it is no token")
+    return token
+
+
+def _parse_session(entry: Any) -> Session:
+    return Session(str(entry["sha256"]), str(entry["token_id"]), float(entry["expires"]))
+
+
+def _digest(secret: str) -> str:
+    return hashlib.sha256(secret.encode(errors="replace")).hexdigest()
