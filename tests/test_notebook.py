@@ -15,6 +15,7 @@ import runner
 from docs.notebooks.store_outputs import execute, reproducible
 from runner.errors import MissingExtra
 from runner.export.notebook import facts_html, plot, report, rerun_view, run_html
+from runner.export.reports.rendering import templates
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "docs" / "notebooks").glob("*.ipynb"))
 
@@ -38,6 +39,7 @@ def test_a_run_shows_its_report_in_a_frame_of_its_own(run):
 def test_without_packages_or_recording_it_shows_its_facts(run, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "jinja2", None)
+        templates.cache_clear()
         shown = run_html(run)
     assert "[plots]" in shown
     assert run.run_id in shown
