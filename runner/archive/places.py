@@ -1,45 +1,50 @@
-"""The recordings of archived runs: found where they were put, and restored into the user's cache to be read.
+"""The archives of runs: found where they are, and restored into the user's cache to be read.
 
-A run that is not archived costs nothing here, so what is heavy is imported when it is needed.
+A restore runs in a child process with a memory limit: whoever made an archive may have made it to exhaust the
+memory. For a run that is not archived nothing heavy is imported.
 """
 
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from runner.errors import RecordingError, StorageError
 from runner.runs.run import RUN_FILE, Run
-from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder
+from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, storage_errors
+from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, report_progress
 
 ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
-KEPT: Final = 8
-"""Restored recordings in the cache; the ones that were not looked at for longest are removed."""
+MAX_CACHED: Final = 8
+"""Restored recordings in the cache; those unused for longest are removed."""
 LOCK_SECONDS: Final = 600.0
+MEMORY_BYTES: Final = 4 << 30
+"""Memory for restoring an archive, beyond what the process takes at its start."""
+_RESTORE_SECONDS: Final = 7 * 86400.0
 
 Report = Callable[[int], None]
-Tell = Callable[[str], None]
 
 
 def default_target(recordings: Path) -> str:
-    """Return where archives are kept: as the variable says, else in `archive` beside the recordings."""
+    """Return the default place of archives: by the variable, else `archive` next to the recordings."""
     return os.environ.get(ARCHIVE_VARIABLE) or str(recordings.absolute().parent / "archive")
 
 
-def at_hand(run: Run, tell: Tell = lambda _: None, report: Report = lambda _: None) -> Run:
-    """Return the run with its recording to be read: if it is archived, restored into the user's cache.
+def at_hand(run: Run, log: Callable[[str], None] = lambda _: None, report: Report = lambda _: None) -> Run:
+    """Return the run with a recording that can be read: an archived one is restored into the user's cache.
 
     Args:
         run: any run.
-        tell: called with a line when it must be restored, which takes seconds.
+        log: called with a line if it must be restored, which takes seconds.
         report: called with the steps restored so far.
 
     Raises:
-        RecordingError: the archive is damaged, missing, or another's.
+        RecordingError: the archive is damaged, missing, or of another run.
         StorageError: the cache cannot be written, or another process has been restoring it for too long.
     """
     if run.status != "archived" or run.restored:
@@ -49,42 +54,36 @@ def at_hand(run: Run, tell: Tell = lambda _: None, report: Report = lambda _: No
     digest = run.archive.digest
     if len(digest) != 64 or not digest.isalnum():
         raise RecordingError(f"{run.folder / RUN_FILE}: found archive digest {digest!r}, expected a BLAKE3.")
-    kept = cache_folder() / RESTORED / f"{run.run_id}-{digest[:16]}.mcap"
-    try:
-        kept.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(kept.with_suffix(".lock"), timeout=LOCK_SECONDS):
-            if not kept.is_file():
-                tell(f"Run {run.run_id} is archived; restoring it from {run.archive.target}.")
-                _restore_kept(run, kept, digest, report)
-            kept.touch()
-    except Timeout as error:
-        raise StorageError(
-            f"{kept}: another process has been restoring it for {LOCK_SECONDS:.0f} s."
-        ) from error
-    except OSError as error:
-        raise StorageError(
-            f"{kept}: cannot be written ({error.strerror}); set {CACHE_VARIABLE} to another folder."
-        ) from error
-    return replace(run, restored=kept)
-
-
-def _restore_kept(run: Run, kept: Path, digest: str, report: Report) -> None:
-    """Restore a run into the cache, and make room there."""
-    others = sorted(kept.parent.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True)
-    for old in others[KEPT - 1 :]:
-        old.unlink(missing_ok=True)
-    fresh = kept.with_suffix(".restoring")
-    with archive_of(run) as folder:
-        restore_to(folder, fresh, digest, report)
-    fresh.replace(kept)
+    cached = cache_folder() / RESTORED / f"{run.run_id}-{digest[:16]}.mcap"
+    with storage_errors(cached, f"set {CACHE_VARIABLE} to another folder"):
+        cached.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with FileLock(cached.with_suffix(".lock"), timeout=LOCK_SECONDS):
+                if not cached.is_file():
+                    log(f"Run {run.run_id} is archived; restoring it from {run.archive.target}.")
+                    others = sorted(
+                        cached.parent.glob("*.mcap"), key=lambda path: path.stat().st_mtime, reverse=True
+                    )
+                    for old in others[MAX_CACHED - 1 :]:
+                        old.unlink(missing_ok=True)
+                    fresh = cached.with_suffix(".restoring")
+                    with archive_of(run) as folder:
+                        restore_to(folder, fresh, digest, report)
+                    fresh.replace(cached)
+                cached.touch()
+        except Timeout as error:
+            raise StorageError(
+                f"{cached}: another process has been restoring it for {LOCK_SECONDS:.0f} s."
+            ) from error
+    return replace(run, restored=cached)
 
 
 @contextlib.contextmanager
 def archive_of(run: Run) -> Iterator[Path]:
-    """Give the archive of a run.
+    """Yield a local folder with the archive of a run.
 
     Raises:
-        RecordingError: there is none where it should be.
+        RecordingError: it is at none of its places.
         StorageError: its place cannot be read.
     """
     from runner.archive.store import Store, split_place
@@ -100,10 +99,10 @@ def archive_of(run: Run) -> Iterator[Path]:
 
 
 def archive_place(run: Run) -> str | None:
-    """Return where the archive of a run is; None if it is nowhere that is known.
+    """Return the place of a run's archive; None if it is at none of its places.
 
     Raises:
-        RecordingError: what is there is no archive.
+        RecordingError: something else than an archive is there.
         StorageError: its place cannot be read.
     """
     from runner.archive.store import Store, split_place
@@ -116,17 +115,53 @@ def archive_place(run: Run) -> str | None:
 
 
 def _places(run: Run) -> list[str]:
-    """Return where the archive of a run may be: where it was put, or beside recordings that moved with it."""
-    beside = f"{default_target(run.folder.absolute().parent)}/{run.run_id}"
-    return list(dict.fromkeys((run.archive.target, beside)))
+    """Return where the archive of a run may be: where it was put, or next to recordings that moved."""
+    default = f"{default_target(run.folder.absolute().parent)}/{run.run_id}"
+    return list(dict.fromkeys((run.archive.target, default)))
 
 
-def restore_to(folder: Path, path: Path, digest: Any, report: Report) -> None:
-    """Restore an archive that must have a digest; errors as for `restoring.restore`."""
-    from runner.archive.restoring import restore
+def restore_to(folder: Path, path: Path, digest: str, report: Report) -> None:
+    """Restore an archive with a digest into a file; it is checked completely.
 
+    Raises:
+        RecordingError: the archive is damaged, or has another digest; there is no file then.
+        StorageError: the file cannot be written.
+    """
     path.unlink(missing_ok=True)
-    manifest = restore(folder, path, report)
-    if manifest.digest != digest:
+    try:
+        found = _in_child_process(folder, path, report)
+        if found != digest:
+            raise RecordingError(f"{folder}: found an archive of digest {found}, expected {digest}.")
+    except BaseException:
         path.unlink(missing_ok=True)
-        raise RecordingError(f"{folder}: found an archive of digest {manifest.digest}, expected {digest}.")
+        raise
+
+
+def check_archive(folder: Path, report: Report) -> None:
+    """Restore an archive in memory alone.
+
+    Raises:
+        RecordingError: the archive is damaged.
+    """
+    _in_child_process(folder, None, report)
+
+
+def _in_child_process(folder: Path, path: Path | None, report: Report) -> str:
+    if multiprocessing.current_process().daemon:  # it has limits of its own, and must not start another one
+        return _restore(folder, path, report)
+    try:
+        with ChildProcess(MEMORY_BYTES, on_progress=report) as child:
+            return child.call(_restore, _RESTORE_SECONDS, folder, path)
+    except (OutOfMemory, ProcessDied) as error:
+        raise RecordingError(
+            f"{folder}: restoring it needs more than {MEMORY_BYTES / (1 << 30):g} GiB of memory: the archive "
+            "is damaged, or was made to exhaust it."
+        ) from error
+
+
+def _restore(folder: Path, path: Path | None, report: Report = report_progress) -> str:
+    """Restore an archive into a file, or in memory alone; return its digest."""
+    from runner.archive.restoring import check, restore
+
+    manifest = check(folder, report) if path is None else restore(folder, path, report)
+    return manifest.digest

@@ -1,7 +1,7 @@
-"""An archive in a local folder, opened: nothing in it is believed before it was compared with the manifest.
+"""Read an archive in a local folder: nothing in it is used before it was compared with the manifest.
 
-Whoever wrote the archive wrote the manifest too, so what a table declares (columns, rows, sizes) is held
-to what archives of ours have, before any of it is unpacked.
+The manifest may be forged too, so what a table declares (columns, rows) is compared with what archives have
+before any of it is decompressed. The memory limit of `places.restore_to` bounds the rest.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import pyarrow.parquet as pq
 from runner.archive import layout
 from runner.archive.columns import Shape, shape_of
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
-from runner.archive.pages import largest_page
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.recording.metadata import check_run, environment_description, environment_of, json_object, kind_of
@@ -27,22 +26,20 @@ from runner.util.files import open_regular
 
 MAX_DESCRIPTION_BYTES: Final = 64 << 20
 MAX_ROWS_A_GROUP: Final = 1 << 21
-MAX_PAGE_BYTES: Final = 160 << 20
-"""A page holds 1 MiB, or one value: a Q-table as large as an environment's arrays may be."""
 _MAX_FOOTER_BYTES: Final = 32 << 20
 _UNPACKED_ANYWAY: Final = 1 << 30
 _ROW_BYTES: Final = 88
-"""Of a step in a recording."""
+"""The size of a step in a recording."""
 
 
 class Archive:
     """An archive in a folder.
 
     Args:
-        folder: with a manifest.
+        folder: the folder, with a manifest.
 
     Raises:
-        RecordingError: it is no archive of ours.
+        RecordingError: it has no valid manifest.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -73,42 +70,40 @@ class Archive:
                     f"{path}: cannot be read ({error.strerror}); the archive is damaged."
                 ) from error
             if found != expected:
-                told = f"{size:,} bytes" if found is None else f"BLAKE3 {found.blake3[:16]}…"
-                wanted = f"{expected.size:,}" if found is None else f"{expected.blake3[:16]}…"
-                raise RecordingError(
-                    f"{path}: found {told}, expected {wanted}: the archive is damaged there."
-                )
+                sizes = f"found {size:,} bytes, expected {expected.size:,}"
+                hashes = found and f"found BLAKE3 {found.blake3[:16]}…, expected {expected.blake3[:16]}…"
+                raise RecordingError(f"{path}: {hashes or sizes}: the archive is damaged there.")
 
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
         """The recording's metadata records, in order."""
         try:
-            said = {str(name): dict(entries) for name, entries in self._said["metadata"]}
-            texts = [text for entries in said.values() for pair in entries.items() for text in pair]
+            records = {str(name): dict(entries) for name, entries in self._description["metadata"]}
+            texts = [text for entries in records.values() for pair in entries.items() for text in pair]
             if not all(isinstance(text, str) for text in texts):
-                raise TypeError("a value is no text")
-            check_run(said["run"], str(self.folder))
+                raise TypeError("a value is not a text")
+            check_run(records["run"], str(self.folder))
         except (KeyError, TypeError, ValueError) as error:
-            raise self._senseless(error) from error
-        return said
+            raise self._invalid(error) from error
+        return records
 
     @cached_property
     def attachments(self) -> list[tuple[str, str]]:
         """Name and media type of the recording's attachments, in order."""
         try:
-            named = [(str(name), str(media_type)) for name, media_type in self._said["attachments"]]
+            named = [(str(name), str(media_type)) for name, media_type in self._description["attachments"]]
         except (KeyError, TypeError, ValueError) as error:
-            raise self._senseless(error) from error
+            raise self._invalid(error) from error
         if strange := [name for name, _ in named if not is_inside(name) or name not in self.manifest.files]:
             raise RecordingError(f"{self.folder}: has no attachment {strange[0]!r}.")
         return named
 
     @cached_property
-    def _said(self) -> dict[str, Any]:
+    def _description(self) -> dict[str, Any]:
         return json_object(self._bytes(layout.METADATA), str(self.folder / layout.METADATA))
 
-    def _senseless(self, error: Exception) -> RecordingError:
-        return RecordingError(f"{self.folder / layout.METADATA}: makes no sense ({error!r}).")
+    def _invalid(self, error: Exception) -> RecordingError:
+        return RecordingError(f"{self.folder / layout.METADATA}: is invalid ({error!r}).")
 
     @cached_property
     def config(self) -> dict[str, Any]:
@@ -119,7 +114,7 @@ class Archive:
 
     @property
     def kind(self) -> str:
-        """Of which kind the run is, one of `schema.KINDS`."""
+        """The kind of the run, one of `schema.KINDS`."""
         return kind_of(self.metadata["run"])
 
     @cached_property
@@ -133,15 +128,15 @@ class Archive:
 
     @cached_property
     def shape(self) -> Shape:
-        """What fixes the tables of messages and their columns."""
+        """The shape of the run, which determines its tables."""
         tabular = self.kind in ("job", "step") and bool(self._environment["arrays"])
         return shape_of(self.metadata["run"], self.mdp if tabular else None, str(self.folder))
 
     def attachment(self, name: str) -> bytes:
-        """Return an attachment's data.
+        """Return the data of an attachment.
 
         Raises:
-            RecordingError: there is none of that name.
+            RecordingError: there is no such attachment.
         """
         if name not in dict(self.attachments):
             raise RecordingError(f"{self.folder}: has no attachment {name!r}.")
@@ -159,25 +154,25 @@ class Archive:
             raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
 
     def count(self, *topics: Topic) -> int:
-        """Return how many messages of these topics there are."""
+        """Return the number of messages of these topics."""
         return sum(self.manifest.topics.get(topic.name, Entry(0, "")).size for topic in topics)
 
     def batches(self, name: str, columns: pa.Schema, rows: int, n: int) -> Iterator[pa.RecordBatch]:
-        """Yield the rows of a table, n at a time.
+        """Yield the rows of a table in batches.
 
         Args:
-            name: of the table's file.
-            columns: what it must have.
-            rows: how many there must be.
-            n: the most rows of a batch.
+            name: the table's file.
+            columns: the columns it must have.
+            rows: the number of rows it must have.
+            n: the maximum number of rows in a batch.
 
         Raises:
-            RecordingError: it is no such table.
+            RecordingError: it is not such a table.
         """
         path = self.folder / name
         try:
-            # reading ahead would keep all that was read until the file is closed
-            open_regular(path).close()  # a pipe would be waited for
+            # pre_buffer would keep everything that was read until the file is closed
+            open_regular(path).close()  # opening a pipe would block
             with pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False) as file:
                 self._check(file, path, columns, rows)
                 for batch in file.iter_batches(n):
@@ -187,7 +182,7 @@ class Archive:
             raise RecordingError(f"{path}: cannot be read as a table ({error}).") from error
 
     def _check(self, file: pq.ParquetFile, path: Path, columns: pa.Schema, rows: int) -> None:
-        """Refuse a table whose footer says what no footer of ours does."""
+        """Refuse a table with another footer than archives have."""
         about, size = file.metadata, path.stat().st_size
         if not file.schema_arrow.remove_metadata().equals(columns):
             raise RecordingError(
@@ -200,10 +195,6 @@ class Archive:
             raise RecordingError(f"{path}: has a group of more than {MAX_ROWS_A_GROUP:,} rows.")
         if rows * max(_ROW_BYTES, layout.row_bytes(columns)) > size * UNPACKED_A_BYTE + _UNPACKED_ANYWAY:
             raise RecordingError(f"{path}: {size:,} bytes declare {rows:,} rows; made to exhaust the disk.")
-        if (found := largest_page(path, about)) > MAX_PAGE_BYTES:
-            raise RecordingError(
-                f"{path}: declares a page of {found:,} bytes, expected {MAX_PAGE_BYTES:,} at most."
-            )
 
 
 def _refuse_nulls(batch: pa.RecordBatch, path: Path) -> None:

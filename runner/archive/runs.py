@@ -1,20 +1,18 @@
-"""A run of the recordings folder in an archive: put there, and brought back.
+"""Archive runs of a recordings folder, and restore them.
 
-What stays of an archived run is its folder with `run.json`, whose `archive` says where the recording is,
-and what people say of it.
+An archived run keeps its folder with labels and `run.json`, whose `archive` has the place of the archive.
 """
 
 from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from runner.archive.manifest import Manifest
-from runner.archive.places import archive_of, restore_to
+from runner.archive.places import Report, archive_of, check_archive, restore_to
 from runner.archive.restoring import check
 from runner.archive.store import Store, no_archive, split_place, temporary_folder
 from runner.archive.writing import write_archive
@@ -25,41 +23,39 @@ from runner.recording.rewriting import content_of
 from runner.runs.locking import locked
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, run_of_id
 
-Report = Callable[[int], None]
-
 
 @dataclass(frozen=True)
 class Archived:
-    """What came of archiving a run."""
+    """The result of archiving a run."""
 
     run: Run
     place: str
     """Path or URL of the archive."""
     manifest: Manifest
     new: bool
-    """Whether it was made now; it may have been there."""
+    """Whether it was made now, or existed before."""
     removed: bool
     """Whether the recording was removed from the run's folder."""
     recording_bytes: int
-    """Of the recording, when it was archived."""
+    """Bytes of the recording when it was archived."""
 
 
 def archive_run(
     run: Run, to: str, remove: bool = False, report: Report = lambda _: None, dry_run: bool = False
 ) -> Archived:
-    """Put a run into an archive; return what came of it.
+    """Archive a run.
 
     Args:
-        run: one of a recordings folder, not running.
+        run: a run of a recordings folder, not running.
         to: a folder, or `s3://bucket/prefix`.
-        remove: remove the recording when what the archive gives back was compared with it.
+        remove: remove the recording after the archive was restored in memory and compared with it.
         report: called with the steps done so far.
-        dry_run: pack, but neither keep nor change anything.
+        dry_run: write the archive to a temporary folder, and change nothing.
 
     Raises:
         RunnerError: the run stands alone, or is running; the target has another archive of its id.
         RecordingError: the recording is damaged.
-        StorageError: the target cannot be written; then there is no archive.
+        StorageError: the target cannot be written; there is no archive then.
     """
     if not (run.folder / RUN_FILE).is_file() or run.stands_alone:
         raise RunnerError(
@@ -69,74 +65,54 @@ def archive_run(
     with locked(run, archived=True) as current:
         if current.status == "archived":
             raise RunnerError(f"run {run.run_id} is archived already, in {current.archive.target}.")
-        return _Archiving(current, store, report).do(remove, dry_run)
+        return _archive(current, store, remove, report, dry_run)
 
 
-class _Archiving:
-    """One run on its way into an archive."""
-
-    def __init__(self, run: Run, store: Store, report: Report) -> None:
-        self._run = run
-        self._store = store
-        self._report = report
-
-    def do(self, remove: bool, dry_run: bool) -> Archived:
-        """Write the archive, unless it is there; note it in the run; perhaps remove the recording."""
-        run, store = self._run, self._store
-        existing = store.manifest(run.run_id)
-        with _sound(run) as recording:
-            size, came = recording.size, recording.done()
-            if dry_run or existing is None:
-                manifest = self._write(recording, dry_run)
-            elif _holds(existing, recording):
-                manifest = existing
-            else:
-                raise RunnerError(
-                    f"{store.place(run.run_id)}: found an archive of another content, made of this run at "
-                    f"another time ({existing.digest[:16]}…); remove it, or choose another --to."
-                )
-        if dry_run:
-            return Archived(run, store.place(run.run_id), manifest, existing is None, False, size)
-        if remove or existing is not None:
-            with store.reading(run.run_id) as folder:
-                check(folder, self._report)
-        run = run.update(archive=_stub(store.place(run.run_id), manifest, size, came))
-        if remove:
-            run.recording.unlink()
-        return Archived(run, store.place(run.run_id), manifest, existing is None, remove, size)
-
-    def _write(self, recording: Recording, dry_run: bool) -> Manifest:
-        if dry_run:
-            with temporary_folder() as folder:
-                return write_archive(recording, folder, self._report)
-        with self._store.writing(self._run.run_id) as folder:
-            return write_archive(recording, folder, self._report)
+def _archive(run: Run, store: Store, remove: bool, report: Report, dry_run: bool) -> Archived:
+    place, existing = store.place(run.run_id), store.manifest(run.run_id)
+    is_new = existing is None
+    with _undamaged(run) as recording:
+        size, done = recording.size, recording.done()
+        if dry_run or existing is None:
+            with temporary_folder() if dry_run else store.writing(run.run_id) as folder:
+                manifest = write_archive(recording, folder, report)
+        elif _has_content_of(existing, recording):
+            manifest = existing
+        else:
+            raise RunnerError(
+                f"{place}: found an archive of another content, made of this run at "
+                f"another time ({existing.digest[:16]}…); remove it, or choose another --to."
+            )
+    if dry_run:
+        return Archived(run, place, manifest, is_new, False, size)
+    if remove or not is_new:
+        with store.reading(run.run_id) as folder:
+            (check if is_new else check_archive)(folder, report)
+    reference = {
+        "target": place,
+        "digest": manifest.digest,
+        "bytes": manifest.size,
+        "recording_bytes": size,
+        "done": done,
+        "version": manifest.version,
+    }
+    run = run.update(archive=reference)
+    if remove:
+        run.recording.unlink()
+    return Archived(run, place, manifest, is_new, remove, size)
 
 
-def _holds(manifest: Manifest, recording: Recording) -> bool:
-    """Return whether an archive has a recording's content; of a killed run, that of its whole chunks."""
+def _has_content_of(manifest: Manifest, recording: Recording) -> bool:
+    """Return whether an archive has a recording's content; of a killed run, that of its complete chunks."""
     stated = recording.result.content_digest
     if manifest.run.get("content_digest") != stated:
         return False
     return stated is not None or manifest.digest == content_of(recording.path)
 
 
-def _stub(place: str, manifest: Manifest, recording_bytes: int, done: dict[str, int]) -> dict[str, Any]:
-    """Return what a run's file says of its archive."""
-    return {
-        "target": place,
-        "digest": manifest.digest,
-        "bytes": manifest.size,
-        "recording_bytes": recording_bytes,
-        "done": done,
-        "version": manifest.version,
-    }
-
-
 @contextlib.contextmanager
-def _sound(run: Run) -> Iterator[Recording]:
-    """Give the recording of a run; damage found in it is told with what mends it."""
-    mend = f"`dualtaxi repair {run.run_id}` mends it."
+def _undamaged(run: Run) -> Iterator[Recording]:
+    """Open the recording of a run; the error for damage suggests a repair."""
     try:
         with open_recording(run.recording) as recording:
             if not recording.finished:
@@ -147,15 +123,15 @@ def _sound(run: Run) -> Iterator[Recording]:
     except RecordingError as error:
         if not run.recording.exists() or "`dualtaxi repair" in str(error):
             raise
-        raise RecordingError(f"{error} {mend}") from error
+        raise RecordingError(f"{error} `dualtaxi repair {run.run_id}` repairs it.") from error
 
 
 def restore_run(run: Run, report: Report = lambda _: None) -> Run:
-    """Bring the recording of an archived run back into its folder; return the run. The archive stays.
+    """Restore the recording of an archived run into its folder; return the run. The archive stays.
 
     Raises:
         RunnerError: it is not archived.
-        RecordingError: the archive is damaged, missing, or another's; nothing changes.
+        RecordingError: the archive is damaged, missing, or of another run; nothing changes.
         StorageError: the recording cannot be written.
     """
     with locked(run, archived=True) as current:
@@ -170,7 +146,7 @@ def restore_run(run: Run, report: Report = lambda _: None) -> Run:
 
 
 def restore_place(place: str, recordings: Path, report: Report = lambda _: None) -> Run:
-    """Bring a run back from an archive alone, as a run of the same id in a recordings folder.
+    """Restore a run from its archive alone, with the same id, into a recordings folder.
 
     Args:
         place: path or URL of the archive.

@@ -1,8 +1,8 @@
-"""Where archives are kept: a folder, or a prefix in object storage that speaks S3.
+"""Store archives in a folder, or under a prefix in object storage with the S3 protocol.
 
-An archive is there whole or not at all. In a folder it is written to `.partial/` on the same disk and renamed
-when it is complete. In object storage its files are uploaded first and the manifest last: without a manifest
-there is no archive, and what an interrupted upload left is overwritten by the next one.
+An archive is complete or absent. In a folder it is written to `.partial/` on the same disk, and renamed when
+it is complete. In object storage its files are uploaded first and the manifest last: without a manifest there
+is no archive, and the next upload overwrites the files of an interrupted one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from runner.util.extras import require
 from runner.util.files import sync
 
 PARTIAL: Final = ".partial"
-"""The folder of archives that are being written; one level down, where `*/steps.parquet` does not reach."""
+"""The folder of archives that are being written, which the pattern `*/steps.parquet` does not match."""
 S3: Final = "s3://"
 _PIECE: Final = 1 << 20
 
@@ -74,7 +74,7 @@ class Store:
             info = self._files.get_file_info(path)
             if info.type == self._missing:
                 return None
-            if info.type != self._file_type:  # opening a pipe would wait for whoever writes to it
+            if info.type != self._file_type:  # opening a pipe would block
                 raise StorageError(f"{where}: cannot be read (it is not a regular file).")
             with self._files.open_input_stream(path, compression=None) as stream:
                 data = stream.read(MAX_MANIFEST_BYTES + 1)
@@ -82,7 +82,7 @@ class Store:
 
     @contextlib.contextmanager
     def writing(self, run_id: str) -> Iterator[Path]:
-        """Give an empty local folder to write an archive in; store it when the block ends without an error.
+        """Yield an empty local folder to write an archive in; store it when the block ends without an error.
 
         Raises:
             RunnerError: another process is writing an archive of this run here.
@@ -109,7 +109,8 @@ class Store:
                     shutil.rmtree(partial, ignore_errors=True)
                     partial.mkdir()
                     yield partial
-                    _sync_all(partial)
+                    for path in filter(Path.is_file, partial.rglob("*")):
+                        sync(path)
                     if self.manifest(run_id) is None:
                         shutil.rmtree(final, ignore_errors=True)
                     partial.rename(final)
@@ -132,7 +133,7 @@ class Store:
 
     @contextlib.contextmanager
     def reading(self, run_id: str) -> Iterator[Path]:
-        """Give a local folder with a run's archive, not to be changed: its own, or a downloaded copy.
+        """Yield a local folder with a run's archive, read-only: its own folder, or a downloaded copy.
 
         Raises:
             RecordingError: there is no archive of the run, or a file of it is missing.
@@ -181,7 +182,7 @@ class Store:
                     left -= target.write(data)
 
     def _path(self, *parts: str) -> str:
-        """Return the path of a part of the store as its file system names it.
+        """Return the path of a file in the store's file system.
 
         Raises:
             RecordingError: it would lead out of the store.
@@ -208,13 +209,13 @@ def split_place(place: str) -> tuple[str, str]:
 
 
 def no_archive(place: str) -> RecordingError:
-    """Return the error that there is no archive at a place."""
+    """Return the error for a place without an archive."""
     return RecordingError(f"{place}: found no archive there (no {layout.MANIFEST}), expected one.")
 
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Give a folder that is removed afterwards."""
+    """Yield a folder that is removed afterwards."""
     with tempfile.TemporaryDirectory(prefix="dualtaxi-archive-", ignore_cleanup_errors=True) as folder:
         yield Path(folder)
 
@@ -227,9 +228,3 @@ def _s3(fs: Any, bucket: str) -> Any:
         return fs.S3FileSystem(endpoint_override=endpoint)
     region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION")
     return fs.S3FileSystem(region=region or fs.resolve_s3_region(bucket))
-
-
-def _sync_all(folder: Path) -> None:
-    for path in folder.rglob("*"):
-        if path.is_file():
-            sync(path)

@@ -4,7 +4,7 @@
         result = child.call(function, argument, seconds=60)
 
 For work that is long, needs much memory, or runs code that cannot be trusted to end. The thread that calls
-waits for it; any other may end the process meanwhile by `kill`.
+waits for it; any other may end the process meanwhile by `kill`. The function may report its progress.
 """
 
 from __future__ import annotations
@@ -12,10 +12,14 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import signal
+import sys
+import threading
+import time
 import traceback
-from collections.abc import Callable, Sequence
+import types
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, ParamSpec, Self, TypeVar
+from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
 
@@ -39,6 +43,27 @@ class ProcessDied(CallFailed):
     """The process died during a call."""
 
 
+_pipe_to_parent: Any = None
+_starting: Final = threading.Lock()
+
+
+def report_progress(value: Any) -> None:
+    """Pass a value to the caller's `on_progress`; for functions that are called in a child process."""
+    _pipe_to_parent.send(("progress", value))
+
+
+@contextlib.contextmanager
+def _without_main_module() -> Iterator[None]:
+    """Start a process without importing the user's script in it, which may not guard its statements."""
+    with _starting:
+        main = sys.modules["__main__"]
+        sys.modules["__main__"] = types.ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = main
+
+
 def start_method(preload: Sequence[str] = ()) -> Any:
     """Return the context that starts processes: forked from one that has loaded modules, where possible.
 
@@ -58,18 +83,23 @@ class ChildProcess:
     Args:
         memory_bytes: how much its calls may allocate; not limited on Windows.
         context: how to start it; by default `start_method()`.
+        on_progress: called with what functions pass to `report_progress`.
 
     Raises:
         OSError: the system cannot start another process.
     """
 
-    def __init__(self, memory_bytes: int, context: Any = None) -> None:
+    def __init__(
+        self, memory_bytes: int, context: Any = None, on_progress: Callable[[Any], None] = lambda _: None
+    ) -> None:
         self._memory_bytes = memory_bytes
+        self._on_progress = on_progress
         context = context or start_method()
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, memory_bytes), daemon=True)
         try:
-            self._process.start()
+            with _without_main_module():
+                self._process.start()
         except BaseException:
             self._pipe.close()
             raise
@@ -100,9 +130,13 @@ class ChildProcess:
         """
         try:
             self._pipe.send((function, args, keywords))
-            if not self._pipe.poll(seconds):
-                raise TimedOut(f"this took longer than {seconds:g} s and was given up; ask for less.")
-            kind, result = self._pipe.recv()
+            deadline, kind = time.monotonic() + seconds, "progress"
+            while kind == "progress":
+                if not self._pipe.poll(max(deadline - time.monotonic(), 0)):
+                    raise TimedOut(f"this took longer than {seconds:g} s and was given up; ask for less.")
+                kind, result = self._pipe.recv()
+                if kind == "progress":
+                    self._on_progress(result)
         except (EOFError, OSError):
             raise ProcessDied(
                 "the process that worked on this died; it may have run out of memory."
@@ -136,6 +170,8 @@ class ChildProcess:
 
 def _serve(pipe: Any, memory_bytes: int) -> None:
     """Call functions that come through a pipe, and send what they return, until it is closed."""
+    global _pipe_to_parent  # noqa: PLW0603 - one pipe for the whole process
+    _pipe_to_parent = pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent to act on
     _limit_memory(memory_bytes)
     with contextlib.suppress(EOFError, BrokenPipeError):
