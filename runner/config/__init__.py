@@ -2,7 +2,7 @@
 
     config = load("quick", ["episodes=50", "evaluation.trials=10"])
 
-Everything that can be wrong is told in one `ConfigError`, a line for each problem.
+All problems are reported in one `ConfigError`, a line for each.
 """
 
 from runner.config.loading import from_mapping, from_text, load

@@ -1,7 +1,7 @@
-"""YAML text to plain values, and where in the text each of them stands.
+"""YAML text to plain values, with the place of each in the text.
 
 The scalars are those of YAML 1.2's core schema, which editors use too: `1e-3` is a number, `no` and
-`2026-11-01` are text. Nothing but null, booleans, numbers, text, lists and mappings comes out.
+`2026-11-01` are text. The values are null, booleans, numbers, text, lists and mappings.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from runner.config.values import MAX_DEPTH, Path
 from runner.errors import ConfigError
 
 MAX_NODES = 100_000
-"""How many values a text may hold, its aliases expanded."""
+"""The most values of a text, with its aliases expanded."""
 
 _LONGEST = 60
 _TAG = "tag:yaml.org,2002:"
@@ -38,7 +38,7 @@ _SCALARS = (
 
 
 class Place(NamedTuple):
-    """Where something was read: a file's line and column (from 1), or an override with neither."""
+    """The origin of a value: a file with line and column (from 1), or an override with neither."""
 
     source: str
     line: int = 0
@@ -49,7 +49,7 @@ class Place(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """Why the value at `path` cannot be used; `place` where that is not where the value stands."""
+    """The reason why the value at `path` cannot be used; `place` if it is not the place of the value."""
 
     path: Path
     message: str
@@ -58,21 +58,21 @@ class Problem(NamedTuple):
 
 @dataclass
 class Document:
-    """Plain values, the places they were read from, and what was wrong with the text itself."""
+    """Plain values, their places, and the problems of the text itself."""
 
     value: Any
     places: dict[tuple[str, ...], Place] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
 
     def place(self, path: Path) -> Place | None:
-        """Return where the value at `path` was read, or else the nearest value around it."""
+        """Return the place of the value at `path`, or of the nearest value around it."""
         keys = tuple(map(str, path))
         around = (self.places.get(keys[:length]) for length in range(len(keys), -1, -1))
         return next((place for place in around if place), None)
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML's parser with the scalars of YAML 1.2, and a bound on what it builds."""
+    """PyYAML's parser with the scalars of YAML 1.2 and bounds on depth and number of values."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - PyYAML's own way to configure a class
 
@@ -94,7 +94,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes whatever YAML 1.1 or 1.2 would not read back as text."""
+    """Quotes what YAML 1.1 or 1.2 would not read as text."""
 
     def ignore_aliases(self, data: object) -> bool:  # noqa: ARG002 - PyYAML's signature
         return True
@@ -111,7 +111,7 @@ for _name, _pattern, _first in _SCALARS:
 
 
 def read_yaml(text: str, source: str, *, lines: bool = True) -> Document:
-    """Return what `text` says; `source` is named in errors, with line and column unless `lines` is false."""
+    """Return the values of a text; errors name `source`, with line and column unless `lines` is false."""
     try:
         node = _Loader(text).get_single_node()
         builder = _Builder(source, lines)
@@ -131,7 +131,7 @@ def read_yaml(text: str, source: str, *, lines: bool = True) -> Document:
 
 
 def write_yaml(value: Mapping[str, Any]) -> str:
-    """Return `value` as YAML that `read_yaml` takes back to an equal one."""
+    """Return `value` as YAML, from which `read_yaml` returns an equal value."""
     text: str = yaml.dump(
         value, Dumper=_Dumper, sort_keys=False, default_flow_style=False, allow_unicode=True, width=110
     )
@@ -139,7 +139,7 @@ def write_yaml(value: Mapping[str, Any]) -> str:
 
 
 class _Builder:
-    """Turns nodes into plain values, noting where each stands."""
+    """Turns nodes into plain values, and keeps the place of each."""
 
     def __init__(self, source: str, lines: bool) -> None:
         self.source = source
@@ -177,8 +177,8 @@ class _Builder:
             below = (*path, key)
             if key in built:
                 first = self.places[tuple(map(str, below))]
-                again = f"given twice; first in line {first.line}" if first.line else "given twice"
-                self.problems.append(Problem(below, again, place))
+                message = f"given twice; first in line {first.line}" if first.line else "given twice"
+                self.problems.append(Problem(below, message, place))
                 continue
             self.places[tuple(map(str, below))] = place
             built[key] = self.value(value_node, below)

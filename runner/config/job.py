@@ -1,4 +1,4 @@
-"""A job: a configuration with one seed. The same job gives the same content."""
+"""A job: a configuration with one seed. Equal jobs give equal content."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from blake3 import blake3
 from runner.config import ExperimentConfig
 
 NOT_CONTENT = ("name", "seeds", "recording")
-"""Keys of a configuration that change neither what is learned nor what is recorded of it."""
+"""Keys of a configuration that change neither what is learned nor what is recorded."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,12 @@ class Job:
     seed: int
 
     def content(self) -> dict[str, Any]:
-        """Return what determines the content of the job's recording, by key."""
+        """Return the values that determine the content of the job's recording."""
         return _content(self.config.to_mapping(), self.seed)
 
     @property
     def identity(self) -> str:
-        """A hash of `content()`: equal jobs, equal identities, whatever they are called."""
+        """A hash of `content()`, which does not depend on the name."""
         return identity_of(self.config.to_mapping(), self.seed)
 
 
@@ -43,6 +43,6 @@ def _content(config: Mapping[str, Any], seed: int) -> dict[str, Any]:
 
 
 def jobs_of(config: ExperimentConfig) -> Iterator[Job]:
-    """Yield the jobs of an experiment, one a seed."""
+    """Yield the jobs of an experiment, one per seed."""
     for seed in config.seeds:
         yield Job(config, seed)

@@ -60,8 +60,8 @@ def from_text(text: str, source: str, overrides: Sequence[str] = ()) -> Experime
     """Return the experiment that the text of a file describes.
 
     Args:
-        text: what stands in the file.
-        source: the file's name, for messages; without its ending it names the experiment, as for `load`.
+        text: the contents of the file.
+        source: the file's name, for messages and as the default name of the experiment.
         overrides: as for `load`.
 
     Raises:
@@ -80,27 +80,27 @@ def from_text(text: str, source: str, overrides: Sequence[str] = ()) -> Experime
 def from_mapping(
     values: Mapping[str, Any], overrides: Sequence[str] = (), *, name: str = "experiment"
 ) -> ExperimentConfig:
-    """Return the experiment that plain Python values describe, under the keys of a YAML file.
+    """Return the experiment that plain Python values describe, with the keys of a YAML file.
 
     Args:
-        values: What a file would say, or what `ExperimentConfig.to_mapping` returned; not changed.
-        overrides: As for `load`.
-        name: What the experiment is called when `values` has no name.
+        values: the contents of a file, or what `ExperimentConfig.to_mapping` returned; not changed.
+        overrides: as for `load`.
+        name: the name of the experiment if `values` has none.
 
     Raises:
         ConfigError: The values do not describe an experiment; a line for each problem.
     """
     if "made_by" in values:
         raise ConfigError(
-            f"found a run made by {values['made_by']}: it was recorded from somebody's own training loop, "
-            "which alone can do it again. It can be looked at, compared, checked and exported, not redone, "
-            "and no table is known of it."
+            f"found a run made by {values['made_by']}: it was recorded from a training loop outside of this "
+            "project, which alone can repeat it. It can be viewed, compared, verified and exported, but not "
+            "run again, and its tables are not known."
         )
     return experiment_in(Document(values), overrides, name, named_by=repr(name))
 
 
 def packing_from(values: Mapping[str, Any]) -> Recording:
-    """Return how a recording is packed, as the `recording` section of a configuration says it.
+    """Return the section `recording` of a configuration with these values.
 
     Raises:
         ConfigError: there is no such option, or a value is out of its bounds.
@@ -113,10 +113,10 @@ def packing_from(values: Mapping[str, Any]) -> Recording:
 
 
 def read_text(file: FilePath) -> str:
-    """Return what stands in a file.
+    """Return the text of a file.
 
     Raises:
-        ConfigError: it cannot be read, is too large, or is no text.
+        ConfigError: it cannot be read, is too large, or is not UTF-8.
     """
     try:
         with file.open("rb") as stream:
@@ -167,7 +167,7 @@ def experiment_in(
 
 
 def _contradictions(given: Mapping[str, Any]) -> list[Problem]:
-    """Return where keys of which each is sound say different things."""
+    """Return the problems of keys that are valid alone and contradict each other."""
     problems = []
     mode = given.get("mode")
     if mode is not None:

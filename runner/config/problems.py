@@ -1,4 +1,4 @@
-"""What pydantic found wrong, in the words of a configuration: one line for each value."""
+"""Pydantic's errors in terms of a configuration: one line for each value."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _LONGEST = 60
 _MOST = 200
 _UNKNOWN = "extra_forbidden"
 _FOLLOWS = "default_factory_not_called"
-"""A default that depends on another value, which is wrong: that one is told."""
+"""The type of the error of a default that depends on another value, whose own error is reported."""
 _BRANCHES = frozenset(
     (
         *("integer", "number", "array", "Linear", "Exponential", "Piecewise"),
         *("RandomTable", "RunTable", "SeedRange", "Range", "path", "mapping"),
     )
 )
-"""The names by which a location tells which branch of a union was taken; none is a key."""
+"""Names in a location that stand for the branch of a union; none is a key."""
 
 _ELSEWHERE = {
     **dict.fromkeys(("alpha", "learning_rate", "lr"), "step_size"),
@@ -35,16 +35,16 @@ _ELSEWHERE = {
     **dict.fromkeys(("decay", "decay_rate"), "factor"),
     **dict.fromkeys(("end", "min", "minimum"), "floor"),
 }
-"""What other programs and textbooks call a key."""
+"""Names of keys in other programs and in textbooks."""
 
 
 def problems_in(error: ValidationError, value: object, schema: Schema | None = None) -> list[Problem]:
-    """Return what is wrong with `value`, the mapping that was validated, and leave out what only follows.
+    """Return the problems of `value`, without those that are only a consequence of others.
 
     Args:
-        error: what pydantic says.
-        value: what was validated.
-        schema: what was expected, without references; a configuration's unless given.
+        error: pydantic's error.
+        value: the mapping that was validated.
+        schema: its schema, without references; that of a configuration unless given.
     """
     details = error.errors(include_url=False, include_input=False)
     paths = [_path(detail) for detail in details]
@@ -62,7 +62,7 @@ def problems_in(error: ValidationError, value: object, schema: Schema | None = N
 
 
 def refuse(problems: Sequence[Problem], document: Document) -> ConfigError:
-    """Return the error that lists `problems`, in the order of the text; past 200, how many."""
+    """Return the error that lists `problems` in the order of the text, at most 200 of them."""
     first: dict[tuple[Path, Place | None], Problem] = {}
     for problem in problems:
         first.setdefault((problem.path, problem.place), problem)
@@ -79,7 +79,7 @@ def refuse(problems: Sequence[Problem], document: Document) -> ConfigError:
 
 
 def found(value: object) -> str:  # noqa: PLR0911 - one line a kind
-    """Return `value` as a message names it: short, on one line, in YAML's words."""
+    """Return `value` for a message: short, on one line, in YAML's terms."""
     match value:
         case None:
             return "null"
@@ -123,7 +123,7 @@ def _problem(path: Path, detail: ErrorDetails, value: object, schema: Schema | N
 
 
 def _path(detail: ErrorDetails) -> Path:
-    """Return the keys of an error's location: without union branches, with what a refusal adds."""
+    """Return the keys of an error's location, without branches of unions, with the path of a refusal."""
     location = detail["loc"]
     below: Path = detail["ctx"]["path"] if detail["type"] == REFUSED else ()
     last = len(location) - 1 if detail["type"] == _UNKNOWN else -1
@@ -142,7 +142,7 @@ def _meant(missing: Path, unknown: Path) -> bool:
 
 
 def _hint(key: str, known: Sequence[str]) -> str:
-    """Return which of the known keys is meant by one that others use, or that is nearly one."""
+    """Return a hint at the known key that was probably meant."""
     other = _ELSEWHERE.get(key.lower())
     return f" Did you mean {other!r}?" if other in known else nearest(key, known)
 

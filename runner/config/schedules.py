@@ -1,14 +1,14 @@
 """Parameters that may change while a run learns: a constant, or a schedule.
 
 A schedule is a function of n, the number of episodes (or training steps) before the current one,
-counted from 0 over the whole run. These models say which function; computing it belongs to learning.
+counted from 0 over the whole run. These models describe the function; `runner.learning` computes it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
@@ -28,7 +28,7 @@ Point = Annotated[
 
 
 def _names_itself(schema: dict[str, Any]) -> None:
-    """In a file the key `schedule` tells the kinds apart, so it must be there; in Python the class does."""
+    """Require the key `schedule` in a file, where it distinguishes the kinds; in Python the class does."""
     schema["required"] = ["schedule", *schema.get("required", [])]
 
 
@@ -97,7 +97,7 @@ SCHEDULES: dict[str, str] = {"linear": "Linear", "exponential": "Exponential", "
 
 
 def _kind(value: object) -> str | None:
-    """Return the tag of the branch that `value` means to be: also the branch's name in the JSON Schema."""
+    """Return the tag of the branch of `value`, which is also the branch's name in the JSON Schema."""
     if isinstance(value, Section):
         return type(value).__name__
     if isinstance(value, Mapping):
@@ -107,7 +107,7 @@ def _kind(value: object) -> str | None:
 
 
 def _names_its_schedule(value: object) -> object:
-    """Refuse a mapping that tells no kind of schedule: no branch could say that it is the wrong one."""
+    """Refuse a mapping without a valid kind of schedule, which would fit no branch."""
     if not isinstance(value, Mapping) or _kind(value):
         return value
     *most, last = map(repr, SCHEDULES)
@@ -127,23 +127,18 @@ def _stays_positive(value: float | Schedule) -> float | Schedule:
     return value
 
 
-Probability = Annotated[
-    Annotated[Fraction, Tag("number")]
+N = TypeVar("N")
+_OrSchedule = Annotated[
+    Annotated[N, Tag("number")]
     | Annotated[Linear, Tag("Linear")]
     | Annotated[Exponential, Tag("Exponential")]
     | Annotated[Piecewise, Tag("Piecewise")],
     Discriminator(_kind),
     BeforeValidator(_names_its_schedule),
 ]
+
+Probability = _OrSchedule[Fraction]
 """A number from 0 to 1, or a schedule of such."""
 
-StepSize = Annotated[
-    Annotated[float, Field(gt=0, le=1), Tag("number")]
-    | Annotated[Linear, Tag("Linear")]
-    | Annotated[Exponential, Tag("Exponential")]
-    | Annotated[Piecewise, Tag("Piecewise")],
-    Discriminator(_kind),
-    BeforeValidator(_names_its_schedule),
-    AfterValidator(_stays_positive),
-]
+StepSize = Annotated[_OrSchedule[Annotated[float, Field(gt=0, le=1)]], AfterValidator(_stays_positive)]
 """A number above 0 and at most 1, or a schedule of such."""

@@ -1,4 +1,4 @@
-"""The JSON Schema of a configuration file, and what it says of one value in a few words."""
+"""The JSON Schema of a configuration file, and short descriptions of what it allows for a value."""
 
 from __future__ import annotations
 
@@ -95,21 +95,21 @@ def _inside(branch: Schema, part: str | int) -> Iterator[Schema]:
 
 
 def keys_of(node: Schema) -> list[str]:
-    """Return the keys that a mapping may have here."""
+    """Return the keys that a schema allows in a mapping."""
     return list(dict.fromkeys(key for branch in branches(node) for key in branch.get("properties", ())))
 
 
 def choices_of(node: Schema) -> list[str]:
-    """Return the words that are accepted here."""
-    return [word for branch in branches(node) for word in _words(branch)]
+    """Return the texts that a schema allows."""
+    return [choice for branch in branches(node) for choice in _choices(branch)]
 
 
-def _words(branch: Schema) -> list[str]:
+def _choices(branch: Schema) -> list[str]:
     return list(branch.get("enum", [branch["const"]] if "const" in branch else []))
 
 
 def expected(node: Schema) -> str:
-    """Return in a few words what may stand here: `a number from 0 to 1`."""
+    """Return a short description of the values that a schema allows: `a number from 0 to 1`."""
     simple, kinds, mappings = [], [], []
     for branch in branches(node):
         properties = branch.get("properties", {})
@@ -120,7 +120,7 @@ def expected(node: Schema) -> str:
         else:
             simple.append(_simple(branch))
     schedules = [f"a mapping with schedule: {_either(kinds)}"] if kinds else []
-    simple.sort(key=lambda words: words == "null")
+    simple.sort(key=lambda text: text == "null")
     return _either([*dict.fromkeys(simple), *schedules, *mappings])
 
 
@@ -130,8 +130,8 @@ def _either(alternatives: list[str]) -> str:
 
 
 def _simple(branch: Schema) -> str:  # noqa: PLR0911 - one line a kind
-    if words := _words(branch):
-        return _either([repr(word) for word in words])
+    if choices := _choices(branch):
+        return _either(list(map(repr, choices)))
     if "prefixItems" in branch:
         return "[" + ", ".join(map(_simple, branch["prefixItems"])) + "]"
     match branch.get("type"):

@@ -1,4 +1,4 @@
-"""The sections of an experiment: the mappings that each say one thing, such as `evaluation`."""
+"""The sections of an experiment, such as `evaluation`."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def _environment_arguments(value: object) -> FrozenMapping:
 
 
 class Environment(Section):
-    """Which environment, and what it is made with."""
+    """A Gymnasium environment."""
 
     id: str = Field(
         default="dualtaxi:DualTaxi-v1",
         min_length=1,
-        description="The Gymnasium id; what stands before a colon is the module to import for it.",
+        description="The Gymnasium id; the part before a colon is a module to import first.",
     )
     kwargs: Annotated[
         FrozenMapping,
@@ -56,15 +56,15 @@ class Environment(Section):
         WithJsonSchema({"type": "object", "propertyNames": {"not": {"const": "competitive"}}, "default": {}}),
     ] = Field(
         default_factory=lambda: FrozenMapping({}),
-        description="Arguments of the environment. `competitive` is not one: it follows from the rewards.",
+        description="Arguments of the environment, except `competitive`, which depends on the rewards.",
     )
 
 
 class UniformRange(Section):
-    """Where random initial values are drawn from: uniform in [low, high)."""
+    """The range of random initial values: uniform in [low, high)."""
 
     low: float = Field(default=0.0, description="The lowest value.")
-    high: float = Field(default=1.0, description="The bound above; never drawn itself.")
+    high: float = Field(default=1.0, description="The upper bound, which is never drawn itself.")
 
     @model_validator(mode="after")
     def _has_width(self) -> Self:
@@ -74,9 +74,9 @@ class UniformRange(Section):
 
 
 class RandomTable(Section):
-    """Initial values drawn at random, each cell on its own."""
+    """Random initial values, drawn for each cell."""
 
-    random: UniformRange = Field(description="Where the values are drawn from.")
+    random: UniformRange = Field(description="The range of the values.")
 
 
 class RunTable(Section):
@@ -127,66 +127,66 @@ TrialStart = Annotated[
 
 
 class Evaluation(Section):
-    """When the greedy policy is tried out, and how often each time."""
+    """When the greedy policy is evaluated, and in how many trials."""
 
     every: Count = Field(description="Training episodes between evaluations.")
     trials: Annotated[int, Field(ge=1, le=10**6)] = Field(description="Greedy episodes in an evaluation.")
     start: TrialStart = Field(
         default="random",
-        description="The states that trials start in: random, as training episodes do; each of the "
-        "environment's start states in turn; or the state of this number.",
+        description="The start states of trials. random: as in training episodes. each: the environment's "
+        "start states in turn. A number: this state.",
     )
     exact: bool = Field(
         default=False,
-        description="Whether the evaluated policy is also measured exactly, over all start states and "
-        "against the optimum, from the environment's transition table: the greedy policy, or with wolf_phc "
-        "and random the policy that actions are drawn from. Discounted values need a discount below 1; with "
-        "1 they are not a number.",
+        description="Also compute exact measures of the evaluated policy from the environment's transition "
+        "table, over all start states and against the optimum: of the greedy policy, or with wolf_phc and "
+        "random of the policy that actions are drawn from. Discounted values are NaN with discount 1.",
     )
 
 
 class Log(Section):
-    """When training reports on itself, and over what."""
+    """Reports on training."""
 
     every_steps: Count = Field(default=50_000, description="Training steps between reports.")
     window: Annotated[int, Field(ge=1, le=10**8)] = Field(
-        default=50_000, description="How many of the last training steps the reward distribution counts."
+        default=50_000, description="Number of last training steps in the reward distribution."
     )
     episodes: Annotated[int, Field(ge=1, le=10**6)] = Field(
-        default=50, description="How many of the last episodes the mean length is taken over."
+        default=50, description="Number of last episodes in the mean length."
     )
 
 
 class Snapshots(Section):
-    """When the Q-tables are written to the recording as they are."""
+    """When whole Q-tables are written to the recording."""
 
     every: Count | None = Field(
         default=None,
-        description="Training episodes between snapshots; null takes only those before and after training. "
+        description="Training episodes between snapshots; null for only those before and after training. "
         "A table at any other step is computed from the nearest snapshot and the recorded steps.",
     )
 
 
 class Recording(Section):
-    """What the recording holds, and how it is packed."""
+    """The contents of the recording, and how it is packed."""
 
     steps: Literal["all", "none"] = Field(
-        default="all", description="Whether environment steps are recorded: all, or none (measures only)."
+        default="all", description="Whether to record environment steps: all, or none (only measures)."
     )
     compression: Compression = Field(
-        default=Packing.compression, description="How the chunks of a recording are compressed."
+        default=Packing.compression, description="Compression of the chunks of a recording."
     )
     level: Annotated[int, Field(ge=MIN_LEVEL, le=MAX_LEVEL)] | None = Field(
         default_factory=lambda chosen: DEFAULT_LEVEL if chosen.get("compression") == "zstd" else None,
-        description="The level of zstd, from -7 (fast) to 19 (small); 3 unless given. Only with zstd.",
+        description="Level of zstd, from -7 (fast) to 19 (small); 3 unless given. Only with zstd.",
     )
     index: Index = Field(
         default=Packing.index,
-        description="message: every message, as some readers need. chunk: only chunks, 16 bytes a step less.",
+        description="message: index every message, as some readers need. chunk: only chunks, 16 bytes a step "
+        "less.",
     )
     chunk_steps: Annotated[int, Field(ge=MIN_CHUNK_STEPS, le=MAX_CHUNK_STEPS)] = Field(
         default=Packing.chunk_steps,
-        description="The most steps in one chunk; fewer when chunks are flushed by the clock.",
+        description="Maximum steps in a chunk; chunks that are flushed by time have fewer.",
     )
 
     @model_validator(mode="after")
@@ -207,7 +207,7 @@ class Recording(Section):
 
 
 class Quirks(Section):
-    """Where the code of the published tutorial differs from its text; each off unless asked for."""
+    """Differences of the published tutorial's code from its text; each is off by default."""
 
     epsilon_exploits: bool = Field(
         default=False,
@@ -247,8 +247,8 @@ class Hysteretic(AlgorithmSection):
 
     decrease: Probability = Field(
         default=0.01,
-        description="The step size of updates that lower a value, from 0 to 1; those that raise it take "
-        "`step_size`, which is to be the greater.",
+        description="The step size of updates that lower a value, from 0 to 1; updates that raise it use "
+        "`step_size`, which should be larger.",
     )
 
 
@@ -259,9 +259,11 @@ class WolfPhc(AlgorithmSection):
 
     win: StepSize = Field(
         default=0.05,
-        description="How much probability an update moves while the policy wins; at most `lose`.",
+        description="Probability that an update moves while the policy wins; at most `lose`.",
     )
-    lose: StepSize = Field(default=0.2, description="How much it moves while the policy loses.")
+    lose: StepSize = Field(
+        default=0.2, description="Probability that an update moves while the policy loses."
+    )
 
     @model_validator(mode="after")
     def _wins_slowly(self) -> Self:

@@ -1,6 +1,6 @@
 """The experiments that are shipped with the project, which can be named without a path.
 
-They live in `configs/`: in a clone next to the packages, in an installed wheel inside of `runner`.
+They are in `configs/`: next to the packages in a clone, inside of `runner` in an installed wheel.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Shipped(NamedTuple):
 
     @property
     def command(self) -> str:
-        """What runs it."""
+        """The command that runs it."""
         return f"dualtaxi {'sweep run' if self.kind == 'sweep' else 'run'} {self.name}"
 
 
@@ -79,7 +79,7 @@ def find_shipped(name: str) -> Shipped:
 
 
 def config_path(path: str | os.PathLike[str]) -> Path:
-    """Return the file that a path means: a shipped experiment if it is the name of one, and no file."""
+    """Return the file of a path; of the name of a shipped experiment, unless a file has this name."""
     file = Path(path)
     if file.name == os.fspath(path) and not file.suffix and not file.is_file():
         known = shipped()
@@ -89,7 +89,7 @@ def config_path(path: str | os.PathLike[str]) -> Path:
 
 
 def suggestion(path: Path) -> str:
-    """Return what to type instead of a path that names no file: a file next to it, or a shipped name."""
+    """Return a hint at the file or shipped experiment that a missing path probably meant."""
     try:
         files = [file.name for file in path.parent.glob("*.y*ml")]
     except OSError:
@@ -105,7 +105,7 @@ def suggestion(path: Path) -> str:
 def copy_shipped(experiment: Shipped, target: Path) -> None:
     """Write a shipped experiment into a new file.
 
-    The line by which editors find the schema is left out where no schema is next to the file.
+    The line by which editors find the schema is left out if there is no schema next to the file.
 
     Raises:
         RunnerError: the file exists already.
@@ -124,8 +124,8 @@ def copy_shipped(experiment: Shipped, target: Path) -> None:
 START_PAGE: Final = """\
 # Experiments
 
-`configs/` holds experiments to run and to change, `configs/sweeps/` searches over many values. Every run is
-recorded in `recordings/`, a folder each. Type in this folder:
+`configs/` contains experiments to run and to edit, `configs/sweeps/` searches over many values. Every run is
+recorded in a folder of `recordings/`. Type in this folder:
 
 ```
 dualtaxi run configs/quick.yaml     # learn for a second, recording every step
@@ -136,17 +136,17 @@ dualtaxi diff @latest OTHER         # compare two runs
 dualtaxi --help                     # every command
 ```
 
-`dualtaxi config check FILE` checks a configuration that you changed.
+`dualtaxi config check FILE` checks a configuration after your changes.
 """
 
 
 def start_folder(folder: Path) -> Iterator[tuple[Path, bool]]:
-    """Make a folder to start in: the shipped experiments, a place for recordings and a short README.
+    """Create a folder to start in: the shipped experiments, a folder for recordings and a short README.
 
-    What exists already is left as it is.
+    Existing files are not changed.
 
     Yields:
-        Each file or folder, and whether it was made.
+        Each file or folder, and whether it was created.
 
     Raises:
         StorageError: something cannot be written.

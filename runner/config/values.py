@@ -1,8 +1,7 @@
-"""What the models of a configuration have in common: sections, located refusals, free values.
+"""The base of a configuration's models: sections, errors with a path, free values.
 
-A section is one frozen mapping of known keys. A refusal is a validator's own error: it names the key
-it is about, so that the line a user reads points there. Free values are the arguments of an
-environment, which the models know nothing about beyond that JSON and YAML can carry them.
+A section is a frozen mapping of known keys. A refusal is a validator's own error with the path of the key
+that it is about. Free values are the arguments of an environment: anything that JSON and YAML can hold.
 """
 
 from __future__ import annotations
@@ -15,22 +14,22 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic_core import PydanticCustomError
 
 REFUSED = "refused"
-"""The type of the errors that `refusal` makes; their message is shown to users as it stands."""
+"""The type of the errors of `refusal`; their message is shown to users unchanged."""
 
 Path = tuple[str | int, ...]
-"""Where a value stands in a configuration: keys and list positions from the top."""
+"""The place of a value in a configuration: keys and list positions from the top."""
 
 MAX_DEPTH = 50
-"""How deep values may be nested; also what stops a value that contains itself."""
+"""The deepest nesting of values, which also stops a value that contains itself."""
 
 Count = Annotated[int, Field(ge=1, le=10**12)]
-"""A number of episodes or steps; bounded so that sums and products of them fit 64 bits."""
+"""A number of episodes or steps, bounded so that sums and products of them fit in 64 bits."""
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class Section(BaseModel):
-    """One frozen mapping of a configuration: unknown keys, wrong types, NaN and infinity are refused."""
+    """A frozen mapping of a configuration; unknown keys, wrong types, NaN and infinity are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -41,7 +40,7 @@ def refusal(path: Path, message: str) -> PydanticCustomError:
 
 
 class FrozenMapping(Mapping[str, Any]):
-    """A read-only mapping that can be hashed, pickled and passed on with `**`."""
+    """A read-only mapping that can be hashed, pickled and unpacked with `**`."""
 
     __slots__ = ("_items",)
 
@@ -65,7 +64,7 @@ class FrozenMapping(Mapping[str, Any]):
 
 
 def frozen(value: object, path: Path = ()) -> Any:
-    """Return `value` with its mappings and lists made read-only; refuse what JSON cannot carry."""
+    """Return `value` with read-only mappings and lists; refuse what JSON cannot hold."""
     if len(path) > MAX_DEPTH:
         raise refusal(path[:1], f"nested deeper than {MAX_DEPTH} levels")
     if isinstance(value, Mapping):
@@ -83,7 +82,7 @@ def frozen(value: object, path: Path = ()) -> Any:
 
 
 def plain(value: object) -> Any:
-    """Return `frozen` undone: dictionaries and lists, which the caller may change."""
+    """Return a frozen value as dictionaries and lists, which the caller may change."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -97,5 +96,5 @@ def _text(value: object, path: Path) -> str:
     try:
         value.encode()
     except UnicodeEncodeError:
-        raise refusal(path, f"found {value!r}, expected text that UTF-8 can carry") from None
+        raise refusal(path, f"found {value!r}, expected text that UTF-8 can hold") from None
     return value

@@ -284,7 +284,7 @@ def test_diff_of_pictures_tells_the_number_that_differs(tmp_path):
 def test_verify_checks_what_can_be_checked(folder, name):
     told = dualtaxi(folder, "verify", name)
     assert told.exit_code == 0
-    assert "which alone can do it again" in told.output
+    assert "which alone can repeat it" in told.output
 
 
 def test_verify_finds_a_digest_that_is_not_its_messages(folder, tmp_path):
@@ -428,7 +428,7 @@ def test_an_interrupted_loop_is_not_resumed(tmp_path):
     before = env.run.recording.read_bytes()
     done = dualtaxi(tmp_path, "resume", "cut")
     assert done.exit_code == 2
-    assert "which alone can do it again" in done.output
+    assert "which alone can repeat it" in done.output
     assert env.run.recording.read_bytes() == before
 
 
