@@ -131,13 +131,13 @@ def difference(a: Run, b: Run) -> bytes:
         return replace(shown, links=[Link("Both replays at this step", both), *viewers])
 
     shown = partials()
-    body = shown.divergences(list(map(linked, view.divergences)), view.training, view.visits)
-    body += "".join(shown.section(other.title.lower(), other.title, other) for other in view.others)
+    body = [shown.divergences(list(map(linked, view.divergences)), view.training, view.visits)]
+    body += [shown.section(other.title.lower(), other.title, other) for other in view.others]
     found = {
         "lead": view.lead,
         "notes": view.notes,
         "first_step": view.divergences[0].step if view.divergences else None,
-        "body": body,
+        "body": "".join(body),
         "tables": shown.tables(view.tables, view.table_figures),
     }
     return json.dumps(found).encode()
@@ -189,9 +189,9 @@ def sweep_results(name: str, recordings: Path, digest: str) -> bytes:
         for grid in ranking.grids[:1]
     ]
     shown = partials()
-    html = shown.section("ranking", "Ranking", replace(ranking, grids=[*grids, *ranking.grids[1:]]))
-    html += "".join(shown.section(f"results-{i}", each.title, each) for i, each in enumerate(others))
-    return str(html + shown.best(results.best_yaml) if results.best_yaml else html).encode()
+    html = [shown.section("ranking", "Ranking", replace(ranking, grids=[*grids, *ranking.grids[1:]]))]
+    html += [shown.section(f"results-{i}", each.title, each) for i, each in enumerate(others)]
+    return "".join([*html, shown.best(results.best_yaml) if results.best_yaml else ""]).encode()
 
 
 def _run_links(runs: Mapping[Any, str]) -> str:

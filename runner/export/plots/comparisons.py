@@ -34,7 +34,7 @@ def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
         metric: the metric that is drawn.
         labels: the labels of all groups, in the order of their colours.
     """
-    bottom = 30.0 + max(100.0, 30.0 * len(metric.groups))
+    bottom = 12.0 + max(100.0, 30.0 * len(metric.groups))
     drawn = [
         value
         for group in metric.groups
@@ -42,7 +42,7 @@ def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
         if math.isfinite(value)
     ]
     x = Scale.around(np.array(drawn), 40.0, WIDTH - 10)
-    y = Scale(len(metric.groups) - 0.4, -0.6, bottom, 30.0)
+    y = Scale(len(metric.groups) - 0.4, -0.6, bottom, 12.0)
     chart = Chart(x, y, WIDTH, bottom + 34, f"{metric.title}: values of the groups")
     chart.x_ticks(labelled(x.ticks))
     chart.shape([(x.start, bottom), (x.end, bottom)], stroke=palette.INK)

@@ -128,8 +128,10 @@ def code(text: str) -> Markup:
 
 
 def sentence(text: str) -> str:
-    """Return a text with a capital at its start and a full stop at its end, unless it ends in a colon."""
-    return f"{text[:1].upper()}{text[1:]}{'' if text[-1:] in '.:' else '.'}"
+    """Return a text with a capital at its start, unless that is a name, and a full stop at its end."""
+    first, space, rest = text.partition(" ")
+    start = first[:1].upper() + first[1:] if first.isalpha() else first
+    return f"{start}{space}{rest}{'' if text[-1:] in '.:' else '.'}"
 
 
 def embedded(data: Any) -> str:

@@ -251,7 +251,7 @@ def test_a_step_is_opened_in_rerun(page, folder):
     with open_recording(find_run("first", folder).recording) as recording:
         step = recording.episode_steps("train", 7)[2]
     opened = browser.execute_script(
-        "return [document.body.dataset.opened, document.getElementById('said').hidden]"
+        "return [document.body.dataset.opened, document.getElementById('message').hidden]"
     )
     assert opened == [str(int(step["log_time"]) // 100_000_000), True]
     browser.switch_to.default_content()
