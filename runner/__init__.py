@@ -2,8 +2,8 @@
 
     import runner
 
-    run = runner.run("quick")                              # learns, and records every step
-    print(runner.frames.evaluations(run))                  # its measures, as a pandas frame
+    run = runner.run("quick")                              # train, and record every step
+    print(runner.frames.evaluations(run))                  # its metrics as a pandas frame
     for run in runner.run_all("quick", overrides=["seeds=[1, 2, 3]"]):
         print(run.run_id, run.summary["content_digest"])
 
@@ -23,11 +23,14 @@ if TYPE_CHECKING:
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
     from runner.errors import RunnerError
+    from runner.execution.rerecord import evaluate, rerecord
+    from runner.execution.resume import resume
+    from runner.execution.verify import verify
     from runner.loops.env import record
     from runner.loops.vector import record_parallel, record_vector
     from runner.recording.reader import Recording, open_recording
     from runner.runs.resolve import find_run
-    from runner.runs.run import Run, list_runs
+    from runner.runs.run import Run, label, list_runs
 
 __all__ = [
     "ExperimentConfig",
@@ -35,15 +38,20 @@ __all__ = [
     "Run",
     "RunnerError",
     "__version__",
+    "evaluate",
     "find_run",
     "frames",
+    "label",
     "list_runs",
     "open_recording",
     "record",
     "record_parallel",
     "record_vector",
+    "rerecord",
+    "resume",
     "run",
     "run_all",
+    "verify",
 ]
 
 _HOME = {
@@ -51,14 +59,19 @@ _HOME = {
     "Recording": "runner.recording.reader",
     "Run": "runner.runs.run",
     "RunnerError": "runner.errors",
+    "evaluate": "runner.execution.rerecord",
     "find_run": "runner.runs.resolve",
+    "label": "runner.runs.run",
     "list_runs": "runner.runs.run",
     "open_recording": "runner.recording.reader",
     "record": "runner.loops.env",
     "record_parallel": "runner.loops.vector",
     "record_vector": "runner.loops.vector",
+    "rerecord": "runner.execution.rerecord",
+    "resume": "runner.execution.resume",
     "run": "runner.api",
     "run_all": "runner.api",
+    "verify": "runner.execution.verify",
 }
 """The module of each public name that is not a module itself."""
 

@@ -1,4 +1,4 @@
-"""`dualtaxi`, or `python -m runner`: the command line, from its first import on."""
+"""`dualtaxi`, or `python -m runner`: the entry point of the command line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C is told by the exit code alone, also while it is loaded."""
+    """Run the command line; Ctrl-C only sets the exit code, even while modules are imported."""
     try:
         from runner.cli import main as command_line
 

@@ -1,4 +1,4 @@
-"""Running experiments from Python: `runner.run` and `runner.run_all`, and what the command line shares.
+"""Running experiments from Python: `runner.run` and `runner.run_all`, which the command line uses too.
 
 import runner
 
@@ -12,7 +12,9 @@ import contextlib
 import os
 import signal
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,7 +23,7 @@ from runner.config.job import Job, jobs_of
 from runner.runs.run import Run, create_run, recordings_folder, unless_empty
 from runner.util.values import checked_name
 
-if TYPE_CHECKING:  # both are imported late: a run is to stand on disk before NumPy and Numba are loaded
+if TYPE_CHECKING:  # imported late: a run is written to disk before NumPy and Numba are loaded
     from runner.execution.session import Progress
 
 Config = str | os.PathLike[str] | Mapping[str, Any] | ExperimentConfig
@@ -47,14 +49,14 @@ def run(
 
     Args:
         config: the path of a YAML file, the same as a mapping, or an `ExperimentConfig`.
-        seed: the seed, instead of the configuration's; needed where that has several.
-        overrides: `KEY=VALUE` each, as `--set` takes them.
-        name: what the run is called; the configuration's name unless given.
-        recordings: the folder for it: $DUALTAXI_RECORDINGS, or ./recordings, unless given.
+        seed: the seed, instead of the configuration's; required if that has several.
+        overrides: `KEY=VALUE` each, as for `--set`.
+        name: the name of the run; the configuration's name by default.
+        recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, by default.
         report: called with the progress a few times a second.
 
     Raises:
-        ConfigError: the configuration cannot be used, or has several seeds and none was chosen.
+        ConfigError: the configuration is not valid, or has several seeds and none was chosen.
         EnvironmentNotUsable: the environment is unknown, or has no transition table.
         StorageError: the recordings folder cannot be written, or its disk is full.
         KeyboardInterrupt: it was interrupted; what was recorded is kept.
@@ -64,7 +66,7 @@ def run(
         raise ConfigError(
             f"found {len(experiment.seeds)} seeds, and run() does one: choose it by seed=, or call run_all()."
         )
-    return next(_run_jobs(experiment, name, recordings, report))
+    return next(_runs(experiment, name, recordings, report, 1))
 
 
 def run_all(
@@ -76,26 +78,60 @@ def run_all(
     report: Callable[[Progress], None] = lambda _: None,
     workers: int = 1,
 ) -> Iterator[Run]:
-    """Yield the runs of an experiment in the order of its seeds; arguments and errors as for `run`.
+    """Yield the runs of an experiment in the order of its seeds; errors as for `run`.
 
     Args:
         config: as for `run`; it may have several seeds.
         overrides: as for `run`.
         name: as for `run`.
         recordings: as for `run`.
-        report: as for `run`; with several at once it is called from their threads.
-        workers: number of runs to train in parallel, one thread each. What they record is the same.
+        report: as for `run`; with several workers it is called from their threads.
+        workers: number of runs to train in parallel, one thread each; the recordings are the same.
     """
     if workers < 1:
         raise ConfigError(f"workers: found {workers}, expected 1 or more.")
-    experiment = experiment_of(config, overrides)
-    if workers == 1:
-        return _run_jobs(experiment, name, recordings, report)
-    return _run_parallel(experiment, name, recordings, report, workers)
+    return _runs(experiment_of(config, overrides), name, recordings, report, workers)
+
+
+def _runs(
+    config: ExperimentConfig,
+    name: str | None,
+    recordings: str | os.PathLike[str] | None,
+    report: Callable[[Progress], None],
+    workers: int,
+) -> Iterator[Run]:
+    """Yield the run of each seed; names and folders are checked before heavy packages are imported."""
+    run_name, folder = checked_name(name), recordings_folder(recordings)
+    jobs = jobs_in(config, folder)
+    if workers > 1:
+        with interruptible() as interrupt:
+            for run in run_parallel(jobs, folder, run_name, workers, interrupt, report):
+                if interrupt.came:
+                    raise KeyboardInterrupt(f"runs were interrupted; what they recorded is in {folder}")
+                yield run
+        return
+    for job in jobs:
+        with interruptible() as interrupt:
+            run = _recorded(job, folder, run_name, report, interrupt)
+        if interrupt.came:
+            raise KeyboardInterrupt(
+                f"run {run.run_id} was interrupted; what it recorded is in {run.recording}"
+            )
+        yield run
+
+
+def _recorded(
+    job: Job, folder: Path, name: str | None, report: Callable[[Progress], None], stop: Callable[[], bool]
+) -> Run:
+    run = create_run(folder, job.config, job.seed, name)
+    with unless_empty(run):
+        from runner.execution.session import run_job
+
+        return run_job(job, run, report, stop)
 
 
 def experiment_of(config: Config, overrides: Sequence[str] = (), seed: int | None = None) -> ExperimentConfig:
-    """Return the experiment that a path, a mapping or an experiment means, with overrides and seed put in.
+    """Return the experiment of a path, a mapping or an experiment, with overrides and a seed.
 
     Raises:
         ConfigError: it does not describe an experiment.
@@ -109,10 +145,10 @@ def experiment_of(config: Config, overrides: Sequence[str] = (), seed: int | Non
 
 
 def jobs_in(config: ExperimentConfig, recordings: Path) -> Iterator[Job]:
-    """Yield the jobs of an experiment, one a seed; all begin with the same table, if it is a run's.
+    """Yield the jobs of an experiment, one per seed, all with the same initial table.
 
     Raises:
-        RunnerError: it begins with the table of a run that is not there.
+        RunnerError: the run with the initial table does not exist.
     """
     if isinstance(config.initial_q, RunTable):
         from runner.execution.initial_tables import resolve_initial_q
@@ -129,59 +165,50 @@ def run_parallel(
     stop: Callable[[], bool],
     report: Callable[[Progress], None] = lambda _: None,
 ) -> Iterator[Run]:
-    """Yield the runs of jobs in their order, several learning side by side, each on a thread of its own.
+    """Yield the runs of jobs in their order, trained in parallel on one thread each.
 
-    Learning releases the interpreter's lock, and a run has its own tables and draws: what it records is
-    what it would record alone. Once `stop` says True, runs under way are closed, and no other is begun.
+    Training releases the interpreter's lock, and each run has its own tables and draws: it records what it
+    would record alone. When `stop` returns True, current runs are closed and no others are started.
     """
-    from collections import deque
-    from concurrent.futures import Future, ThreadPoolExecutor
+    is_left = threading.Event()
 
-    left = threading.Event()
-
-    def stopped() -> bool:
-        return left.is_set() or stop()
+    def is_stopped() -> bool:
+        return is_left.is_set() or stop()
 
     def do(job: Job) -> Run | None:
-        if stopped():
-            return None
-        from runner.execution.session import run_job
+        return None if is_stopped() else _recorded(job, folder, name, report, is_stopped)
 
-        run = create_run(folder, job.config, job.seed, name)
-        with unless_empty(run):
-            return run_job(job, run, report, stopped)
-
-    under_way: deque[Future[Run | None]] = deque()
+    pending: deque[Future[Run | None]] = deque()
     with ThreadPoolExecutor(workers, thread_name_prefix="learner") as threads:
         try:
             for job in jobs:
-                under_way.append(threads.submit(do, job))
-                if len(under_way) == 2 * workers and (run := under_way.popleft().result()):
+                pending.append(threads.submit(do, job))
+                if len(pending) == 2 * workers and (run := pending.popleft().result()):
                     yield run
-            yield from (run for each in under_way if (run := each.result()))
+            yield from (run for each in pending if (run := each.result()))
         finally:
-            left.set()
+            is_left.set()
 
 
 class Interrupt:
-    """Whether the process was told to stop."""
+    """Whether a signal interrupted the process; also callable, as `run_job` needs it."""
 
     def __init__(self) -> None:
         self.came = False
 
     def __call__(self) -> bool:
-        """Return whether it was, as `run_job` asks."""
+        """Return whether a signal came."""
         return self.came
 
 
 @contextlib.contextmanager
 def interruptible(second: Handler = None) -> Iterator[Interrupt]:
-    """Catch the first SIGINT or SIGTERM, so that a run can end properly; the caller looks whether it came.
-
-    Args:
-        second: the handler of a second signal: the one from before, unless given.
+    """Catch the first SIGINT or SIGTERM, so that a run can end properly; the caller checks whether it came.
 
     Handlers belong to the main thread; on another one nothing is caught.
+
+    Args:
+        second: the handler of a second signal; the previous one by default.
     """
     interrupt = Interrupt()
     if threading.current_thread() is not threading.main_thread():
@@ -191,58 +218,17 @@ def interruptible(second: Handler = None) -> Iterator[Interrupt]:
 
     def first(_number: int, _frame: Any) -> None:
         interrupt.came = True
+        restore(second)
+
+    def restore(replacement: Handler) -> None:
         for number, handler in before.items():
-            _handle(number, handler if second is None else second)
+            chosen = handler if replacement is None else replacement
+            if chosen is not None:  # a handler that was not set from Python cannot be set again
+                signal.signal(number, chosen)
 
     try:
         for number in _SIGNALS:
             signal.signal(number, first)
         yield interrupt
     finally:
-        for number, handler in before.items():
-            _handle(number, handler)
-
-
-def _handle(number: int, handler: Handler) -> None:
-    """Set a signal's handler; one that was not set from Python (None) cannot be set again."""
-    if handler is not None:
-        signal.signal(number, handler)
-
-
-def _run_jobs(
-    config: ExperimentConfig,
-    name: str | None,
-    recordings: str | os.PathLike[str] | None,
-    report: Callable[[Progress], None],
-) -> Iterator[Run]:
-    """Yield a run a seed; the folder is checked and the run stands on disk before anything heavy."""
-    called, folder = checked_name(name), recordings_folder(recordings)
-    for job in jobs_in(config, folder):
-        yield _run_job(job, folder, called, report)
-
-
-def _run_parallel(
-    config: ExperimentConfig,
-    name: str | None,
-    recordings: str | os.PathLike[str] | None,
-    report: Callable[[Progress], None],
-    workers: int,
-) -> Iterator[Run]:
-    called, folder = checked_name(name), recordings_folder(recordings)
-    with interruptible() as interrupt:
-        for run in run_parallel(jobs_in(config, folder), folder, called, workers, interrupt, report):
-            if interrupt.came:
-                raise KeyboardInterrupt(f"runs were interrupted; what they recorded is in {folder}")
-            yield run
-
-
-def _run_job(job: Job, folder: Path, name: str | None, report: Callable[[Progress], None]) -> Run:
-    with interruptible() as interrupt:
-        run = create_run(folder, job.config, job.seed, name)
-        with unless_empty(run):
-            from runner.execution.session import run_job
-
-            run = run_job(job, run, report, interrupt)
-    if interrupt.came:
-        raise KeyboardInterrupt(f"run {run.run_id} was interrupted; what it recorded is in {run.recording}")
-    return run
+        restore(None)

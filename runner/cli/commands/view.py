@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     "step",
     type=STEP,
     metavar="EPISODE:T",
-    help="The point in training to show: EPISODE:T, or eval:N:TRIAL:T of an evaluation. "
+    help="The point in training: EPISODE:T to show a step, or eval:N:TRIAL:T of an evaluation. "
     "T and TRIAL default to 0.",
 )
 @click.option("--web", is_flag=True, help="Serve the web viewer on 127.0.0.1 instead of opening a window.")

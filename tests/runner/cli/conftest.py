@@ -50,6 +50,12 @@ def tiny(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def command_in() -> type[Command]:
+    """The command line of a recordings folder."""
+    return Command
+
+
 @pytest.fixture
 def command(tmp_path: Path) -> Command:
     """The command line with an empty recordings folder."""

@@ -23,15 +23,20 @@ def test_the_public_names():
         "Run",
         "RunnerError",
         "__version__",
+        "evaluate",
         "find_run",
         "frames",
+        "label",
         "list_runs",
         "open_recording",
         "record",
         "record_parallel",
         "record_vector",
+        "rerecord",
+        "resume",
         "run",
         "run_all",
+        "verify",
     ]
     for name in runner.__all__:
         assert getattr(runner, name) is not None

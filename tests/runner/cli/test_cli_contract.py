@@ -1,0 +1,199 @@
+"""Rules that hold for every command: its JSON is an object, and its exit codes are the documented ones."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+from types import SimpleNamespace
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from runner.cli import cli
+from runner.cli.commands import remote
+from runner.cli.options import RunName
+from runner.client.jobs import RemoteJob
+from runner.errors import ExitCode
+
+
+def walk(group=cli, path=()):
+    """Yield the path of every command and the command."""
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if isinstance(command, click.Group):
+            yield from walk(command, (*path, name))
+        else:
+            yield (*path, name), command
+
+
+EVERY = dict(walk())
+WITH_JSON = {
+    path: command for path, command in EVERY.items() if any(p.name == "as_json" for p in command.params)
+}
+
+LISTS = {
+    "ls": "runs",
+    "du": "runs",
+    "config ls": "configs",
+    "sweep ls": "sweeps",
+    "token ls": "tokens",
+    "remote push": "runs",
+    "remote jobs": "jobs",
+}
+"""Commands whose result is a list, and the name of the list."""
+LINES = ("run", "play", "table", "archive")
+"""Commands that print one object per line."""
+WORDS = {
+    "run": "{tiny}",
+    "sweep run": "{sweep} --dry-run",
+    "sweep show": "small",
+    "resume": "@latest",
+    "evaluate": "@latest --trials 2",
+    "rerecord": "@latest",
+    "show": "@latest",
+    "play": "@latest",
+    "diff": "@latest @latest",
+    "compare": "@latest other@latest",
+    "verify": "@latest",
+    "qtable": "@latest --state 0",
+    "table": "--env FrozenLake-v1",
+    "label": "@latest --tag good",
+    "rm": "@latest --dry-run",
+    "prune": "--keep-last 0 --dry-run",
+    "repair": "@latest",
+    "init": "{folder}/start",
+    "config copy": "quick -o {folder}/mine.yaml",
+    "config check": "{tiny}",
+    "archive": "@latest --to {folder}/archive",
+    "restore": "other",
+    "export mcap": "@latest -o {folder}/a.mcap",
+    "import": "{recording} --as-new",
+    "remote push": "@latest",
+    "remote pull": "@latest",
+    "remote submit": "{tiny}",
+    "remote watch": "1",
+    "remote cancel": "1",
+    "remote resume": "1",
+    "token create": "laptop",
+    "token revoke": "laptop",
+}
+"""What is typed after a command; nothing for the others."""
+JOB = RemoteJob(1, "config", "tiny", "finished", 1, "", None, {3: "k3v9m2xq"})
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory, recorded_run, command_in):
+    """A folder with two runs, an archive of one, and a sweep."""
+    folder = tmp_path_factory.mktemp("contract")
+    recordings = folder / "recordings"
+    shutil.copytree(recorded_run.folder, recordings / recorded_run.run_id)
+    tiny = folder / "tiny.yaml"
+    shutil.copy(recorded_run.folder.parents[1] / "tiny.yaml", tiny)
+    command = command_in(recordings)
+    other = command.json("run", tiny, "--set", "discount=0.5", "--name", "other")
+    command.json("archive", other["run_id"], "--to", folder / "archived", "--remove")
+    sweep = folder / "small.yaml"
+    sweep.write_text("base: tiny.yaml\nstrategy: grid\nseeds: [0]\nparameters: {discount: [0.5, 0.9]}\n")
+    done = command("sweep", "run", sweep, "--workers", 1)
+    assert done.exit_code == 0, done.output
+    return SimpleNamespace(
+        folder=folder,
+        command=command,
+        tiny=tiny,
+        sweep=sweep,
+        recording=recorded_run.recording,
+    )
+
+
+@pytest.fixture(autouse=True)
+def server(monkeypatch, tmp_path, recorded_run):
+    """Stand in for a server, and keep tokens in a folder of the test."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    pulled = SimpleNamespace(run=recorded_run, content_digest="0" * 64, already=True)
+    client = SimpleNamespace(
+        url="http://localhost",
+        push=lambda *_: SimpleNamespace(run_id="k3v9m2xq", already=False),
+        pull=lambda *_: pulled,
+        submit=lambda *_: JOB,
+        jobs=lambda *_: [JOB],
+        job=lambda _: JOB,
+        watch=lambda _: [],
+        cancel=lambda _: JOB,
+        resume=lambda *_: JOB,
+    )
+    monkeypatch.setattr(remote.Server, "client", lambda *_: contextlib.nullcontext(client))
+
+
+def test_every_command_with_json_is_tested():
+    assert {*WORDS, *LISTS} <= {" ".join(path) for path in WITH_JSON}
+
+
+@pytest.mark.parametrize("path", WITH_JSON, ids=" ".join)
+def test_json_is_an_object_or_one_per_line(place, path):
+    name = " ".join(path)
+    words = WORDS.get(name, "").format(**vars(place)).split()
+    if name == "token revoke":
+        place.command("token", "create", "laptop")
+    done = place.command(*path, *words, "--json")
+    assert done.exit_code in (ExitCode.OK, ExitCode.DIFFERENT), done.output
+    objects = (
+        [json.loads(line) for line in done.stdout.splitlines()]
+        if name in LINES
+        else [json.loads(done.stdout)]
+    )
+    assert objects
+    assert all(isinstance(each, dict) for each in objects)
+    if name in LISTS:
+        assert isinstance(objects[0][LISTS[name]], list)
+
+
+@pytest.mark.parametrize("path", EVERY, ids=" ".join)
+def test_wrong_usage_has_the_documented_exit_code(path):
+    done = CliRunner().invoke(cli, [*path, "--nope"])
+    assert done.exit_code == ExitCode.USAGE
+    assert done.stdout == ""
+    if path in WITH_JSON:
+        error = json.loads(CliRunner().invoke(cli, [*path, "--nope", "--json"]).stderr.splitlines()[-1])[
+            "error"
+        ]
+        assert error["exit_code"] == ExitCode.USAGE
+
+
+def takes_runs(command):
+    arguments = [parameter for parameter in command.params if isinstance(parameter, click.Argument)]
+    return any(isinstance(argument.type, RunName) and argument.name != "names" for argument in arguments)
+
+
+@pytest.mark.parametrize("path", [path for path in EVERY if takes_runs(EVERY[path])], ids=" ".join)
+def test_an_unknown_run_has_the_documented_exit_code(place, path):
+    words = ["nosuchrun"] * (2 if path == ("diff",) else 1)
+    done = place.command(*path, *words)
+    assert done.exit_code == ExitCode.USAGE, done.output
+    assert "no run 'nosuchrun'" in done.stderr
+
+
+def test_exit_codes_are_explained_by_help():
+    lines = [
+        line.split() for line in CliRunner().invoke(cli, ["--help"], terminal_width=200).stdout.splitlines()
+    ]
+    for code in ExitCode:
+        assert [str(int(code)), *code.explanation.split()] in lines
+
+
+@pytest.mark.parametrize(
+    "name", ["all", "at", "limit", "workers", "target", "set", "json", "markdown", "recordings"]
+)
+def test_an_option_has_one_meaning(name):
+    meanings = {
+        option.help.removeprefix("The folder of runs")
+        .removeprefix("A folder of runs; may be repeated")
+        .rstrip(".")
+        for command in EVERY.values()
+        for option in command.params
+        if isinstance(option, click.Option) and f"--{name}" in option.opts
+    }
+    heads = {meaning.partition(":")[0].partition("; may")[0] for meaning in meanings}
+    assert len(heads) == 1, heads
