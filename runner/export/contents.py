@@ -1,4 +1,4 @@
-"""What a recording has to be shown or exported, and what is to be said of what it has not."""
+"""What a recording contains for a display or an export, and messages about what it lacks."""
 
 from __future__ import annotations
 
@@ -11,24 +11,30 @@ from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.util.values import flatten, is_whole
 
+Ranges = tuple[tuple[int, int | None], ...]
+"""Ranges of episodes: the first, and the one after the last or None for the end."""
+
 
 def shortcomings(recording: Recording) -> list[str]:
-    """Return what is missing from a recording, a sentence each; of a whole one nothing."""
-    said, status = [], recording.status
+    """Return what is missing from a recording, a sentence each; nothing if it is complete."""
+    sentences, status = [], recording.status
     if status != "finished":
-        done = "there is what its loop had done"
+        recorded = "its loop is recorded up to its last step"
         if recording.is_job:
             planned = recording.config.get("episodes")
             of = f" of {planned:,}" if is_whole(planned, 0, 2**63) else ""
-            done = f"there are {recording.count(schema.TRAIN_EPISODE):,}{of} training episodes"
-        how = "is still running" if status == "running" else f"did not finish ({status})"
-        said.append(f"Run {recording.run_id} {how}: {done}.")
-    said += [f"Of {topic} some messages were lost in a repair; they are missing." for topic in recording.lost]
-    return said
+            recorded = f"there are {recording.count(schema.TRAIN_EPISODE):,}{of} training episodes"
+        problem = "is still running" if status == "running" else f"did not finish ({status})"
+        sentences.append(f"Run {recording.run_id} {problem}: {recorded}.")
+    return sentences + [f"Some messages of {topic} were lost in a repair." for topic in recording.lost]
 
 
 def require_steps(recording: Recording, purpose: str) -> None:
-    """Refuse a recording without steps; the purpose is what is to be done with them, such as `play`.
+    """Refuse a recording without steps.
+
+    Args:
+        recording: the recording.
+        purpose: what the steps are needed for, such as `play`.
 
     Raises:
         RecordingError: it has none.
@@ -38,7 +44,7 @@ def require_steps(recording: Recording, purpose: str) -> None:
 
 
 def why_no_steps(recording: Recording) -> str:
-    """Return why a recording has no steps, and what gives it some."""
+    """Return why a recording has no steps, and the command that records them."""
     if recording.leaves_out_steps:
         return (
             f"they were left out (recording.steps: none); `dualtaxi rerecord {recording.run_id}` records them"
@@ -49,10 +55,10 @@ def why_no_steps(recording: Recording) -> str:
 def whole_ranges(
     ranges: Iterable[tuple[int, int | None]], count: int, phase: str, where: str
 ) -> list[tuple[int, int]]:
-    """Return ranges of episodes, the second number not included, with an end where none is said.
+    """Return ranges of episodes with an end in place of None.
 
     Raises:
-        RecordingError: one is empty, or goes beyond the `count` that there are; it begins with `where`.
+        RecordingError: one is empty, or exceeds the `count` episodes; the message begins with `where`.
     """
     whole = [(start, count if stop is None else stop) for start, stop in ranges]
     for start, stop in whole:

@@ -1,4 +1,4 @@
-"""A run into MLflow: parameters, metrics over training steps, tags, and what it is as an artifact."""
+"""A run in MLflow: parameters, metrics over training steps, tags, and its facts as an artifact."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import count, islice
+from itertools import chain, count, islice
 from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import RunnerError
 from runner.export.contents import flat_text
-from runner.export.scalars import Measures, created, episodes, measures, seconds_of
+from runner.export.scalars import created, episodes, measures
 from runner.recording.reader import Recording
 from runner.util.extras import require
 
@@ -25,28 +25,29 @@ RUN_TAG: Final = "dualtaxi.run_id"
 DIGEST_TAG: Final = "dualtaxi.content_digest"
 _SQLITE: Final = "sqlite:///"
 _STATUS: Final = {"finished": "FINISHED", "interrupted": "KILLED", "failed": "FAILED", "running": "RUNNING"}
-_AT_ONCE: Final = 1000
-_PARAMS_AT_ONCE: Final = 100
-_LONGEST: Final = 6000
-_LONGEST_NAME: Final = 240
-_TOLD: Final = 60
+# Limits of MLflow: metrics and parameters of a request, and characters of a parameter and of a name.
+_MAX_METRICS: Final = 1000
+_MAX_PARAMS: Final = 100
+_MAX_TEXT: Final = 6000
+_MAX_NAME: Final = 240
 _REFUSED: Final = re.compile(r"[^/\w.\- :]")
-"""What MLflow has in no name."""
+"""The characters that MLflow does not allow in names."""
+_MAX_SHOWN: Final = 60
 
 
 @dataclass(frozen=True)
-class Exported:
-    """What came of an export."""
+class MlflowExport:
+    """The result of an export."""
 
     mlflow_run: str
     metrics: int
-    already: bool
-    """Whether the run was there before; then nothing was written."""
+    exists: bool = False
+    """Whether the run was in the store already; then nothing was written."""
     notes: tuple[str, ...] = ()
 
 
 def require_packages() -> None:
-    """Raise an error that says what is missing, if MLflow's client is not installed.
+    """Check that MLflow's client is installed.
 
     Raises:
         MissingExtra: it is not.
@@ -58,25 +59,25 @@ def require_packages() -> None:
 
 def export(
     recording: Recording, tracking: str, experiment: str, with_recording: bool = False, force: bool = False
-) -> Exported:
-    """Write a run into an MLflow store; one that is there with the same content is left as it is.
+) -> MlflowExport:
+    """Write a run into an MLflow store, unless it is there already with the same content.
 
     Args:
         recording: the run's.
         tracking: the store: `sqlite:///exports/mlflow.db`, or the address of a server.
-        experiment: the name of the experiment, made if it is missing.
+        experiment: the name of the experiment, created if it is missing.
         with_recording: also store the recording as an artifact.
-        force: write it anew, and delete what is there of it.
+        force: write the run again, and delete what the store has of it.
 
     Raises:
-        RunnerError: the store cannot be used.
+        RunnerError: the store cannot be used, or has the run with other content.
         RecordingError: the recording is damaged.
     """
     from mlflow.exceptions import MlflowException
 
     with _quiet():
         try:
-            if tracking.startswith(_SQLITE):  # SQLite makes the file, but not its folder
+            if tracking.startswith(_SQLITE):  # SQLite creates the file, but not its folder
                 Path(tracking.removeprefix(_SQLITE)).parent.mkdir(parents=True, exist_ok=True)
             return _export(recording, tracking, experiment, with_recording, force)
         except (MlflowException, ImportError, OSError) as error:
@@ -89,115 +90,115 @@ def export(
 
 def _export(
     recording: Recording, tracking: str, experiment: str, with_recording: bool, force: bool
-) -> Exported:
+) -> MlflowExport:
     from mlflow.tracking import MlflowClient
 
     client = MlflowClient(tracking_uri=tracking, registry_uri=tracking)
     found = client.get_experiment_by_name(experiment)
-    into = client.create_experiment(experiment) if found is None else found.experiment_id
-    known = client.search_runs([into], f"tags.`{RUN_TAG}` = '{recording.run_id}'")
-    same = [one for one in known if one.data.tags.get(DIGEST_TAG) == _digest(recording)]
-    if same and not force:
-        return Exported(same[0].info.run_id, 0, already=True)
-    if known and not force:
+    experiment_id = client.create_experiment(experiment) if found is None else found.experiment_id
+    stored = client.search_runs([experiment_id], f"tags.`{RUN_TAG}` = '{recording.run_id}'")
+    tags = tags_of(recording)
+    if stored and not force:
+        for one in stored:
+            if one.data.tags.get(DIGEST_TAG) == tags[DIGEST_TAG]:
+                return MlflowExport(one.info.run_id, 0, exists=True)
         raise RunnerError(
             f"{tracking}: experiment {experiment!r} has the run {recording.run_id} "
             "with other content; --force replaces it."
         )
-    made = client.create_run(into, start_time=round(created(recording) * 1000), tags=_tags(recording))
+    run = client.create_run(experiment_id, start_time=round(created(recording) * 1000), tags=tags)
+    run_id = run.info.run_id
     try:
-        exported = _fill(client, made.info.run_id, recording, with_recording)
+        names: dict[str, str] = {}
+        notes = _log_params(client, run_id, recording, names)
+        metrics, end = _log_metrics(client, run_id, recording, names)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "run.json")
+            path.write_text(json.dumps(recording.run_facts(), indent=1), encoding="utf-8")
+            client.log_artifact(run_id, str(path))
+        if with_recording:
+            client.log_artifact(run_id, str(recording.path))
+        client.set_terminated(run_id, _STATUS.get(recording.status, "KILLED"), round(end * 1000))
     except BaseException:
-        client.delete_run(made.info.run_id)
+        client.delete_run(run_id)
         raise
-    for one in known:
+    for one in stored:
         client.delete_run(one.info.run_id)
-    return exported
-
-
-def _fill(client: Any, run_id: str, recording: Recording, with_recording: bool) -> Exported:
-    from mlflow.entities import Metric, Param
-
-    params, names = flat_text(recording.config), dict[str, str]()
-    fitting = [Param(_name(key, names), text) for key, text in params.items() if len(text) <= _LONGEST]
-    notes = [
-        f"{key} is longer than MLflow's {_LONGEST:,} characters; it is in run.json alone."
-        for key, text in params.items()
-        if len(text) > _LONGEST
-    ]
-    for start in range(0, len(fitting), _PARAMS_AT_ONCE):
-        client.log_batch(run_id, params=fitting[start : start + _PARAMS_AT_ONCE])
-    began, written, last = created(recording), 0, 0.0
-    rows = (
-        (f"{found.phase}/{name}", value, began + seconds_of(found.position), found.step)
-        for found in _measured(recording)
-        for name, value in found.values.items()
-    )
-    while some := list(islice(rows, _AT_ONCE)):
-        client.log_batch(
-            run_id,
-            [Metric(_name(key, names), value, round(at * 1000), step) for key, value, at, step in some],
-        )
-        written, last = written + len(some), max(last, *(at for _, _, at, _ in some))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, "run.json")
-        path.write_text(json.dumps(recording.run_facts(), indent=1), encoding="utf-8")
-        client.log_artifact(run_id, str(path))
-    if with_recording:
-        client.log_artifact(run_id, str(recording.path))
-    status = _STATUS.get(recording.status, "KILLED")
-    client.set_terminated(run_id, status, round(max(last, began) * 1000))
     notes += [
         f"{_short(name)} is called {_short(key)}: MLflow takes no such name."
         for name, key in names.items()
         if name != key
     ]
-    return Exported(run_id, written, False, tuple(notes))
+    return MlflowExport(run_id, metrics, notes=tuple(notes))
 
 
-def _measured(recording: Recording) -> Iterator[Measures]:
-    """Yield the measures of a run; of a loop, which has few, also length and return of its episodes."""
-    yield from measures(recording)
-    if not recording.is_job:
-        for phase in ("train", "eval"):
-            yield from episodes(recording, phase)
+def _log_params(client: Any, run_id: str, recording: Recording, names: dict[str, str]) -> list[str]:
+    """Log the configuration; return a note about each value that is too long."""
+    from mlflow.entities import Param
+
+    values = flat_text(recording.config)
+    params = iter([Param(_name(key, names), text) for key, text in values.items() if len(text) <= _MAX_TEXT])
+    while batch := list(islice(params, _MAX_PARAMS)):
+        client.log_batch(run_id, params=batch)
+    return [
+        f"{key} is longer than MLflow's {_MAX_TEXT:,} characters; it is in run.json alone."
+        for key, text in values.items()
+        if len(text) > _MAX_TEXT
+    ]
 
 
-def _name(name: str, known: dict[str, str]) -> str:
-    """Return what MLflow takes for a name, another one for each; `known` is what was taken so far."""
-    if name not in known:
-        parts = _REFUSED.sub("_", name)[:_LONGEST_NAME].split("/")
-        plain = "/".join(part if part.strip(". ") else "_" for part in parts)
-        several = (plain if number == 1 else f"{plain}_{number}" for number in count(1))
-        known[name] = next(one for one in several if one not in known.values())
-    return known[name]
+def _log_metrics(client: Any, run_id: str, recording: Recording, names: dict[str, str]) -> tuple[int, float]:
+    """Log all metrics, of a loop also length and return of its episodes; return their number, and the end."""
+    from mlflow.entities import Metric
+
+    end = began = created(recording)
+    phases = () if recording.is_job else ("train", "eval")
+    moments = chain(measures(recording), *(episodes(recording, phase) for phase in phases))
+    metrics = (
+        Metric(_name(name, names), value, round((began + moment.seconds) * 1000), moment.step)
+        for moment in moments
+        for name, value in moment.by_phase.items()
+    )
+    written = 0
+    while batch := list(islice(metrics, _MAX_METRICS)):
+        client.log_batch(run_id, batch)
+        written += len(batch)
+        end = max(end, *(metric.timestamp / 1000 for metric in batch))
+    return written, end
 
 
-def _short(name: str) -> str:
-    return repr(name if len(name) <= _TOLD else f"{name[: _TOLD - 1]}…")
-
-
-def _digest(recording: Recording) -> str:
-    return recording.result.content_digest or ""
-
-
-def _tags(recording: Recording) -> dict[str, str]:
-    run = recording.run
+def tags_of(recording: Recording) -> dict[str, str]:
+    """Return the tags of a run."""
     return {
         "mlflow.runName": recording.title,
         "mlflow.source.name": "dualtaxi",
         "mlflow.user": "",
-        RUN_TAG: run["run_id"],
-        DIGEST_TAG: _digest(recording),
-        "dualtaxi.job": run["job"],
-        **({} if recording.seed is None else {"dualtaxi.seed": run["seed"]}),
+        RUN_TAG: recording.run_id,
+        DIGEST_TAG: recording.result.content_digest or "",
+        "dualtaxi.job": recording.run["job"],
+        **({} if recording.seed is None else {"dualtaxi.seed": str(recording.seed)}),
         "dualtaxi.status": recording.status,
     }
 
 
+def _name(name: str, names: dict[str, str]) -> str:
+    """Return a name that MLflow allows, distinct from the others in `names`, to which it is added."""
+    if name not in names:
+        parts = _REFUSED.sub("_", name)[:_MAX_NAME].split("/")
+        allowed = "/".join(part if part.strip(". ") else "_" for part in parts)
+        candidates = chain([allowed], (f"{allowed}_{number}" for number in count(2)))
+        taken = set(names.values())
+        names[name] = next(candidate for candidate in candidates if candidate not in taken)
+    return names[name]
+
+
+def _short(name: str) -> str:
+    return repr(name if len(name) <= _MAX_SHOWN else f"{name[: _MAX_SHOWN - 1]}…")
+
+
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep MLflow's own notices from the user's terminal."""
+    """Suppress MLflow's own notices."""
     loggers = [logging.getLogger(name) for name in ("mlflow", "alembic")]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():

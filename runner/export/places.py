@@ -1,4 +1,4 @@
-"""Where an export goes: a file or folder that is there when it is whole, and replaces another if asked."""
+"""Files and folders that an export writes: they appear complete, and replace others only if allowed."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from runner.errors import RunnerError, StorageError
-from runner.util.extras import require
 from runner.util.files import replacing, storage_errors
 
 
 def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
-    """Have a file written beside its place, and put there when it is whole.
+    """Call `write` with a temporary path next to `path`, then move that file there.
 
     Raises:
-        RunnerError: there is one already and `force` is not given.
+        RunnerError: there is a file already and `force` is not set.
         StorageError: it cannot be written.
     """
     require_new(path, force)
@@ -27,15 +26,15 @@ def write_new(path: Path, force: bool, write: Callable[[Path], object]) -> None:
             path.parent.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
             raise StorageError(f"{path}: {path.parent} is a file, expected a folder.") from error
-        with replacing(path) as fresh:
-            write(fresh)
+        with replacing(path) as temporary:
+            write(temporary)
 
 
 def require_new(path: Path, force: bool) -> None:
     """Refuse a path at which no file may be written.
 
     Raises:
-        RunnerError: it is a folder, or there is a file already and `force` is not given.
+        RunnerError: it is a folder, or there is a file already and `force` is not set.
     """
     if path.is_dir():
         raise RunnerError(f"{path}: found a folder, expected a file to write.")
@@ -45,60 +44,46 @@ def require_new(path: Path, force: bool) -> None:
 
 def write_text_new(path: Path, force: bool, text: str) -> None:
     """Write text to a file, as `write_new` does."""
-
-    def write(fresh: Path) -> None:
-        fresh.write_text(text, encoding="utf-8")
-
-    write_new(path, force, write)
+    write_new(path, force, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 @contextlib.contextmanager
-def new_folder(path: Path, force: bool, ours: Sequence[str]) -> Iterator[Path]:
-    """Give a hidden folder beside a place; put it there when all went well.
+def new_folder(path: Path, force: bool, patterns: Sequence[str]) -> Iterator[Path]:
+    """Yield a hidden folder next to `path`, which becomes `path` if the block succeeds.
 
     Args:
-        path: the place.
-        force: replace a folder that is there, if it holds nothing but files of ours.
-        ours: patterns of the paths of the files that the export writes.
+        path: the folder to create.
+        force: whether an existing folder is replaced if it holds nothing but exported files.
+        patterns: of the relative paths of exported files.
 
     Raises:
-        RunnerError: something is there and is not to be replaced.
+        RunnerError: something exists that must not be replaced.
         StorageError: the folder cannot be written.
     """
-    _check_place(path, force, ours)
-    fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    if path.exists():
+        _require_replaceable(path, force, patterns)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     old = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
         with storage_errors(path):
-            fresh.mkdir(parents=True)
-            yield fresh
+            temporary.mkdir(parents=True)
+            yield temporary
             if path.exists():
                 path.rename(old)
-            fresh.rename(path)
+            temporary.rename(path)
     finally:
-        for folder in (fresh, old):
+        for folder in (temporary, old):
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _check_place(path: Path, force: bool, ours: Sequence[str]) -> None:
-    if not path.exists():
-        return
+def _require_replaceable(path: Path, force: bool, patterns: Sequence[str]) -> None:
     if not path.is_dir():
-        raise RunnerError(f"{path}: found a file, expected a place for a folder; choose another by -o.")
+        raise RunnerError(f"{path}: found a file, expected a folder; choose another by -o.")
     if not force:
         raise RunnerError(f"{path}: exists already; --force replaces it, or choose another by -o.")
     for file in path.rglob("*"):
         name = file.relative_to(path).as_posix()
-        if not file.is_dir() and not any(fnmatch.fnmatchcase(name, pattern) for pattern in ours):
+        if not file.is_dir() and not any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns):
             raise RunnerError(
                 f"{path}: holds {name}, which no export wrote; --force leaves such a folder alone."
             )
-
-
-def require_pyarrow(purpose: str) -> None:
-    """Raise an error that says what is missing, if what writes tables is not installed.
-
-    Raises:
-        MissingExtra: it is not.
-    """
-    require("pyarrow", extra="archive", purpose=purpose)

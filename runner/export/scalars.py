@@ -1,34 +1,39 @@
-"""A run's measures as named numbers over training steps: what metric stores and spreadsheets take.
+"""A run's metrics as named numbers over training steps: what metric stores and spreadsheets take.
 
     train/mean_length, train/percent_filled/taxi_1, train/reward_counts/-1, train/epsilon, ...
     eval/success_percent, eval/mean_return/taxi_1, eval/events/taxi_1.drop_off, eval/training/epsilon, ...
     eval/exact/value/taxi_1, eval/exact/optimal_value, ... with `evaluation: {exact: true}`
-    train/logged/loss, ... what somebody's own loop logged
+    train/logged/loss, ... logged by a loop
     train/episode/length, train/episode/return/taxi_1, ... of each episode: in TensorBoard; of loops in MLflow
 
-What is unknown (a mean over no episode, success where the environment does not say what it is) is left
-out, so every number is one that was recorded, unchanged.
+Unknown values (a mean over no episode, success where the environment does not define it) are left out, so
+every number is one that was recorded, unchanged.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import Any, Final
 
 from runner.errors import RecordingError
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
-from runner.recording.schema import EVAL_EPISODE, SCALAR_TOPIC, STEP_NANOSECONDS, TRAIN_EPISODE
+from runner.recording.schema import PHASES, SCALAR_TOPIC, STEP_NANOSECONDS
 
-_OF_TRAINING = ("mean_length", "zero_cells", "percent_filled", "epsilon", "step_size", "discount")
-_EXACT = {
+_TRAINING: Final = ("mean_length", "zero_cells", "percent_filled", "epsilon", "step_size", "discount")
+_EVALUATION: Final = {
+    **{name: name for name in ("trials", "successes", "terminations")},
+    **{metric.name: metric.field for metric in METRICS},
+}
+_EXACT: Final = {
     **{name: name for name in ("success_percent", "timeout_percent", "mean_length", "mean_penalties")},
-    **{"mean_returns": "mean_return", "values": "value", "best_responses": "best_response"},
+    **{"mean_return": "mean_returns", "value": "values", "best_response": "best_responses"},
     **{f"optimal_{name}": f"optimal_{name}" for name in ("value", "success_percent", "mean_length")},
 }
+"""Name to field of a message, for each kind of metrics."""
 
 
 @dataclass(frozen=True)
@@ -42,42 +47,50 @@ class Measures:
     step: int
     """Training steps taken."""
     episode: int
-    """Training episodes done; with what a loop logged in evaluation, episodes of evaluation."""
+    """Training episodes finished; for values that a loop logged in evaluation, episodes of evaluation."""
     values: Mapping[str, float]
     """By name, without the phase."""
 
+    @property
+    def seconds(self) -> float:
+        """The logical time in seconds."""
+        return self.position * STEP_NANOSECONDS / 1e9
+
+    @property
+    def by_phase(self) -> dict[str, float]:
+        """The values by name, with the phase: `train/epsilon`."""
+        return {f"{self.phase}/{name}": value for name, value in self.values.items()}
+
 
 def measures(recording: Recording) -> Iterator[Measures]:
-    """Yield the reports of training, the evaluations, their exact measures, and what a loop logged, in order.
+    """Yield the reports of training, the evaluations, their exact metrics, and the values logged by a loop.
 
     Raises:
         RecordingError: the recording is damaged.
     """
-    agents, events = recording.agents, recording.event_names
-    for phase in ("train", "eval"):
-        for metrics in recording.iter_metrics(phase):
-            values = training_values(metrics, agents)
+    agents, exact_values = recording.agents, {f"exact/{name}": field for name, field in _EXACT.items()}
+    for phase in PHASES:
+        for row in recording.iter_metrics(phase):
+            values = _named(row, {name: name for name in _TRAINING}, agents)
+            rewards = zip(row["rewards"], row["reward_counts"], strict=True)
+            values |= {f"reward_counts/{reward:g}": float(count) for reward, count in rewards}
             if phase == "eval":
-                values = evaluation_values(metrics, agents, events) | {
-                    f"training/{name}": value for name, value in values.items()
-                }
-            position = metrics["log_time"] // STEP_NANOSECONDS
-            yield Measures(phase, position, metrics["step"], metrics["episode"], values)
-    for exact in recording.optimality():
-        position = exact["log_time"] // STEP_NANOSECONDS
-        yield Measures("eval", position, exact["step"], exact["episode"], exact_values(exact, agents))
+                training = {f"training/{name}": value for name, value in values.items()}
+                names = dict(_EVALUATION)
+                if row["successes"] < 0:  # the environment does not define success
+                    del names["successes"]
+                events = _named(row, {"events": "events"}, recording.event_names)
+                values = _named(row, names, agents) | events | training
+            yield _measures(phase, row, values)
+    for row in recording.optimality():
+        yield _measures("eval", row, _named(row, exact_values, agents))
     if not recording.is_job:
-        yield from _logged(recording)
-
-
-def _logged(recording: Recording) -> Iterator[Measures]:
-    """Yield the finite numbers that a loop logged."""
-    for scalar in recording.decoded(SCALAR_TOPIC):
-        if math.isfinite(scalar["value"]):
-            position = scalar["log_time"] // STEP_NANOSECONDS
-            step = scalar["step"] if scalar["phase"] == "train" else position - scalar["step"]
-            values = {f"logged/{scalar['name']}": scalar["value"]}
-            yield Measures(scalar["phase"], position, step, scalar["episode"], values)
+        for scalar in recording.decoded(SCALAR_TOPIC):
+            if math.isfinite(scalar["value"]):
+                position, phase = scalar["log_time"] // STEP_NANOSECONDS, scalar["phase"]
+                step = scalar["step"] if phase == "train" else position - scalar["step"]
+                values = {f"logged/{scalar['name']}": scalar["value"]}
+                yield Measures(phase, position, step, scalar["episode"], values)
 
 
 def episodes(recording: Recording, phase: str) -> Iterator[Measures]:
@@ -86,74 +99,47 @@ def episodes(recording: Recording, phase: str) -> Iterator[Measures]:
     Raises:
         RecordingError: the recording is damaged.
     """
-    names = [f"episode/return/{agent}" for agent in recording.agents]
-    topic = TRAIN_EPISODE if phase == "train" else EVAL_EPISODE
-    for block in recording.blocks(topic):
+    names = ["episode/length", *(f"episode/return/{agent}" for agent in recording.agents)]
+    for block in recording.blocks(PHASES[phase][1]):
         columns = (
             block[field].tolist() for field in ("log_time", "episode", "last_step", "length", "returns")
         )
         for time, episode, last_step, length, returns in zip(*columns, strict=True):
             position = time // STEP_NANOSECONDS
             step = last_step + 1 if phase == "train" else position - last_step - 1
-            found = {"episode/length": float(length), **dict(zip(names, returns, strict=True))}
-            finite = {name: value for name, value in found.items() if math.isfinite(value)}
-            yield Measures(phase, position, step, episode, finite)
-
-
-def training_values(metrics: Mapping[str, Any], agents: Sequence[str]) -> dict[str, float]:
-    """Return how training stood, by name."""
-    values: dict[str, float] = {}
-    for name in _OF_TRAINING:
-        values |= _named(name, metrics[name], agents)
-    pairs = zip(metrics["rewards"], metrics["reward_counts"], strict=True)
-    return values | {f"reward_counts/{reward:g}": float(count) for reward, count in pairs}
-
-
-def evaluation_values(
-    metrics: Mapping[str, Any], agents: Sequence[str], events: Sequence[str]
-) -> dict[str, float]:
-    """Return what came of an evaluation, by name."""
-    values: dict[str, float] = {}
-    for name in ("trials", "successes", "terminations"):
-        if name != "successes" or metrics[name] >= 0:
-            values |= _named(name, metrics[name], agents)
-    for metric in METRICS:
-        values |= _named(metric.name, metrics[metric.field], agents)
-    return values | _named("events", metrics["events"], events)
-
-
-def exact_values(exact: Mapping[str, Any], agents: Sequence[str]) -> dict[str, float]:
-    """Return the exact measures of a greedy policy, by name."""
-    values: dict[str, float] = {}
-    for field, name in _EXACT.items():
-        values |= _named(f"exact/{name}", exact[field], agents)
-    return values
+            values = zip(names, [float(length), *returns], strict=True)
+            yield Measures(phase, position, step, episode, _finite(values))
 
 
 def created(recording: Recording) -> float:
     """Return when the run began, in seconds since 1970.
 
     Raises:
-        RecordingError: it says no time.
+        RecordingError: the recording holds no such time.
     """
     try:
         return datetime.fromisoformat(recording.created).timestamp()
     except (ValueError, OverflowError) as error:
         raise RecordingError(
-            f"{recording.path}: found {recording.created!r}, expected the time it was made."
+            f"{recording.path}: found {recording.created!r}, expected the time it was created."
         ) from error
 
 
-def seconds_of(position: int) -> float:
-    """Return logical time in seconds."""
-    return position * STEP_NANOSECONDS / 1e9
+def _measures(phase: str, row: Mapping[str, Any], values: Mapping[str, float]) -> Measures:
+    return Measures(phase, row["log_time"] // STEP_NANOSECONDS, row["step"], row["episode"], values)
 
 
-def _named(name: str, value: Any, owners: Sequence[str]) -> dict[str, float]:
-    """Return one number, or one for each owner; what is unknown is left out."""
-    found = (
-        {f"{name}/{owner}": float(part) for owner, part in zip(owners, value, strict=True)}
-        if isinstance(value, list)
-        else {name: float(value)}
-    )
-    return {key: number for key, number in found.items() if math.isfinite(number)}
+def _named(row: Mapping[str, Any], fields: Mapping[str, str], owners: Sequence[str]) -> dict[str, float]:
+    """Return the known values of fields by name; a list has a value for each owner, `NAME/OWNER`."""
+    values: dict[str, float] = {}
+    for name, field in fields.items():
+        if isinstance(value := row.get(field), list):
+            parts = zip(owners, value, strict=True)
+            values |= _finite((f"{name}/{owner}", float(part)) for owner, part in parts)
+        elif value is not None:
+            values |= _finite([(name, float(value))])
+    return values
+
+
+def _finite(values: Iterable[tuple[str, float]]) -> dict[str, float]:
+    return {name: value for name, value in values if math.isfinite(value)}

@@ -19,6 +19,7 @@ from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.errors import RunnerError
 from runner.recording.reader import open_recording
 from runner.service.errors import Refused
+from runner.util.extras import require
 from runner.util.values import finite
 
 if TYPE_CHECKING:
@@ -145,9 +146,7 @@ def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
         MissingExtra: pyarrow is not installed.
         RecordingError: the recording cannot be read.
     """
-    from runner.export.places import require_pyarrow
-
-    require_pyarrow("Arrow")
+    require("pyarrow", extra="archive", purpose="Arrow")
     import pyarrow as pa
 
     with open_recording(path) as recording:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from runner.cli import Command
-from runner.cli.options import json_option, recordings_option, run_argument
+from runner.cli.options import force_option, json_option, output_option, recordings_option, run_argument
 from runner.cli.output import draw, facts, print_json, say
 from runner.cli.runs import find_recorded
 from runner.util.humanize import size
@@ -15,15 +15,9 @@ from runner.util.humanize import size
 
 @click.command("mcap", cls=Command)
 @run_argument
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="The file to write.  [default: NAME-RUN.mcap]",
-)
+@output_option("NAME-RUN.mcap")
 @click.option("--anonymous", is_flag=True, help="Leave out host, user, command line and folder.")
-@click.option("--force", is_flag=True, help="Replace the file if it exists.")
+@force_option
 @recordings_option
 @json_option
 def command(

@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 
 from runner.cli import Command
-from runner.cli.options import recordings_option, run_argument
+from runner.cli.commands.export import opened_run
+from runner.cli.options import force_option, recordings_option, run_argument
 from runner.cli.output import say
-from runner.cli.runs import find_recorded
 
 
 @click.command("mlflow", cls=Command)
@@ -27,7 +27,7 @@ from runner.cli.runs import find_recorded
     "--experiment", default="dualtaxi", show_default=True, help="The experiment; created if it is missing."
 )
 @click.option("--with-recording", is_flag=True, help="Also store the recording as an artifact.")
-@click.option("--force", is_flag=True, help="Restore the run again, and replace what is there.")
+@force_option
 @recordings_option
 def command(
     run_name: str, tracking: str, experiment: str, with_recording: bool, force: bool, recordings: Path | None
@@ -41,19 +41,15 @@ def command(
       dualtaxi export mlflow k3v9m2xq --tracking-uri http://127.0.0.1:5000 --with-recording
     """
     from runner.cli.progress import stage_line
-    from runner.export.contents import shortcomings
     from runner.export.mlflow import export, require_packages
-    from runner.recording.reader import open_recording
 
     require_packages()
-    run = find_recorded(run_name, recordings)
-    with open_recording(run.recording) as recording:
-        with stage_line("writing to the store"):
-            done = export(recording, tracking, experiment, with_recording, force)
-        for note in (*shortcomings(recording), *done.notes):
-            say(note)
-    if done.already:
-        say("The run is there already with this content; nothing was written. --force writes it anew.")
+    with opened_run(run_name, recordings) as (_, recording), stage_line("writing to the store"):
+        result = export(recording, tracking, experiment, with_recording, force)
+    for note in result.notes:
+        say(note)
+    if result.exists:
+        say("The run is in the store already, with this content; nothing was written. --force replaces it.")
     click.echo(
-        f"{tracking}  experiment {experiment}, run {done.mlflow_run}, {done.metrics:,} metrics written"
+        f"{tracking}  experiment {experiment}, run {result.mlflow_run}, {result.metrics:,} metrics written"
     )

@@ -3,32 +3,38 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from runner.cli import Command
-from runner.cli.choosing import request_of, tell
-from runner.cli.options import EXPORTS, recordings_option, run_argument, selection_options
+from runner.cli.options import (
+    EXPORTS,
+    Ranges,
+    force_option,
+    output_option,
+    recordings_option,
+    run_argument,
+    selection_options,
+)
+from runner.cli.output import say
 from runner.cli.runs import find_recorded
 from runner.util.humanize import duration, size
+
+if TYPE_CHECKING:
+    from runner.export.rerun.selection import Selection
 
 
 @click.command("rerun", cls=Command)
 @run_argument
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(dir_okay=False, path_type=Path),
-    metavar="FILE.rrd",
-    help="The file to write.  [default: exports/NAME-RUN.rrd]",
-)
+@output_option("exports/NAME-RUN.rrd", "FILE.rrd")
 @selection_options
-@click.option("--force", is_flag=True, help="Replace the file if it exists.")
+@force_option
 @recordings_option
 def command(
     run_name: str,
     output: Path | None,
-    episodes: tuple[tuple[int, int | None], ...] | None,
+    episodes: Ranges | None,
     evaluations: tuple[int, ...] | None,
     every: int | None,
     everything: bool,
@@ -54,16 +60,27 @@ def command(
     from runner.recording.reader import open_recording
 
     require_rerun("export rerun")
+    from runner.export.rerun.selection import Request
     from runner.export.rerun.writing import Source, export
 
     started = time.monotonic()
     run = find_recorded(run_name, recordings)
     path = output or EXPORTS / f"{run.file_stem}.rrd"
     require_new(path, force)
-    request = request_of(episodes, evaluations, every, everything)
+    request = Request(episodes or (), evaluations or (), every or 0, everything)
     with open_recording(run.recording) as recording, compilation_notice(), stage_line("exporting"):
         source = Source(recording, f"{run.title} ({run.run_id})")
         (selection,) = export([source], request, path)
-    tell(selection)
+    print_selection(selection)
     took = duration(time.monotonic() - started)
     click.echo(f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}")
+
+
+def print_selection(selection: Selection) -> None:
+    """Print which steps are exported, and which are not."""
+    for warning in selection.warnings:
+        say(warning)
+    if selection.exported:
+        say("Exported: all metrics; " + "; ".join(selection.exported) + ".")
+    for left_out in selection.left_out:
+        say(f"Left out: {left_out}.")

@@ -1,4 +1,4 @@
-"""`dualtaxi export csv` and `export parquet`: steps, episodes and measures as tables."""
+"""`dualtaxi export csv` and `export parquet`: steps, episodes and metrics as tables."""
 
 from __future__ import annotations
 
@@ -6,35 +6,21 @@ from pathlib import Path
 
 import click
 
-from runner.cli.options import EXPORTS, RANGES, recordings_option, run_argument
+from runner.cli import Command
+from runner.cli.commands.export import opened_run
+from runner.cli.options import (
+    EXPORTS,
+    Ranges,
+    episodes_option,
+    force_option,
+    output_option,
+    recordings_option,
+    run_argument,
+)
 from runner.cli.output import say
 from runner.cli.progress import count_line
-from runner.cli.runs import find_recorded
+from runner.util.extras import require
 from runner.util.humanize import size
-
-Ranges = tuple[tuple[int, int | None], ...]
-
-_OPTIONS = (
-    run_argument,
-    click.option(
-        "-o",
-        "--output",
-        type=click.Path(path_type=Path),
-        metavar="FOLDER",
-        help="The folder to write.  [default: exports/NAME-RUN-FORM]",
-    ),
-    click.option(
-        "--phase", type=click.Choice(["train", "eval"]), help="Only the steps and episodes of this phase."
-    ),
-    click.option(
-        "--episodes",
-        type=RANGES,
-        metavar="RANGES",
-        help="Episodes of the phase (train unless given), such as 0:20,49980:50000.",
-    ),
-    click.option("--force", is_flag=True, help="Replace the folder if it exists."),
-    recordings_option,
-)
 
 
 def _command(form: str, text: str) -> click.Command:
@@ -49,48 +35,38 @@ def _command(form: str, text: str) -> click.Command:
         recordings: Path | None,
         gz: bool = False,
     ) -> None:
-        _export(form, run_name, output, phase, episodes, force, recordings, gz)
+        require("pyarrow", extra="archive", purpose=f"export {form}")
+        from runner.export.places import new_folder
+        from runner.export.tables import PATTERNS, left_out, write_tables
+
+        with opened_run(run_name, recordings, needs_steps=True) as (found, recording):
+            path = output or EXPORTS / f"{found.file_stem}-{form}"
+            total = (recording.result.train_steps or 0) + (recording.result.eval_steps or 0)
+            with new_folder(path, force, PATTERNS) as folder, count_line("steps", total) as report:
+                rows = write_tables(recording, folder, form, phase, episodes or (), gz, report)
+            if form == "csv" and (large := left_out(recording)):
+                say(f"Left out, as CSV cannot hold bytes: {', '.join(large)}; `export parquet` has them.")
+        for name, count in rows.items():
+            click.echo(f"{path / name}  {size((path / name).stat().st_size)}, {count:,} rows")
 
     run.__doc__ = text
-    options = [*_OPTIONS]
-    if form == "csv":
-        options.insert(-2, click.option("--gz", is_flag=True, help="Compress each file with gzip."))
-    for option in reversed(options):
+    phase_option = click.option(
+        "--phase",
+        type=click.Choice(["train", "eval"]),
+        help="Only steps and episodes of this phase; train if --episodes is given.",
+    )
+    gz_option = click.option("--gz", is_flag=True, help="Compress each file with gzip.")
+    for option in (
+        recordings_option,
+        force_option,
+        *([gz_option] if form == "csv" else []),
+        episodes_option,
+        phase_option,
+        output_option(f"exports/NAME-RUN-{form}", "FOLDER"),
+        run_argument,
+    ):
         run = option(run)
-    return click.command(form)(run)
-
-
-def _export(
-    form: str,
-    run_name: str,
-    output: Path | None,
-    phase: str | None,
-    episodes: Ranges | None,
-    force: bool,
-    recordings: Path | None,
-    gz: bool,
-) -> None:
-    from runner.export.contents import require_steps, shortcomings
-    from runner.export.places import new_folder, require_pyarrow
-
-    require_pyarrow(f"export {form}")
-    from runner.export.tables import OURS, Choice, left_out, write_tables
-    from runner.recording.reader import open_recording
-
-    run = find_recorded(run_name, recordings)
-    path = output or EXPORTS / f"{run.file_stem}-{form}"
-    choice = Choice(phase or ("train" if episodes else ""), episodes or ())
-    with open_recording(run.recording) as recording:
-        require_steps(recording, "export")
-        total = (recording.result.train_steps or 0) + (recording.result.eval_steps or 0)
-        with new_folder(path, force, OURS) as folder, count_line("steps", total) as report:
-            rows = write_tables(recording, folder, form, choice, gz, report)
-        for shortcoming in shortcomings(recording):
-            say(shortcoming)
-        if form == "csv" and (large := left_out(recording)):
-            say(f"Left out, as CSV cannot hold their bytes: {', '.join(large)}; `export parquet` has them.")
-    for name, count in rows.items():
-        click.echo(f"{path / name}  {size((path / name).stat().st_size)}, {count:,} rows")
+    return click.command(form, cls=Command)(run)
 
 
 csv: click.Command = _command(
@@ -98,8 +74,8 @@ csv: click.Command = _command(
     """Export RUN as CSV: steps.csv, episodes.csv and metrics.csv in a folder.
 
     Columns are named as the recording's fields; each agent's action and reward has its own. metrics.csv has
-    a row for each measure. Of a loop there are resets.csv and infos.csv too, and each number of an
-    observation or action has a column. Numbers are written so that they read back as they were.
+    a row for each value of a metric. A loop has resets.csv and infos.csv too, and a column for each number of
+    an observation or action. Numbers are written with all their digits.
 
     Examples:
       dualtaxi export csv @latest

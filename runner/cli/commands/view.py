@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import Command
-from runner.cli.choosing import request_of, tell
+from runner.cli.commands.export_rerun import print_selection
 from runner.cli.options import PICTURE_SIZE, STEP, RunName, recordings_option, selection_options
 from runner.cli.output import say
 from runner.cli.runs import find_recorded
@@ -92,10 +92,11 @@ def view_command(
     if screenshot is not None:
         require_new(screenshot, force)
     runs = [find_recorded(name, recordings) for name in run_names]
-    request = request_of(episodes, evaluations, every, everything)
     with stage_line("loading Rerun") as stage:
-        from runner.export.rerun.selection import locate, locate_divergence
+        from runner.export.rerun.selection import Request, locate, locate_divergence
         from runner.export.rerun.writing import cached_export
+
+        request = Request(episodes or (), evaluations or (), every or 0, everything)
 
         divergence = None
         if len(runs) == 2 and step is None:
@@ -112,7 +113,7 @@ def view_command(
         with compilation_notice():
             path, selections = cached_export(runs, location.request)
     for selection in selections:
-        tell(selection)
+        print_selection(selection)
     _show(path, location, web, port, screenshot, picture_size)
 
 

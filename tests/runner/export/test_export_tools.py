@@ -142,7 +142,7 @@ def test_tables_of_chosen_episodes(export, taxis):
 def test_minari_reads_the_episodes(export, taxis, phase, monkeypatch):
     import minari
 
-    monkeypatch.setattr("runner.export.minari._AT_ONCE", 7)
+    monkeypatch.setattr("runner.export.minari._BATCH", 7)
     told = export("minari", taxis.recording, "--phase", phase)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("exports/minari").absolute()))
     dataset = minari.load_dataset(f"taxis-{taxis.run_id}-v0")

@@ -11,7 +11,7 @@ from runner.analysis.compare.sections import unpaired
 from runner.analysis.groups import groups_of
 from runner.analysis.series import read_series
 from runner.errors import RunNotFound
-from runner.export.mlflow import _tags
+from runner.export.mlflow import tags_of
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from tests.runner.loops.making import make, play
@@ -30,7 +30,7 @@ def test_a_recording_is_titled_by_its_seed_only_if_it_has_one(tmp_path):
         run = loop(tmp_path, seed)
         with open_recording(run.recording) as recording:
             assert (recording.seed, recording.title, run.title) == (seed, title, title)
-            tags = _tags(recording)
+            tags = tags_of(recording)
             assert tags["mlflow.runName"] == title
             assert ("dualtaxi.seed" in tags) == (seed is not None)
 

@@ -1,0 +1,223 @@
+"""The episodes of a run as Minari stores them: with one more observation than steps, that of the reset.
+
+Steps are read a block at a time; an episode is yielded when it has ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.export.contents import Ranges
+from runner.recording import schema
+from runner.recording.reader import Recording
+
+MAX_EPISODE_BYTES: Final = 1 << 30
+"""The limit of one episode, which Minari needs in memory."""
+Steps = NDArray[np.void] | list[dict[str, Any]]
+"""Records of one size, or mappings where values vary in size."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """The T steps of an episode that ended; observations and actions are nested as their spaces."""
+
+    observations: Any
+    """T + 1 of them."""
+    actions: Any
+    rewards: NDArray[np.float64]
+    """[T, agents]."""
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    acted: NDArray[np.uint32] | None = None
+    """[T]: bit i, whether agent i took part; None in a job, where all do."""
+    seed: int | None = None
+    """That of its reset, if it had one."""
+
+    @property
+    def is_abandoned(self) -> bool:
+        """Whether it was reset before its end."""
+        return not (self.terminated[-1] or self.truncated[-1])
+
+
+def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Episode]:
+    """Yield the episodes of a phase that ended, in these ranges.
+
+    An episode of a loop is left out if a repair lost steps of it or the observation of its reset.
+
+    Raises:
+        RecordingError: one is too large, or the recording is damaged.
+    """
+    if recording.is_job:
+        yield from _job_episodes(recording, phase, ranges)
+        return
+    lengths: dict[int, int] = {}
+    """The lengths of the episodes, by the number of their last step."""
+    for start, stop in ranges:
+        for block in recording.blocks(recording.topic(f"/{phase}/episode"), start, stop):
+            lengths |= zip(block["last_step"].tolist(), block["length"].tolist(), strict=True)
+    if not lengths:
+        return
+    resets = _Resets(recording, phase)
+    steps_of = _variable_steps if recording.kind == "variable" else _fixed_steps
+    for environment, steps in steps_of(recording, phase, lengths):
+        seed, first = resets.before(environment, steps)
+        resets.keep_last(environment, steps[-1])
+        if lengths.get(int(steps[-1]["step"])) == len(steps):
+            if recording.kind == "step":
+                yield _discrete_episode(recording, steps, seed)
+            elif first is not None:
+                yield _episode(recording, steps, first, seed)
+
+
+def _job_episodes(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Episode]:
+    for start, stop in ranges:
+        rest = np.empty(0, recording.dtypes[schema.PHASES[phase][0]])
+        for block in recording.blocks_of_episodes(phase, start, stop):
+            steps = np.concatenate([rest, block])
+            ends = np.flatnonzero(steps["terminated"] | steps["truncated"]) + 1
+            *whole, rest = np.split(steps, ends)
+            for episode in whole:
+                states = np.append(episode["state"], episode["next_state"][-1:]).astype(np.int64)
+                actions = episode["action"].astype(np.int64)
+                outcomes = (episode["rewards"], episode["terminated"], episode["truncated"])
+                yield Episode(states, actions, *outcomes)
+
+
+class _Resets:
+    """The seed and the observation that each episode begins with."""
+
+    def __init__(self, recording: Recording, phase: str) -> None:
+        self._has_observations = recording.kind != "step"
+        self._remaining = recording.resets(phase)
+        self._next = next(self._remaining, None)
+        self._read: dict[tuple[int, int], tuple[int | None, Any]] = {}
+        """By environment and episode."""
+        self._last: dict[int, Any] = {}
+
+    def before(self, environment: int, steps: Steps) -> tuple[int | None, Any]:
+        """Return seed and observation of the reset before steps, or None and the last observation."""
+        while self._next is not None and int(self._next["step"]) <= int(steps[0]["step"]):
+            reset = self._next
+            seed = int(reset["seed"]) if reset["seeded"] else None
+            key = int(reset["environment"]), int(reset["episode"])
+            self._read[key] = seed, _copy(reset["observation"])
+            self._next = next(self._remaining, None)
+        key = environment, int(steps[0]["episode"])
+        return self._read.pop(key, (None, self._last.get(environment)))
+
+    def keep_last(self, environment: int, step: Any) -> None:
+        """Keep the last observation of an environment, since an episode may continue after its end."""
+        if self._has_observations:
+            self._last[environment] = _copy(step["next_observation"])
+
+
+def _copy(value: Any) -> Any:
+    """Return a value that does not keep its block in memory."""
+    return value.copy() if isinstance(value, np.ndarray | np.void) else value
+
+
+def _fixed_steps(
+    recording: Recording, phase: str, lengths: Mapping[int, int]
+) -> Iterator[tuple[int, NDArray[np.void]]]:
+    """Yield environment and steps of each episode; the last one of an environment may not have ended."""
+    topic, n = recording.topic(f"/{phase}/step"), recording.environments
+    first = max(min(last - (length - 1) * n for last, length in lengths.items()), 0)
+    open_parts: dict[int, list[NDArray[np.void]]] = {environment: [] for environment in range(n)}
+    for block in recording.blocks(topic, first, max(lengths) + 1):
+        ended: list[tuple[int, NDArray[np.void]]] = []
+        for environment, parts in open_parts.items():
+            rows = block[(environment - int(block["step"][0])) % n :: n]
+            rows = rows[rows["t"] != schema.NEVER] if n > 1 else rows
+            for part in np.split(rows, np.flatnonzero(np.diff(rows["episode"])) + 1):
+                ended += ((environment, steps) for steps in _extend(recording, parts, part))
+        yield from sorted(ended, key=lambda found: int(found[1]["step"][-1]))
+    yield from ((environment, np.concatenate(parts)) for environment, parts in open_parts.items() if parts)
+
+
+def _extend(
+    recording: Recording, parts: list[NDArray[np.void]], part: NDArray[np.void]
+) -> Iterator[NDArray[np.void]]:
+    """Add steps to the parts of the current episode; yield it if they belong to another one, or end it."""
+    if not len(part):
+        return
+    if parts and parts[-1]["episode"][-1] != part["episode"][0]:
+        yield np.concatenate(parts)
+        parts.clear()
+    parts.append(part.copy())
+    if sum(one.nbytes for one in parts) > MAX_EPISODE_BYTES:
+        raise RecordingError(
+            f"{recording.path}: episode {part['episode'][0]} has more than {MAX_EPISODE_BYTES:,} bytes, "
+            "which Minari would hold at once; choose others by --episodes, or export parquet."
+        )
+    if part["terminated"][-1] or part["truncated"][-1]:
+        yield np.concatenate(parts)
+        parts.clear()
+
+
+def _variable_steps(
+    recording: Recording, phase: str, lengths: Mapping[int, int]
+) -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """Yield the steps of each episode of the only environment."""
+    for _, group in groupby(recording.transitions(phase), key=lambda step: step["episode"]):
+        steps = list(group)
+        yield 0, steps
+        if steps[-1]["step"] >= max(lengths):
+            return
+
+
+def _discrete_episode(recording: Recording, steps: Any, seed: int | None) -> Episode:
+    """Return an episode whose observations and actions are numbered from 0 in the recording."""
+    observed, acted = recording.spaces["observation"], recording.spaces["action"]
+    states = np.append(steps["state"], steps["next_state"][-1:]).astype(np.int64)
+    actions = steps["action"].astype(np.int64)
+    return Episode(states + observed["start"], actions + acted["start"], seed=seed, **_outcomes(steps))
+
+
+def _episode(recording: Recording, steps: Any, first: Any, seed: int | None) -> Episode:
+    """Return an episode of its steps and the observation of its reset."""
+    after, actions = _column(steps, "next_observation"), _column(steps, "action")
+    observed, acted = (recording.spaces[name] for name in ("observation", "action"))
+    if isinstance(after, list):
+        observations, taken = _collected(observed, [first, *after]), _collected(acted, actions)
+    else:
+        records = np.concatenate([np.array([first], after.dtype), after])
+        observations, taken = _split(observed, records), _split(acted, actions)
+    return Episode(observations, taken, seed=seed, **_outcomes(steps))
+
+
+def _outcomes(steps: Any) -> dict[str, Any]:
+    names = ("rewards", "terminated", "truncated", "acted")
+    return {name: np.array(_column(steps, name)) for name in names}
+
+
+def _column(steps: Any, name: str) -> Any:
+    if isinstance(steps, list):
+        return [step[name] for step in steps]
+    return steps[name] if name in steps.dtype.names else np.ones(len(steps), np.uint32)
+
+
+def _split(description: Mapping[str, Any], values: NDArray[Any]) -> Any:
+    """Return records as dictionaries and tuples of arrays."""
+    if description["type"] == "Dict":
+        return {name: _split(part, values[name]) for name, part in description["spaces"].items()}
+    if description["type"] == "Tuple":
+        return tuple(_split(part, values[str(i)]) for i, part in enumerate(description["spaces"]))
+    return np.ascontiguousarray(values)
+
+
+def _collected(description: Mapping[str, Any], values: Sequence[Any]) -> Any:
+    """Return single values as dictionaries and tuples of arrays and lists of texts."""
+    if description["type"] == "Dict":
+        parts = description["spaces"].items()
+        return {name: _collected(part, [value[name] for value in values]) for name, part in parts}
+    if description["type"] == "Tuple":
+        parts = enumerate(description["spaces"])
+        return tuple(_collected(part, [value[i] for value in values]) for i, part in parts)
+    return list(values) if description["type"] == "Text" else np.array(values)
