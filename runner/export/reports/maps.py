@@ -1,14 +1,14 @@
 """Policy and highest values of a run before, in the middle of and after learning, as maps.
 
-A map is about one situation: whatever does not move by itself stands as in the state the maps are made
+A map shows one situation: everything that does not move by itself is as in the state that the maps are made
 for (a passenger at G, a destination R).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,11 @@ from runner.errors import RecordingError
 from runner.recording.reader import Recording
 from runner.replay.tables import step_of_episode, tables_at
 
-Tables = list[NDArray[np.float64]]
+Values = NDArray[np.float64]
+Bounds = tuple[float, float]
+
+_HALFWAY: Final = 0.05
+"""Largest distance of a snapshot from half of the episodes to be called the middle, as a share of all."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +34,12 @@ class Stage:
     title: str
     episode: int
     step: int
-    tables: Tables
+    tables: list[Values]
 
 
 @dataclass(frozen=True)
 class MapRow:
-    """One kind of map at every stage, coloured alike."""
+    """One kind of map at every stage, with the same colours for the same values."""
 
     title: str
     explanation: str
@@ -45,36 +49,31 @@ class MapRow:
     high: float
 
 
-_HALFWAY: Final = 0.05
-"""How far from half of the episodes a snapshot may be, as a share of all, to be called the middle."""
-
-
 def stages_of(recording: Recording) -> list[Stage]:
     """Return the tables before, in the middle of and after learning; fewer where they are the same.
 
-    The middle is the snapshot nearest to half of the episodes; where there is none between the first and
-    the last, the steps up to there are replayed, if they were recorded.
+    The middle is the snapshot nearest to half of the episodes; without one between the first and the last,
+    the steps up to there are replayed, if they were recorded.
     """
-    learners = len(recording.agents)
     found: dict[int, Stage] = {}
     for table in recording.snapshots():
         stage = found.setdefault(table.step, Stage("", table.episode, table.step, []))
         stage.tables.append(table.values)
-    whole = [stage for stage in found.values() if len(stage.tables) == learners]
+    whole = [stage for stage in found.values() if len(stage.tables) == len(recording.agents)]
     if not whole:
         return []
     first, last = whole[0], whole[-1]
     half = (first.episode + last.episode) // 2
     between = sorted(whole[1:-1], key=lambda stage: abs(stage.episode - half))
     middle = between[0] if between else _replayed(recording, half)
-    stages = [first, *([middle] if middle else []), last]
-    titles = ["before learning", "during learning", "after learning"]
-    if middle and abs(middle.episode - half) <= _HALFWAY * (last.episode - first.episode):
-        titles[1] = "in the middle"
-    if recording.status != "finished":
-        titles[-1] = "at the last snapshot"
-    named = zip([titles[0], *([titles[1]] if middle else []), titles[-1]], stages, strict=True)
-    unique = {stage.step: Stage(f"{title}: {_after(stage)}", *_rest(stage)) for title, stage in named}
+    named = [("before learning", first)]
+    if middle:
+        is_half = abs(middle.episode - half) <= _HALFWAY * (last.episode - first.episode)
+        named.append(("in the middle" if is_half else "during learning", middle))
+    named.append(("after learning" if recording.status == "finished" else "at the last snapshot", last))
+    unique = {
+        stage.step: replace(stage, title=f"{title}: {stage.episode:,} episodes") for title, stage in named
+    }
     return list(unique.values())
 
 
@@ -83,29 +82,27 @@ def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[Stage], state: i
     if mdp.scene is None or mdp.scene_cells is None or not stages:
         return []
     movers = [i for i, thing in enumerate(mdp.scene["things"]) if thing["kind"] == "mover"]
-    rows = [
-        _pair_row(mdp, learners, stages, state, movers, i) for i in range(len(learners)) if len(movers) == 2
+    pairs = range(len(learners)) if len(movers) == 2 else ()
+    return [
+        *(_pair_row(mdp, learners, stages, state, movers, learner) for learner in pairs),
+        *(_policy_row(mdp, learners, stages, state, mover) for mover in movers),
     ]
-    return rows + [_policy_row(mdp, learners, stages, state, mover) for mover in movers]
 
 
 def situation(mdp: Mdp, state: int, free: Sequence[int]) -> NDArray[np.bool_]:
     """Return which states differ from one in nothing but the places of the free things, [S]."""
     assert mdp.scene_cells is not None
-    fixed = [i for i in range(mdp.scene_cells.shape[1]) if i not in free]
     carriers = mdp.scene_carriers if mdp.scene_carriers is not None else np.full(mdp.scene_cells.shape, -1)
-    alike = (carriers == carriers[state]).all(axis=1)
-    standing = [i for i in fixed if carriers[state, i] < 0]
-    return np.asarray(alike & (mdp.scene_cells[:, standing] == mdp.scene_cells[state, standing]).all(axis=1))
+    same_carriers = (carriers == carriers[state]).all(axis=1)
+    fixed = [i for i in range(mdp.scene_cells.shape[1]) if i not in free and carriers[state, i] < 0]
+    same_cells = (mdp.scene_cells[:, fixed] == mdp.scene_cells[state, fixed]).all(axis=1)
+    return np.asarray(same_carriers & same_cells)
 
 
 def situation_in_words(mdp: Mdp, state: int, free: Sequence[int]) -> str:
-    """Return what stands still in a situation: `passenger at G, destination R`."""
+    """Return what does not move in a situation: `passenger at G, destination R`."""
     words = str(states_in_words(mdp)[state]).split(", ")
     return ", ".join(word for i, word in enumerate(words) if i not in free)
-
-
-# --- inside -------------------------------------------------------------------------------------------
 
 
 def _replayed(recording: Recording, episode: int) -> Stage | None:
@@ -116,99 +113,85 @@ def _replayed(recording: Recording, episode: int) -> Stage | None:
         return None
 
 
-def _after(stage: Stage) -> str:
-    return f"{stage.episode:,} episodes"
-
-
-def _rest(stage: Stage) -> tuple[int, int, Tables]:
-    return stage.episode, stage.step, stage.tables
-
-
 def _pair_row(
     mdp: Mdp, learners: Sequence[str], stages: Sequence[Stage], state: int, movers: list[int], learner: int
 ) -> MapRow:
     """Return the highest value for each pair of cells of two movers."""
     assert mdp.scene is not None
     assert mdp.scene_cells is not None
-    cells = mdp.scene["rows"] * mdp.scene["columns"]
+    scene, cells = mdp.scene, mdp.scene["rows"] * mdp.scene["columns"]
     states = np.flatnonzero(situation(mdp, state, movers))
-    at = mdp.scene_cells[states][:, movers]
+    places = tuple(mdp.scene_cells[states][:, movers].T)
     grids = []
     for stage in stages:
         values = np.full((cells, cells), np.nan)
-        values[at[:, 0], at[:, 1]] = _highest(stage.tables[learner][states])
+        values[places] = _highest(stage.tables[learner][states])
         grids.append(values)
-    bounds = _bounds(grids)
-    one, other = (mdp.scene["things"][mover]["label"] for mover in movers)
+    one, other = (scene["things"][mover]["label"] for mover in movers)
     whose = "" if len(learners) == 1 else f" of {spoken(learners[learner])}"
-    title = f"Highest Q-value{whose} for every pair of places"
-    fixed = situation_in_words(mdp, state, movers)
-    told = (
-        f"Large square: where {one} is. In it the grid again: where {other} is. "
-        "Grey: all actions are worth the same." + (f" Situation: {fixed}." if fixed else "")
+    return _row(
+        f"Highest Q-value{whose} for every pair of places",
+        f"Large square: the place of {one}. In it the grid again: the place of {other}. Grey: all actions "
+        "have the same value.",
+        situation_in_words(mdp, state, movers),
+        stages,
+        grids,
+        lambda i, bounds, title: pair_map(scene, grids[i], bounds, title),
     )
-    svgs = [
-        (stage.title, pair_map(mdp.scene, grid, bounds, f"{title}, {stage.title}; {_span(grid)}"))
-        for stage, grid in zip(stages, grids, strict=True)
-    ]
-    return MapRow(title, told, tuple(svgs), *bounds)
 
 
 def _policy_row(mdp: Mdp, learners: Sequence[str], stages: Sequence[Stage], state: int, mover: int) -> MapRow:
-    """Return the greedy action of one mover in each cell, all others standing still."""
+    """Return the greedy action and the highest value of one mover in each cell."""
     assert mdp.scene is not None
     assert mdp.scene_cells is not None
-    thing = mdp.scene["things"][mover]
+    scene, cells = mdp.scene, mdp.scene["rows"] * mdp.scene["columns"]
+    thing = scene["things"][mover]
     agent = mdp.agents.index(thing["agent"]) if thing.get("agent") in mdp.agents else 0
-    learner = agent if len(learners) > 1 else 0
+    is_joint = len(learners) == 1
     states = np.flatnonzero(situation(mdp, state, [mover]))
-    at = mdp.scene_cells[states, mover]
-    made = [_best(mdp, stage.tables[learner], states, at, agent, len(learners) == 1) for stage in stages]
-    bounds = _bounds([values for values, _ in made])
-    fixed = situation_in_words(mdp, state, [mover])
-    title = f"What {thing['label']} would do, and the highest Q-value"
-    told = "Arrow: the greedy action in that cell. Grey: all actions are worth the same there." + (
-        f" Situation: {fixed}." if fixed else ""
+    places = mdp.scene_cells[states, mover]
+    grids, policies = [], []
+    for stage in stages:
+        rows = stage.tables[0 if is_joint else agent][states]
+        values = np.full(cells, np.nan)
+        values[places] = _highest(rows)
+        greedy: list[int | None] = [None] * cells
+        for cell, best in zip(places.tolist(), rows.argmax(axis=1).tolist(), strict=True):
+            if not np.isnan(values[cell]):
+                greedy[cell] = int(np.unravel_index(best, mdp.action_counts)[agent]) if is_joint else best
+        grids.append(values)
+        policies.append(greedy)
+    return _row(
+        f"Greedy actions of {thing['label']}, and the highest Q-value",
+        "Arrow: the greedy action in that cell. Grey: all actions have the same value there.",
+        situation_in_words(mdp, state, [mover]),
+        stages,
+        grids,
+        lambda i, bounds, title: policy_map(scene, grids[i], policies[i], bounds, title),
     )
-    svgs = [
-        (
-            stage.title,
-            policy_map(mdp.scene, values, greedy, bounds, f"{title}, {stage.title}; {_span(values)}"),
-        )
-        for stage, (values, greedy) in zip(stages, made, strict=True)
-    ]
-    return MapRow(title, told, tuple(svgs), *bounds)
 
 
-def _best(
-    mdp: Mdp, table: NDArray[np.float64], states: NDArray[Any], at: NDArray[Any], agent: int, joint: bool
-) -> tuple[NDArray[np.float64], list[int | None]]:
-    """Return the highest value and the agent's greedy action in each cell."""
-    assert mdp.scene is not None
-    cells = mdp.scene["rows"] * mdp.scene["columns"]
-    values = np.full(cells, np.nan)
-    greedy: list[int | None] = [None] * cells
-    rows = table[states]
-    values[at] = _highest(rows)
-    for cell, row in zip(at.tolist(), rows, strict=True):
-        if row.max() > row.min():
-            best = int(row.argmax())
-            greedy[cell] = int(np.unravel_index(best, mdp.action_counts)[agent]) if joint else best
-    return values, greedy
+def _row(
+    title: str,
+    explanation: str,
+    fixed: str,
+    stages: Sequence[Stage],
+    grids: Sequence[Values],
+    draw: Callable[[int, Bounds, str], str],
+) -> MapRow:
+    """Return the maps of some grids of values, a grid for each stage, drawn by number, bounds and title."""
+    known = np.concatenate([grid[~np.isnan(grid)] for grid in grids])
+    bounds = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    svgs = []
+    for i, (stage, grid) in enumerate(zip(stages, grids, strict=True)):
+        span = "no action is preferred anywhere"
+        if not np.isnan(grid).all():
+            span = f"from {np.nanmin(grid):.4g} to {np.nanmax(grid):.4g}"
+        svgs.append((stage.title, draw(i, bounds, f"{title}, {stage.title}; {span}")))
+    return MapRow(title, explanation + (f" Situation: {fixed}." if fixed else ""), tuple(svgs), *bounds)
 
 
-def _highest(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the highest value of each row; nan where all are the same, so that nothing is preferred."""
+def _highest(rows: Values) -> Values:
+    """Return the highest value of each row; nan where all are the same, so that no action is preferred."""
     best = rows.max(axis=1)
     return np.where(best > rows.min(axis=1), best, np.nan)
-
-
-def _bounds(grids: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
-    known = np.concatenate([grid[~np.isnan(grid)] for grid in grids])
-    return (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
-
-
-def _span(values: NDArray[np.float64]) -> str:
-    if np.isnan(values).all():
-        return "nothing is preferred anywhere"
-    return f"from {np.nanmin(values):.4g} to {np.nanmax(values):.4g}"
