@@ -17,9 +17,9 @@ import pyarrow.parquet as pq
 from runner.archive import layout
 from runner.archive.columns import Shape, shape_of
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
-from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
-from runner.recording.metadata import check_run, environment_description, environment_of, json_object, kind_of
+from runner.recording.description import RunDescription
+from runner.recording.metadata import check_run, json_object
 from runner.recording.records import UNPACKED_A_BYTE
 from runner.recording.schema import Topic
 from runner.util.files import open_regular
@@ -32,7 +32,7 @@ _ROW_BYTES: Final = 88
 """The size of a step in a recording."""
 
 
-class Archive:
+class Archive(RunDescription):
     """An archive in a folder.
 
     Args:
@@ -43,6 +43,7 @@ class Archive:
     """
 
     def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
         self.folder = folder
         path = folder / layout.MANIFEST
         try:
@@ -75,8 +76,7 @@ class Archive:
                 raise RecordingError(f"{path}: {hashes or sizes}: the archive is damaged there.")
 
     @cached_property
-    def metadata(self) -> dict[str, dict[str, str]]:
-        """The recording's metadata records, in order."""
+    def _metadata(self) -> dict[str, dict[str, str]]:
         try:
             records = {str(name): dict(entries) for name, entries in self._description["metadata"]}
             texts = [text for entries in records.values() for pair in entries.items() for text in pair]
@@ -105,32 +105,25 @@ class Archive:
     def _invalid(self, error: Exception) -> RecordingError:
         return RecordingError(f"{self.folder / layout.METADATA}: is invalid ({error!r}).")
 
-    @cached_property
-    def config(self) -> dict[str, Any]:
-        """The run's configuration."""
-        return json_object(
-            self.metadata.get("config", {}).get("json"), f"{self.folder}: the metadata 'config'"
-        )
+    def metadata(self, name: str) -> dict[str, str]:
+        """Return a metadata record's entries.
+
+        Raises:
+            RecordingError: there is none of that name.
+        """
+        if name not in self._metadata:
+            raise RecordingError(f"{self.folder}: has no metadata {name!r}.")
+        return self._metadata[name]
 
     @property
-    def kind(self) -> str:
-        """The kind of the run, one of `schema.KINDS`."""
-        return kind_of(self.metadata["run"])
-
-    @cached_property
-    def _environment(self) -> dict[str, Any]:
-        return environment_description(self.attachment(layout.ENVIRONMENT), str(self.folder))
-
-    @cached_property
-    def mdp(self) -> Mdp:
-        """The run's environment."""
-        return environment_of(self._environment, self.attachment, str(self.folder))
+    def metadata_names(self) -> list[str]:
+        """The names of the metadata records, in order."""
+        return list(self._metadata)
 
     @cached_property
     def shape(self) -> Shape:
         """The shape of the run, which determines its tables."""
-        tabular = self.kind in ("job", "step") and bool(self._environment["arrays"])
-        return shape_of(self.metadata["run"], self.mdp if tabular else None, str(self.folder))
+        return shape_of(self.run, self.mdp if self.tabular else None, str(self.folder))
 
     def attachment(self, name: str) -> bytes:
         """Return the data of an attachment.

@@ -58,7 +58,7 @@ def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: 
     archive = Archive(folder)
     archive.check_files()
     try:
-        with storage_errors(path), RecordingFile(path, schema.KINDS[archive.kind]) as file:
+        with storage_errors(path), RecordingFile(path, archive.topics) as file:
             _Restoring(archive, file, report).restore()
         with open_recording(path):  # what cannot be read is not restored
             pass
@@ -98,7 +98,7 @@ class _Restoring:
         self._pipeline = Pipeline(file, packing, lambda: None)
         self._batches = MessageBatches(self._send)
         self._room = threading.Semaphore(_UNDER_WAY)
-        topics = schema.KINDS[archive.kind]
+        topics = archive.topics
         self._undigested = {topic: blake3() for topic in topics if not topic.digested}
         self._counts = {topic.name: 0 for topic in topics}
         self._steps_done = 0
@@ -115,22 +115,23 @@ class _Restoring:
         self._pipeline.raise_failure()
         self._compare()
         if self._file is not None:
-            result = self._archive.metadata.get("result")
+            names = self._archive.metadata_names
+            result = self._archive.metadata("result") if "result" in names else None
             self._file.finish("" if result is None else "result", result)
 
     def _describe(self) -> None:
         if self._file is None:
             return
-        for name, entries in self._archive.metadata.items():
+        for name in self._archive.metadata_names:
             if name != "result":
-                self._file.add_metadata(name, entries)
+                self._file.add_metadata(name, self._archive.metadata(name))
         for name, media_type in self._archive.attachments:
             self._file.add_attachment(name, media_type, self._archive.attachment(name))
 
     def _restore_table(self, table: Table) -> None:
         if table.topics[0] not in self._shape.sizes:
             self._restore_messages(table)
-        elif self._archive.kind == "job" and table.name == layout.STEPS:
+        elif self._archive.is_job and table.name == layout.STEPS:
             self._restore_learning(table)
         else:
             for topic, records in self._records(table):
@@ -138,7 +139,7 @@ class _Restoring:
 
     def _restore_learning(self, table: Table) -> None:
         """Restore the steps of a job, and the snapshots that they make."""
-        seed = int(self._archive.metadata["run"]["seed"])
+        seed = self._archive.seed or 0
         tables = DerivedTables(StepReplay(self._archive.config, self._archive.mdp, seed, self._where))
         visitor = SnapshotVisitor(tables, self._snapshots(), partial(self._restore_snapshot, tables))
         for topic, records in self._records(table):
@@ -189,7 +190,7 @@ class _Restoring:
         if not topic.digested:
             self._undigested[topic].update(message_record(topic, time, payload))
         self._batches.extend(topic, [time], [payload])
-        if topic.message is schema.IMAGE or self._archive.kind == "job":
+        if topic.message is schema.IMAGE or self._archive.is_job:
             self._batches.flush()
         self._count_steps(topic, 1)
 
@@ -260,7 +261,7 @@ def _packing_of(archive: Archive) -> Packing:
         RunnerError: its configuration makes no sense of it.
     """
     config = archive.config
-    if archive.kind == "job":
+    if archive.is_job:
         return from_mapping(config).recording.packing
     parts = json_object(json.dumps(config.get("recording")), f"{archive.folder}: 'recording' in its config")
     if parts.get("compression") != "zstd":

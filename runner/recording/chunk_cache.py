@@ -1,6 +1,6 @@
 """The records of an open recording: read, unpacked, compared with their checksums; the last few are kept.
 
-Reading is safe from several threads, so the chunks that come next are unpacked beside the one in use.
+Reading is safe from several threads, so the next chunks are unpacked while one is in use.
 """
 
 from __future__ import annotations
@@ -12,20 +12,23 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from typing import BinaryIO, Final
 
+from mcap.opcode import Opcode
+
 from runner.errors import RecordingError
+from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, first_channel, unpack_chunk
 from runner.recording.index import ChunkEntry
+from runner.recording.records import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
 
-_BYTES_KEPT: Final = 16 << 20
+_MAX_KEPT_BYTES: Final = 16 << 20
 _THREADS: Final = 2
 _AHEAD: Final = 4
-"""So many chunks are unpacked ahead of the one in use, if they are small."""
+"""The number of chunks that are unpacked before they are needed, if they are small."""
 _SMALL: Final = 8 << 20
-_OPCODE: Final = 6
 
 
 class RecordStore:
-    """Gives the bytes of records by their place.
+    """Reads records by their places.
 
     Args:
         stream: the file; closed with the store.
@@ -37,7 +40,7 @@ class RecordStore:
         self._path = path
         self._lock = threading.Lock()
         self._kept: OrderedDict[int, bytes] = OrderedDict()
-        self._bytes_kept = 0
+        self._kept_bytes = 0
 
     def close(self) -> None:
         """Close the file."""
@@ -45,13 +48,13 @@ class RecordStore:
             self._threads.shutdown(cancel_futures=True)
         self._stream.close()
 
-    def record(self, offset: int, length: int, most: int = MAX_CHUNK_BYTES) -> bytes:
-        """Return the bytes of a record, its head included.
+    def record(self, opcode: int, offset: int, length: int, max_bytes: int = MAX_CHUNK_BYTES) -> memoryview:
+        """Return the body of a record; its length includes the head.
 
         Raises:
-            RecordingError: it is cut off, larger than `most`, or the file cannot be read.
+            RecordingError: it is of another kind, cut off, larger than `max_bytes`, or cannot be read.
         """
-        if length > most:
+        if length > max_bytes:
             raise RecordingError(
                 f"{self._path}: the record at {offset} declares {length:,} bytes; too large to be ours."
             )
@@ -63,7 +66,43 @@ class RecordStore:
             raise RecordingError(f"{self._path}: cannot be read at {offset} ({error.strerror}).") from error
         if len(data) != length:
             raise RecordingError(f"{self._path}: the record at {offset} is cut off.")
-        return data
+        if RECORD_HEAD.unpack_from(data) != (opcode, length - RECORD_HEAD.size):
+            raise RecordingError(f"{self._path}: found another record at {offset} than the index says.")
+        return memoryview(data)[RECORD_HEAD.size :]
+
+    def metadata(self, name: str, offset: int, length: int) -> dict[str, str]:
+        """Return the entries of a metadata record.
+
+        Raises:
+            RecordingError: it cannot be read, or has another name.
+        """
+        try:
+            body = bytes(self.record(Opcode.METADATA, offset, length, MAX_METADATA_BYTES))
+            found, entries = metadata_of(body)
+        except UNREADABLE as error:
+            raise RecordingError(
+                f"{self._path}: the metadata {name!r} at {offset} cannot be read."
+            ) from error
+        if found != name:
+            raise RecordingError(f"{self._path}: found metadata {found!r} at {offset}, expected {name!r}.")
+        return entries
+
+    def attachment(self, name: str, offset: int, length: int) -> tuple[str, bytes]:
+        """Return an attachment's media type and data, after comparing its checksum.
+
+        Raises:
+            RecordingError: it cannot be read, is damaged, or has another name.
+        """
+        body = bytes(self.record(Opcode.ATTACHMENT, offset, length))
+        try:
+            found, media_type, data = attachment_of(body, offset)
+        except UNREADABLE as error:
+            raise RecordingError(f"{self._path}: the attachment at {offset} cannot be read.") from error
+        except RecordingError as error:
+            raise RecordingError(f"{self._path}: {error}.") from error
+        if found != name:
+            raise RecordingError(f"{self._path}: found attachment {found!r} at {offset}, expected {name!r}.")
+        return media_type, data
 
     def chunk(self, entry: ChunkEntry) -> bytes:
         """Return a chunk's message records, after comparing its checksum; keeps the last few.
@@ -82,43 +121,44 @@ class RecordStore:
         Raises:
             RecordingError: one is damaged.
         """
-        under_way: deque[tuple[ChunkEntry, Future[bytes] | None]] = deque()
+        pending: deque[tuple[ChunkEntry, Future[bytes] | None]] = deque()
         for k, entry in enumerate(entries):
             small = entry.uncompressed_size + entry.length <= _SMALL
             ahead = k > 1 and small and entry.offset not in self._kept
-            under_way.append((entry, self._threads.submit(self._unpacked, entry) if ahead else None))
-            if len(under_way) > _AHEAD:
-                yield self._taken(*under_way.popleft())
-        while under_way:
-            yield self._taken(*under_way.popleft())
+            pending.append((entry, self._threads.submit(self._unpacked, entry) if ahead else None))
+            if len(pending) > _AHEAD:
+                yield self._result(*pending.popleft())
+        while pending:
+            yield self._result(*pending.popleft())
 
     def first_channel(self, entry: ChunkEntry) -> int:
-        """Return the channel of a chunk's first message, where no index says it.
+        """Return the channel of a chunk's first message, where no index states it.
 
         Raises:
             RecordingError: it is damaged.
         """
-        return first_channel(self._body(entry), self._where(entry))
+        return first_channel(self.record(Opcode.CHUNK, entry.offset, entry.length), self._where(entry))
 
     @cached_property
     def _threads(self) -> ThreadPoolExecutor:
         return ThreadPoolExecutor(_THREADS, thread_name_prefix="unpack")
 
-    def _taken(self, entry: ChunkEntry, unpacked: Future[bytes] | None) -> bytes:
+    def _result(self, entry: ChunkEntry, unpacked: Future[bytes] | None) -> bytes:
         return self.chunk(entry) if unpacked is None else self._keep(entry, unpacked.result())
 
     def _keep(self, entry: ChunkEntry, records: bytes) -> bytes:
         """Keep what was unpacked last; little of it, unless it is one large chunk."""
-        self._bytes_kept += len(records) - len(self._kept.pop(entry.offset, b""))
+        self._kept_bytes += len(records) - len(self._kept.pop(entry.offset, b""))
         self._kept[entry.offset] = records
-        while self._bytes_kept > _BYTES_KEPT and len(self._kept) > 1:
-            self._bytes_kept -= len(self._kept.popitem(last=False)[1])
+        while self._kept_bytes > _MAX_KEPT_BYTES and len(self._kept) > 1:
+            self._kept_bytes -= len(self._kept.popitem(last=False)[1])
         return records
 
     def _unpacked(self, entry: ChunkEntry) -> bytes:
         where = self._where(entry)
+        body = self.record(Opcode.CHUNK, entry.offset, entry.length)
         try:
-            head, records = unpack_chunk(self._body(entry), where)
+            head, records = unpack_chunk(body, where)
         except RecordingError as error:
             raise RecordingError(f"{error}; `dualtaxi repair` mends it.") from error
         if head.uncompressed_size != entry.uncompressed_size:
@@ -126,12 +166,6 @@ class RecordStore:
                 f"{where}: declares {head.uncompressed_size} bytes, expected {entry.uncompressed_size}."
             )
         return records
-
-    def _body(self, entry: ChunkEntry) -> memoryview:
-        record = self.record(entry.offset, entry.length)
-        if record[0] != _OPCODE or int.from_bytes(record[1:9], "little") != entry.length - 9:
-            raise RecordingError(f"{self._where(entry)}: found no chunk of {entry.length} bytes there")
-        return memoryview(record)[9:]
 
     def _where(self, entry: ChunkEntry) -> str:
         return f"{self._path}: chunk at {entry.offset}"

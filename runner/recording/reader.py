@@ -1,16 +1,15 @@
-"""The lazy reader of a recording: opens by the index, reads in blocks, keeps nothing.
+"""The lazy reader of a recording: opens by the index, reads in blocks, keeps little in memory.
 
     with runner.open_recording("recordings/k3v9m2xq/recording.mcap") as recording:
         for block in recording.blocks(TRAIN_STEP):      # NumPy records, some thousands at a time
             print(block["rewards"].mean())
 
 A block is the file's own bytes seen through the dtype of `record_dtype`: no message is parsed one
-by one. It is the only way in which the rest of the project reads recordings.
+by one. All other parts of the project read recordings through it.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import stat
 from bisect import bisect_right
@@ -21,39 +20,28 @@ from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
 import numpy as np
-from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from runner.environments.mdp import Mdp
-from runner.errors import RecordingError, RunnerError
+from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
 from runner.recording.chunk_cache import RecordStore
 from runner.recording.chunks import MAX_CHUNK_BYTES
+from runner.recording.description import RunDescription
 from runner.recording.index import read_index
 from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
 from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
-from runner.recording.metadata import (
-    check_file,
-    environment_description,
-    environment_of,
-    json_object,
-    kind_of,
-    lost_ranges,
-    sizes_of,
-    spaces_of,
-)
-from runner.recording.records import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
-from runner.recording.run_file import Summary, parse_summary, run_title
+from runner.recording.metadata import check_file, sizes_of
+from runner.recording.run_file import run_title
 from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
 from runner.recording.topic_chunks import TopicChunks, chunks_by_topic
 
 MAX_EPISODE_BYTES: Final = 128 << 20
-"""The most that `episode_steps` gives as one array: some 1.5 million steps."""
+"""The most that `episode_steps` returns as one array: some 1.5 million steps."""
 MAX_METRICS: Final = 1 << 17
-"""The most that `metrics` gives as one list."""
+"""The most that `metrics` returns as one list."""
 _METRICS_BYTES: Final = 1 << 20
 
 M = TypeVar("M")
@@ -68,11 +56,11 @@ def open_recording(path: str | os.PathLike[str]) -> Recording:
     return Recording(Path(path))
 
 
-class Recording:
+class Recording(RunDescription):
     """A recording, opened; a context manager."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        super().__init__(path)
         try:
             if not stat.S_ISREG(path.stat().st_mode):  # to open a pipe would wait for its writer
                 raise RecordingError(f"{path}: cannot be read: it is no file.")
@@ -104,7 +92,7 @@ class Recording:
         """Close the file."""
         self._store.close()
 
-    # --- what the recording says of itself ------------------------------------------------------------
+    # --- the run --------------------------------------------------------------------------------------
 
     @property
     def finished(self) -> bool:
@@ -116,127 +104,38 @@ class Recording:
         """Bytes of the file."""
         return os.fstat(self._stream.fileno()).st_size
 
-    @cached_property
-    def run(self) -> dict[str, str]:
-        """The metadata record `run`: id, name, seed, job, creation, agents and more, as texts."""
-        return self.metadata("run")
-
-    @property
-    def run_id(self) -> str:
-        """The id of the run."""
-        return self.run["run_id"]
-
-    @property
-    def job(self) -> str:
-        """The identity of the run's job."""
-        return self.run["job"]
-
-    @property
-    def created(self) -> str:
-        """When the run began, in ISO format."""
-        return self.run["created"]
-
-    @property
-    def seed(self) -> int | None:
-        """The seed of the run's job; None for a loop without one."""
-        return None if self.run.get("seeded") == "false" else int(self.run["seed"])
-
-    @cached_property
-    def agents(self) -> tuple[str, ...]:
-        """The names of the learners: one table and one reward each."""
-        return tuple(map(str, json.loads(self.run["agents"])))
-
-    @property
-    def event_names(self) -> tuple[str, ...]:
-        """The names of the environment's events, which episodes count."""
-        return tuple(self.environment["event_names"])
-
-    @property
-    def title(self) -> str:
-        """What the run is called now, and its seed if it has one: `patient, seed 3`."""
-        return run_title(self.name, self.seed)
-
-    @cached_property
-    def lost(self) -> dict[str, list[list[int]]]:
-        """Messages that a repair could not save: topic to [first, behind the last] numbers; mostly none."""
-        if "repair" not in self._index.metadata:
-            return {}
-        return lost_ranges(self._json("repair"), str(self.path))
-
-    @cached_property
-    def config(self) -> dict[str, Any]:
-        """The resolved configuration, as `runner.config.from_mapping` takes it."""
-        return self._json("config")
-
-    @cached_property
-    def provenance(self) -> dict[str, str]:
-        """Where and by what it was made."""
-        return self.metadata("provenance")
-
-    @cached_property
-    def raw_result(self) -> dict[str, Any]:
-        """The result as it was written, unchecked; empty if the recorder never came to that.
-
-        Raises:
-            RecordingError: it is no JSON object.
-        """
-        if "result" not in self._index.metadata:
-            return {}
-        return self._json("result")
-
-    @cached_property
-    def result(self) -> Summary:
-        """What the recorder wrote at the end: status, digest, counts; empty if it never came to that.
-
-        Raises:
-            RecordingError: it holds what cannot be.
-        """
-        problems: list[str] = []
-        found = parse_summary(self.raw_result, "", problems)
-        if problems:
-            raise RecordingError(f"{self.path}: its result is damaged: {'; '.join(problems)}.")
-        return found
-
     @property
     def status(self) -> str:
-        """How the run stands: `finished`, `failed`, `running`, or else `interrupted`."""
+        """The status of the run: `finished`, `failed`, `running`, or else `interrupted`."""
         if self.result.status is None and self._is_in_run_folder and is_owned(self.path.parent):
             return "running"
         return self.result.status or "interrupted"
 
     @property
     def name(self) -> str:
-        """What the run is called now: the name in its labels if it was renamed, else the first one."""
+        """The current name of the run: that in its labels if it was renamed, else the first one."""
         renamed = read_labels(self.path.parent).name if self._is_in_run_folder else ""
         return renamed or self.run["name"]
+
+    @property
+    def title(self) -> str:
+        """The current name of the run, and its seed if it has one: `patient, seed 3`."""
+        return run_title(self.name, self.seed)
 
     @property
     def _is_in_run_folder(self) -> bool:
         return self.path.name == "recording.mcap"
 
-    def run_facts(self) -> dict[str, Any]:
-        """Return what `run.json` says, from the recording alone; the result in it is unchecked."""
-        result = self.raw_result
-        return {
-            "run_id": self.run["run_id"],
-            "name": self.run["name"],
-            "seed": int(self.run["seed"]),
-            **({"seeded": False} if self.run.get("seeded") == "false" else {}),
-            "created": self.run["created"],
-            "status": result.get("status", "interrupted"),
-            "config": self.config,
-            "summary": {key: value for key, value in result.items() if key != "status"},
-        }
-
     def done(self) -> dict[str, int]:
-        """Return how many training episodes and steps of each phase were done: as written, else counted."""
-        result = self.result
+        """Return the number of training episodes and steps of each phase: as written, else counted."""
+        topics = {
+            "episodes": schema.TRAIN_EPISODE,
+            "train_steps": schema.TRAIN_STEP,
+            "eval_steps": schema.EVAL_STEP,
+        }
+        stated = {key: getattr(self.result, key) for key in topics}
         return {
-            "episodes": self.count(schema.TRAIN_EPISODE) if result.episodes is None else result.episodes,
-            "train_steps": self.count(schema.TRAIN_STEP)
-            if result.train_steps is None
-            else result.train_steps,
-            "eval_steps": self.count(schema.EVAL_STEP) if result.eval_steps is None else result.eval_steps,
+            key: self.count(topic) if stated[key] is None else stated[key] for key, topic in topics.items()
         }
 
     def metadata(self, name: str) -> dict[str, str]:
@@ -247,14 +146,7 @@ class Recording:
         """
         if name not in self._index.metadata:
             raise RecordingError(f"{self.path}: has no metadata {name!r}; it was cut off, or is not ours.")
-        offset, length = self._index.metadata[name]
-        try:
-            found, entries = metadata_of(self._record(Opcode.METADATA, offset, length, MAX_METADATA_BYTES))
-        except UNREADABLE as error:
-            raise RecordingError(f"{self.path}: the metadata {name!r} at {offset} cannot be read.") from error
-        if found != name:
-            raise RecordingError(f"{self.path}: found metadata {found!r} at {offset}, expected {name!r}.")
-        return entries
+        return self._store.metadata(name, *self._index.metadata[name])
 
     @property
     def metadata_names(self) -> list[str]:
@@ -263,8 +155,8 @@ class Recording:
 
     def attachments(self) -> Iterator[tuple[str, str, bytes]]:
         """Yield name, media type and data of each attachment, in the order of the file."""
-        for name in sorted(self._index.attachments, key=lambda name: self._index.attachments[name][0]):
-            yield name, *self._attachment(name)
+        for name, place in sorted(self._index.attachments.items(), key=lambda item: item[1]):
+            yield name, *self._store.attachment(name, *place)
 
     def attachment(self, name: str) -> bytes:
         """Return an attachment's data, after comparing its checksum.
@@ -272,50 +164,11 @@ class Recording:
         Raises:
             RecordingError: there is none of that name, or it is damaged.
         """
-        return self._attachment(name)[1]
-
-    def _attachment(self, name: str) -> tuple[str, bytes]:
-        """Return an attachment's media type and data."""
         if name not in self._index.attachments:
             raise RecordingError(f"{self.path}: has no attachment {name!r}; it was cut off, or is not ours.")
-        offset, length = self._index.attachments[name]
-        try:
-            found, media_type, data = attachment_of(self._record(Opcode.ATTACHMENT, offset, length), offset)
-        except UNREADABLE as error:
-            raise RecordingError(f"{self.path}: the attachment at {offset} cannot be read.") from error
-        except RecordingError as error:
-            raise RecordingError(f"{self.path}: {error}.") from error
-        if found != name:
-            raise RecordingError(f"{self.path}: found attachment {found!r} at {offset}, expected {name!r}.")
-        return media_type, data
+        return self._store.attachment(name, *self._index.attachments[name])[1]
 
-    @cached_property
-    def mdp(self) -> Mdp:
-        """The environment: arrays, agents, events, scene."""
-        return environment_of(self.environment, self.attachment, str(self.path))
-
-    @cached_property
-    def environment(self) -> dict[str, Any]:
-        """What is said of the environment beside its arrays: agents, events, scene; not to be changed."""
-        return environment_description(self.attachment("environment.json"), str(self.path))
-
-    @property
-    def tabular(self) -> bool:
-        """Whether the environment's arrays are there, so that it has an `mdp`."""
-        return self.kind in ("job", "step") and bool(self.environment["arrays"])
-
-    @property
-    def has_steps(self) -> bool:
-        """Whether any step was recorded."""
-        return any(len(self._chunks(self.topic(f"/{phase}/step"))) for phase in schema.PHASES)
-
-    @property
-    def leaves_out_steps(self) -> bool:
-        """Whether the configuration leaves the steps out of the recording (`recording.steps: none`)."""
-        plan = self.config.get("recording")
-        return isinstance(plan, Mapping) and plan.get("steps") == "none"
-
-    # --- blocks ------------------------------------------------------------------------------------
+    # --- blocks ---------------------------------------------------------------------------------------
 
     @cached_property
     def dtypes(self) -> dict[Topic, np.dtype[np.void]]:
@@ -324,46 +177,6 @@ class Recording:
             topic: record_dtype(topic.message, sizes)
             for topic, sizes in sizes_of(self.run, str(self.path)).items()
         }
-
-    @property
-    def kind(self) -> str:
-        """`job` if the runner learned it; else what the spaces of somebody's own loop ask for.
-
-        `step`: both are `Discrete`; `transition`: all values have one size; `variable`: they have not.
-        """
-        return kind_of(self.run)
-
-    @property
-    def is_job(self) -> bool:
-        """Whether the runner itself learned it, from a configuration; else it was recorded from a loop."""
-        return self.kind == "job"
-
-    @property
-    def topics(self) -> tuple[Topic, ...]:
-        """The topics that a recording of its kind has."""
-        return schema.KINDS[self.kind]
-
-    def require_job(self, purpose: str, instead: str) -> None:
-        """Refuse a recording of somebody's own loop.
-
-        Raises:
-            RunnerError: it is one; `purpose` says what it cannot be used for, `instead` what can be done.
-        """
-        if not self.is_job:
-            raise RunnerError(
-                f"{self.path}: was recorded from somebody's own loop, by {self.config.get('made_by')}; "
-                f"{purpose} is for runs that were trained here. {instead}"
-            )
-
-    @cached_property
-    def spaces(self) -> dict[str, Any]:
-        """The descriptions of the `observation` and the `action` space of a loop's recording."""
-        return spaces_of(self.run, str(self.path))
-
-    @property
-    def environments(self) -> int:
-        """How many environments took turns: step number n was taken in number n modulo this."""
-        return int(self.run.get("environments", "1"))
 
     def topic(self, name: str) -> Topic:
         """Return the topic of that name, such as `/train/step`.
@@ -375,8 +188,13 @@ class Recording:
             raise RecordingError(f"{self.path}: has no topic {name!r}: it is of the kind {self.kind!r}.")
         return self._own[name]
 
+    @property
+    def has_steps(self) -> bool:
+        """Whether any step was recorded."""
+        return any(len(self._chunks(self.topic(f"/{phase}/step"))) for phase in schema.PHASES)
+
     def count(self, topic: Topic) -> int:
-        """Return the number behind a topic's last message: how many there are, if none was lost.
+        """Return the number after that of a topic's last message: how many there are, if none was lost.
 
         For a topic of variable size it reads them.
         """
@@ -395,10 +213,10 @@ class Recording:
         return self._chunks(topic).blocks_between(start_time, stop_time)
 
     def blocks_of_episodes(self, phase: str, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
-        """Yield the steps of the episodes number `start` up to `stop`; None for the very end."""
+        """Yield the steps of the episodes number `start` up to `stop`; None for all that follow."""
         steps = self._chunks(self.topic(f"/{phase}/step"))
-        behind = None if stop is None else steps.first_from("episode", stop)
-        return steps.blocks(steps.first_from("episode", start), behind)
+        end = None if stop is None else steps.first_from("episode", stop)
+        return steps.blocks(steps.first_from("episode", start), end)
 
     def messages(self, topic: Topic, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
         """Yield (log time in nanoseconds, payload) of a topic's messages, in order."""
@@ -413,15 +231,15 @@ class Recording:
     def episode_steps(self, phase: str, episode: int) -> NDArray[np.void]:
         """Return the steps of one episode, also of one that never ended.
 
-        Where several environments take turns, episodes are numbered as they ended, and only those are given.
+        Where several environments take turns, episodes are numbered as they ended, and only ended ones are
+        returned.
 
         Raises:
             RecordingError: the recording has no such episode, or no steps.
         """
         topic, episodes = self.topic(f"/{phase}/step"), self.topic(f"/{phase}/episode")
-        stride = self.environments
+        stride, phased = self.environments, schema.PHASE_NAMES[phase]
         total, ended = self.count(topic), self.count(episodes)
-        phased = {"train": "training", "eval": "evaluation"}[phase]
         if not total:
             raise RecordingError(f"{self.path}: has no {phased} steps.")
         start = stop = 0
@@ -437,42 +255,27 @@ class Recording:
             )
         if (stop - start) * self.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
             raise RecordingError(
-                f"{self.path}: {phased} episode {episode} has {stop - start:,} steps, too many to be given "
-                f"at once; read them in blocks, from {start}."
+                f"{self.path}: {phased} episode {episode} has {stop - start:,} steps, too many for an array; "
+                f"read them in blocks, from {start}."
             )
         blocks = list(self.blocks(topic, start, stop))
         if not blocks:
             raise RecordingError(f"{self.path}: the steps of {phased} episode {episode} were lost.")
         return np.concatenate(blocks)[::stride]
 
-    # --- of somebody's own loop ---------------------------------------------------------------------
+    # --- messages, parsed -----------------------------------------------------------------------------
 
     def transitions(self, phase: str) -> Iterator[Any]:
-        """Yield the steps of a phase one by one, with `action` and `next_observation` as values.
+        """Yield the steps of a loop's phase one by one, with `action` and `next_observation` as values.
 
-        Of the kind `step` they have `state`, `action` and `next_state`, counted from 0.
-
-        Records of NumPy where values have one size (`blocks` gives many at once), else dictionaries.
+        Those of the kind `step` have `state`, `action` and `next_state`, counted from 0. They are NumPy
+        records where values have one size (`blocks` yields many at once), else dictionaries.
         """
         yield from self._values(self.topic(f"/{phase}/step"), action="action", next_observation="observation")
 
     def resets(self, phase: str) -> Iterator[Any]:
         """Yield the resets of a phase one by one, as `transitions` yields steps."""
         yield from self._values(self.topic(f"/{phase}/reset"), observation="observation")
-
-    def decoded(self, topic: Topic, most: int = MAX_CHUNK_BYTES) -> Iterator[dict[str, Any]]:
-        """Yield the messages of a topic of variable size: `log_time` and the fields, by name.
-
-        Raises:
-            RecordingError: one cannot be read, or has more bytes than `most`.
-        """
-        for time, fields in self._parsed(topic, partial(decode, topic.message), most=most):
-            yield {"log_time": time} | fields
-
-    def arrays(self) -> Iterator[Snapshot]:
-        """Yield the arrays that a loop recorded by `snapshot`, in order."""
-        for _, array in self._parsed(schema.ARRAY_TOPIC, decode_array):
-            yield array
 
     def _values(self, topic: Topic, **spaces: str) -> Iterator[Any]:
         """Yield a topic's messages one by one; `spaces` names the space of each field that is a value."""
@@ -488,19 +291,32 @@ class Recording:
                 fields["rewards"] = np.array(fields["rewards"])
             yield fields
 
+    def decoded(self, topic: Topic, max_bytes: int = MAX_CHUNK_BYTES) -> Iterator[dict[str, Any]]:
+        """Yield the messages of a topic of variable size: `log_time` and the fields, by name.
+
+        Raises:
+            RecordingError: one cannot be read, or has more than `max_bytes` bytes.
+        """
+        for time, fields in self._parsed(topic, partial(decode, topic.message), max_bytes=max_bytes):
+            yield {"log_time": time} | fields
+
+    def arrays(self) -> Iterator[Snapshot]:
+        """Yield the arrays that a loop recorded by `snapshot`, in order."""
+        return (array for _, array in self._parsed(schema.ARRAY_TOPIC, decode_array))
+
     def metrics(self, phase: str) -> list[dict[str, Any]]:
         """Return the metrics of a phase, in order.
 
         Raises:
-            RecordingError: they are damaged, or more than 131,072; `iter_metrics` gives them one by one.
+            RecordingError: they are damaged, or more than 131,072; `iter_metrics` yields them one by one.
             ValueError: there is no such phase.
         """
-        found: list[dict[str, Any]] = []
-        for metrics in self.iter_metrics(phase):
-            if len(found) == MAX_METRICS:
+        metrics: list[dict[str, Any]] = []
+        for one in self.iter_metrics(phase):
+            if len(metrics) == MAX_METRICS:
                 raise RecordingError(f"{self.path}: has more than {MAX_METRICS:,} {phase} metrics.")
-            found.append(metrics)
-        return found
+            metrics.append(one)
+        return metrics
 
     def iter_metrics(self, phase: str) -> Iterator[dict[str, Any]]:
         """Yield the metrics of a phase (`train` or `eval`), in order.
@@ -519,54 +335,52 @@ class Recording:
         yield from self.decoded(schema.OPTIMALITY_TOPIC, _METRICS_BYTES)
 
     def snapshots(self, step: int = 0, tables: int = 0) -> Iterator[QTable]:
-        """Yield the snapshots in order; those are left out that are older than needed for `step`.
+        """Yield the snapshots in order, without those that are older than needed for `step`.
 
-        Of the last moment at or before `step` all are given, and of the moment before it.
+        All tables of the last moment at or before `step` are included, and of the moment before it.
 
         Args:
             step: a training step.
-            tables: how many tables there are of a moment; by default the learners' Q-tables are given, and
-                what else their algorithm keeps is left out.
+            tables: how many tables each moment has; by default only the learners' Q-tables are yielded, not
+                what else their algorithm keeps.
         """
         learners = len(self.agents)
-        for snapshot in self._since(step, tables or learners):
+        first, chunks = 0, range(len(self._chunks(schema.Q_TABLE_TOPIC)))
+        if step:
+            after = bisect_right(chunks, step, key=lambda k: next(self._snapshots(k)).step)
+            first = max(0, after - 2 * (tables or learners))
+        for snapshot in self._snapshots(first):
             if tables or snapshot.table < learners:
                 yield snapshot
 
-    def _since(self, step: int, tables: int) -> Iterator[QTable]:
-        chunks = range(len(self._chunks(schema.Q_TABLE_TOPIC)))
-        behind = bisect_right(chunks, step, key=lambda k: next(self._snapshots(k)).step) if step else 0
-        yield from self._snapshots(max(0, behind - 2 * tables))
-
     def _snapshots(self, first_chunk: int) -> Iterator[QTable]:
-        for _, table in self._parsed(schema.Q_TABLE_TOPIC, decode_q_table, first_chunk):
-            yield table
-
-    # --- inside ------------------------------------------------------------------------------------
+        return (table for _, table in self._parsed(schema.Q_TABLE_TOPIC, decode_q_table, first_chunk))
 
     def _parsed(
         self,
         topic: Topic,
         parse: Callable[[bytes], M],
         first_chunk: int = 0,
-        most: int = MAX_CHUNK_BYTES,
+        max_bytes: int = MAX_CHUNK_BYTES,
     ) -> Iterator[tuple[int, M]]:
-        """Yield (log time in nanoseconds, what `parse` makes of it) of a topic's messages, in order.
+        """Yield (log time in nanoseconds, parsed message) of a topic's messages, in order.
 
         Raises:
-            RecordingError: it makes nothing of one, which is named, or one has more bytes than `most`.
+            RecordingError: one cannot be parsed, or has more than `max_bytes` bytes; it is named.
         """
         for time, payload in self.messages(topic, first_chunk):
             try:
-                if len(payload) > most:
+                if len(payload) > max_bytes:
                     raise RecordingError(f"found {len(payload):,} bytes; too many to be ours.")
                 message = parse(payload)
             except RecordingError as error:
                 raise RecordingError(f"{self.path}: {topic.name} at {time} ns: {error}") from error
             yield time, message
 
+    # --- chunks ---------------------------------------------------------------------------------------
+
     def _chunks(self, topic: Topic) -> TopicChunks:
-        """Return the chunks of a topic, or of this recording's own of that name: the kinds differ."""
+        """Return the chunks of a topic, or of this recording's own topic of that name: the kinds differ."""
         own = self._own.get(topic.name, topic)
         if own not in self._known_chunks:
             self._known_chunks[own] = TopicChunks(
@@ -582,20 +396,10 @@ class Recording:
 
     @cached_property
     def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
-        """Which chunks of the file are each topic's."""
+        """The chunks of the file that hold each topic."""
         return chunks_by_topic(self._index, self._store, self.dtypes, str(self.path))
 
     @cached_property
     def _own(self) -> Mapping[str, Topic]:
         """The topics that a recording of its kind has, by name."""
         return {topic.name: topic for topic in self.topics}
-
-    def _json(self, name: str) -> dict[str, Any]:
-        return json_object(self.metadata(name).get("json"), f"{self.path}: the metadata {name!r}")
-
-    def _record(self, opcode: int, offset: int, length: int, most: int = MAX_CHUNK_BYTES) -> bytes:
-        """Return the body of a record of this kind."""
-        record = self._store.record(offset, length, most)
-        if record[0] != opcode or int.from_bytes(record[1:9], "little") != length - 9:
-            raise RecordingError(f"{self.path}: found another record at {offset} than the index says.")
-        return record[9:]

@@ -1,4 +1,4 @@
-"""The chunks of one topic in an open recording: its messages by number or time, as blocks or one by one."""
+"""The chunks of one topic in an open recording: its messages by number or time, in blocks or one by one."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from runner.recording.schema import ALL_TOPICS, STEP_NANOSECONDS, Topic
 
 _MESSAGE: Final = int(Opcode.MESSAGE)
 _MANY: Final = 32
-"""Chunks of one size from which on they are not unpacked to learn whose messages they hold."""
+"""The least number of chunks of one size whose topic is inferred instead of unpacking them."""
 
 
 def chunks_by_topic(
@@ -28,12 +28,12 @@ def chunks_by_topic(
 ) -> dict[Topic, NDArray[np.intp]]:
     """Return which chunks of a file hold each topic's messages, in order.
 
-    Without message indexes only a chunk itself says whose messages it holds. Unpacking the beginning of every
-    chunk takes seconds in a long recording, so most are inferred from the summary where it determines them.
+    Without message indexes the topic of a chunk stands only in the chunk itself. Unpacking the beginning of
+    every chunk takes seconds in a long recording, so most topics are inferred if the summary determines them.
 
     Args:
         index: of the file.
-        store: gives the chunks' records.
+        store: reads the chunks.
         dtypes: of the message records of fixed-width topics.
         path: of the recording, for errors.
 
@@ -110,15 +110,15 @@ def _with_inferred(
 class TopicChunks:
     """The chunks of a topic, in order.
 
-    Messages are numbered as recorded; where a repair lost some, the numbers go on behind the gap.
+    Messages are numbered as recorded; where a repair lost some, the numbers continue after the gap.
 
     Args:
-        topic: whose they are.
-        places: which chunks of the file they are.
+        topic: the topic.
+        places: which chunks of the file hold it.
         table: all chunks of the file.
-        store: gives what they hold.
+        store: reads the chunks.
         dtype: of a message record; None if messages vary in size.
-        lost: [first, behind the last] numbers of the messages that a repair could not save.
+        lost: ranges (first, stop) of the numbers of messages that a repair could not save.
         path: of the recording, for errors.
     """
 
@@ -144,11 +144,11 @@ class TopicChunks:
         return len(self._places)
 
     def entry(self, k: int) -> ChunkEntry:
-        """Return where chunk number k stands, and what it says of itself."""
+        """Return the place of chunk number k, and what it declares."""
         return self._table[int(self._places[k])]
 
     def count(self) -> int:
-        """Return the number behind the last message; where messages vary in size, by reading them."""
+        """Return the number after that of the last message; where messages vary in size, by reading them."""
         if self._dtype is None:
             return sum(1 for _ in self.messages())
         _, ends = self._numbers
@@ -172,8 +172,8 @@ class TopicChunks:
             return
         start, stop = np.uint64(max(start_time, 0)), np.uint64(max(stop_time, 0))
         times = self._table.columns[self._places]
-        first, behind = np.searchsorted(times["end_time"], start), np.searchsorted(times["start_time"], stop)
-        for block in self.blocks(int(firsts[first]), int(ends[behind - 1])) if first < behind else ():
+        first, end = np.searchsorted(times["end_time"], start), np.searchsorted(times["start_time"], stop)
+        for block in self.blocks(int(firsts[first]), int(ends[end - 1])) if first < end else ():
             low, high = (int(np.searchsorted(block["log_time"], time)) for time in (start, stop))
             if low < high:
                 yield block[low:high]
@@ -205,7 +205,7 @@ class TopicChunks:
 
     @cached_property
     def _numbers(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """For each chunk the number of its first message, and behind its last."""
+        """The number of each chunk's first message, and after its last."""
         if self._dtype is None:
             raise RecordingError(
                 f"{self._path}: the messages of {self._topic.name} vary in size; read them one by one."
@@ -220,13 +220,13 @@ class TopicChunks:
         ends = np.cumsum(sizes // size)
         firsts = ends - sizes // size
         for start, stop in self._lost:
-            behind = firsts >= start
-            firsts[behind] += stop - start
-            ends[behind] += stop - start
+            after = firsts >= start
+            firsts[after] += stop - start
+            ends[after] += stop - start
         return firsts, ends
 
     def _block(self, k: int, data: bytes) -> NDArray[np.void]:
-        """Return chunk number k as an array, after looking at its constant bytes."""
+        """Return chunk number k as an array, after checking its constant bytes."""
         assert self._dtype is not None
         block = np.frombuffer(data, dtype=self._dtype)
         if (block["channel_id"] != self._topic.channel).any() or (

@@ -1,0 +1,206 @@
+"""The description of a run, as its recording and its archive hold it: metadata records and attachments."""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from runner.environments.mdp import Mdp
+from runner.errors import RecordingError, RunnerError
+from runner.recording import schema
+from runner.recording.metadata import (
+    environment_description,
+    environment_of,
+    json_object,
+    kind_of,
+    lost_ranges,
+    spaces_of,
+)
+from runner.recording.run_file import Summary, parse_summary
+from runner.recording.schema import Topic
+
+
+class RunDescription(ABC):
+    """What is recorded about a run besides its messages; raises a `RecordingError` where it is damaged.
+
+    Args:
+        path: the file or folder, for errors.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @abstractmethod
+    def metadata(self, name: str) -> dict[str, str]:
+        """Return a metadata record's entries.
+
+        Raises:
+            RecordingError: there is none of that name, or it cannot be read.
+        """
+
+    @property
+    @abstractmethod
+    def metadata_names(self) -> list[str]:
+        """The names of the metadata records, in order."""
+
+    @abstractmethod
+    def attachment(self, name: str) -> bytes:
+        """Return an attachment's data, after comparing its checksum.
+
+        Raises:
+            RecordingError: there is none of that name, or it is damaged.
+        """
+
+    @cached_property
+    def run(self) -> dict[str, str]:
+        """The metadata record `run`: id, name, seed, job, creation, agents and more, as texts."""
+        return self.metadata("run")
+
+    @property
+    def run_id(self) -> str:
+        """The id of the run."""
+        return self.run["run_id"]
+
+    @property
+    def job(self) -> str:
+        """The identity of the run's job."""
+        return self.run["job"]
+
+    @property
+    def created(self) -> str:
+        """When the run began, in ISO format."""
+        return self.run["created"]
+
+    @property
+    def seed(self) -> int | None:
+        """The seed of the run's job; None for a loop without one."""
+        return None if self.run.get("seeded") == "false" else int(self.run["seed"])
+
+    @cached_property
+    def agents(self) -> tuple[str, ...]:
+        """The names of the learners: one table and one reward each."""
+        return tuple(map(str, json.loads(self.run["agents"])))
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration, as `runner.config.from_mapping` takes it."""
+        return self._json("config")
+
+    @cached_property
+    def provenance(self) -> dict[str, str]:
+        """Where and by what it was made."""
+        return self.metadata("provenance")
+
+    @cached_property
+    def raw_result(self) -> dict[str, Any]:
+        """The result as it was written, unchecked; empty if the run ended without one.
+
+        Raises:
+            RecordingError: it is no JSON object.
+        """
+        return self._json("result") if "result" in self.metadata_names else {}
+
+    @cached_property
+    def result(self) -> Summary:
+        """What the recorder wrote at the end: status, digest, counts; empty if the run ended without it.
+
+        Raises:
+            RecordingError: it has a value that is not possible.
+        """
+        problems: list[str] = []
+        result = parse_summary(self.raw_result, "", problems)
+        if problems:
+            raise RecordingError(f"{self.path}: its result is damaged: {'; '.join(problems)}.")
+        return result
+
+    def run_facts(self) -> dict[str, Any]:
+        """Return the contents of `run.json`, from the recording alone; the result in it is unchecked."""
+        result = self.raw_result
+        return {
+            "run_id": self.run_id,
+            "name": self.run["name"],
+            "seed": self.seed or 0,
+            **({"seeded": False} if self.seed is None else {}),
+            "created": self.created,
+            "status": result.get("status", "interrupted"),
+            "config": self.config,
+            "summary": {key: value for key, value in result.items() if key != "status"},
+        }
+
+    @cached_property
+    def lost(self) -> dict[str, list[list[int]]]:
+        """Messages that a repair could not save, by topic: ranges (first, stop) of their numbers."""
+        return lost_ranges(self._json("repair"), str(self.path)) if "repair" in self.metadata_names else {}
+
+    @property
+    def kind(self) -> str:
+        """`job` if the runner learned it; else how the steps of a recorded loop are stored.
+
+        `step`: both spaces are `Discrete`; `transition`: all values have one size; `variable`: they have not.
+        """
+        return kind_of(self.run)
+
+    @property
+    def is_job(self) -> bool:
+        """Whether the runner itself learned it, from a configuration; else it was recorded from a loop."""
+        return self.kind == "job"
+
+    def require_job(self, purpose: str, instead: str) -> None:
+        """Refuse the recording of a loop.
+
+        Raises:
+            RunnerError: it is one; `purpose` says what it cannot be used for, `instead` what can be done.
+        """
+        if not self.is_job:
+            raise RunnerError(
+                f"{self.path}: was recorded from somebody's own loop, by {self.config.get('made_by')}; "
+                f"{purpose} is for runs that were trained here. {instead}"
+            )
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The topics that a recording of its kind has."""
+        return schema.KINDS[self.kind]
+
+    @cached_property
+    def environment(self) -> dict[str, Any]:
+        """The environment's description without its arrays: agents, events, scene; not to be changed."""
+        return environment_description(self.attachment("environment.json"), str(self.path))
+
+    @property
+    def event_names(self) -> tuple[str, ...]:
+        """The names of the environment's events, which episodes count."""
+        return tuple(self.environment["event_names"])
+
+    @property
+    def tabular(self) -> bool:
+        """Whether the environment's arrays are there, so that it has an `mdp`."""
+        return self.kind in ("job", "step") and bool(self.environment["arrays"])
+
+    @cached_property
+    def mdp(self) -> Mdp:
+        """The environment: arrays, agents, events, scene."""
+        return environment_of(self.environment, self.attachment, str(self.path))
+
+    @cached_property
+    def spaces(self) -> dict[str, Any]:
+        """The descriptions of the `observation` and the `action` space of a loop's recording."""
+        return spaces_of(self.run, str(self.path))
+
+    @property
+    def environments(self) -> int:
+        """How many environments took turns: step number n was taken in number n modulo this."""
+        return int(self.run.get("environments", "1"))
+
+    @property
+    def leaves_out_steps(self) -> bool:
+        """Whether the configuration leaves the steps out of the recording (`recording.steps: none`)."""
+        plan = self.config.get("recording")
+        return isinstance(plan, Mapping) and plan.get("steps") == "none"
+
+    def _json(self, name: str) -> dict[str, Any]:
+        return json_object(self.metadata(name).get("json"), f"{self.path}: the metadata {name!r}")
