@@ -7,7 +7,7 @@ episodes, the resets that environments do by themselves) is computed for a block
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -26,21 +26,13 @@ _MAX_STEPS: Final = 2048
 
 
 class _Reset(NamedTuple):
-    """A reset, called by the user, of environments whose episodes had ended."""
+    """A reset of environments whose episodes had ended, by the user or within a step (`SAME_STEP`)."""
 
     row: int
     """The row of the block that comes after it."""
     which: NDArray[np.intp]
     observation: NDArray[Any]
     seeds: Sequence[int | None]
-
-
-class _Final(NamedTuple):
-    """The last observations of episodes that ended in a step whose observations are of the next ones."""
-
-    row: int
-    which: NDArray[np.intp]
-    observation: NDArray[Any]
 
 
 class _Counts(NamedTuple):
@@ -106,14 +98,15 @@ class VectorRows:
         self._over = np.zeros(n, np.bool_)
         self._state = np.full(n, -self._state_start)
         """The states before the first row, where both spaces are discrete."""
-        self._user_resets: list[_Reset] = []
-        self._finals: list[_Final] = []
+        self._block_resets: list[_Reset] = []
+        self._finals: list[tuple[int, NDArray[np.intp], NDArray[Any]]] = []
+        """Rows whose observations are of the next episodes; environments, and the last ones of the ended."""
         self._counted, self._ended_here = 0, 0
         """Rows of the block of which `place` has counted the ends of episodes, and those ends."""
         self.reshape(described)
 
     def open(self) -> None:
-        """Do nothing: blocks are taken from the recorder when records are complete."""
+        """Do nothing: `commit` takes blocks from the recorder."""
 
     def reshape(self, described: Described) -> None:
         """Prepare for actions of another dtype, before the first step."""
@@ -133,8 +126,6 @@ class VectorRows:
         self._truncated = np.empty((rows, n), np.bool_)
         self._put_action = filler(self._action_leaves, self._actions, (n,))
         self._put_observation = filler(self._observation_leaves, self._observations, (n,))
-
-    # --- what a loop does -----------------------------------------------------------------------------
 
     @property
     def filled(self) -> int:
@@ -156,7 +147,7 @@ class VectorRows:
         if not self._filled:
             return self._over
         over: Flags = self._terminated[self._filled - 1] | self._truncated[self._filled - 1]
-        for reset in self._user_resets:
+        for reset in self._block_resets:
             if reset.row == self._filled:
                 over[reset.which] = False
         return over
@@ -206,7 +197,9 @@ class VectorRows:
         if len(which):
             last = np.zeros(self._n, self._observation_dtype)
             put_chosen(self._observation_leaves, final, last, which)
-            self._finals.append(_Final(row, which, last[which]))
+            self._finals.append((row, which, last[which]))
+            after = self._observations[row, which]
+            self._block_resets.append(_Reset(row + 1, which, after, [None] * len(which)))
 
     def reset(self, observation: Any, seeds: Sequence[int | None], which: Flags) -> None:
         """Record a reset of some environments; it ends episodes in progress in them."""
@@ -216,7 +209,7 @@ class VectorRows:
         filler(self._observation_leaves, now[np.newaxis], (self._n,))(0, observation)
         over = self.over
         if self._filled and over[chosen].all():
-            self._user_resets.append(_Reset(self._filled, chosen, now[chosen], own))
+            self._block_resets.append(_Reset(self._filled, chosen, now[chosen], own))
             return
         self.commit()
         self._abandon(chosen)
@@ -230,13 +223,11 @@ class VectorRows:
         """End the episodes in progress of these environments, neither terminated nor truncated."""
         which = which[self._length[which] > 0]
         if len(which):
-            last = self._recorder.steps[self._phase] - self._n + which
-            self._put_ends(last, self._length[which], self._return[which], False, False)
+            last, never = self._recorder.steps[self._phase] - self._n + which, np.zeros(len(which), np.bool_)
+            self._put_ends(last, self._length[which], self._return[which], never, never)
             self._episode[which] += 1
             self._length[which] = 0
             self._return[which] = 0.0
-
-    # --- blocks ---------------------------------------------------------------------------------------
 
     def commit(self) -> None:
         """Make the records of the block and hand them to the recorder.
@@ -252,14 +243,13 @@ class VectorRows:
         self._put_records(counts, first)
         self._recorder.steps[self._phase] += rows * n
         row, which = np.nonzero(counts.over)
-        if len(row):
-            self._put_ends(
-                first + row * n + which,
-                counts.length[row, which],
-                counts.returns[row, which],
-                self._terminated[row, which],
-                self._truncated[row, which],
-            )
+        self._put_ends(
+            first + row * n + which,
+            counts.length[row, which],
+            counts.returns[row, which],
+            self._terminated[row, which],
+            self._truncated[row, which],
+        )
         self._put_block_resets(counts, first)
         ended = counts.over[-1]
         self._episode += counts.ended_before[-1]
@@ -267,7 +257,7 @@ class VectorRows:
         self._return = np.where(ended, 0.0, counts.returns[-1])
         self._over = over_after
         self._filled = self._counted = self._ended_here = 0
-        self._user_resets, self._finals = [], []
+        self._block_resets, self._finals = [], []
 
     def _count(self) -> _Counts:
         rows, n = self._filled, self._n
@@ -275,7 +265,7 @@ class VectorRows:
         only_reset = np.zeros((rows, n), np.bool_)
         if self._next_step:
             only_reset[0], only_reset[1:] = self._over, over[:-1]
-            for reset in self._user_resets:
+            for reset in self._block_resets:
                 only_reset[reset.row : reset.row + 1, reset.which] = False
         ended_before = np.zeros((rows + 1, n), np.int64)
         np.cumsum(over, axis=0, out=ended_before[1:])
@@ -308,8 +298,8 @@ class VectorRows:
         last = self._observations[:rows]
         if self._finals:
             last = last.copy()
-            for final in self._finals:
-                last[final.row, final.which] = final.observation
+            for row, which, observation in self._finals:
+                last[row, which] = observation
         columns: dict[str, NDArray[Any]] = {
             "rewards": self._rewards[:rows, :, np.newaxis],
             "step": first + np.arange(rows * n).reshape(rows, n),
@@ -327,70 +317,56 @@ class VectorRows:
             columns["acted"] = np.ones((rows, n), np.uint32)
             columns["agents_terminated"], columns["agents_truncated"] = terminated, truncated
         flat = {name: values.reshape(rows * n, *values.shape[2:]) for name, values in columns.items()}
-        positions = sum(self._recorder.steps.values()) + np.arange(1, rows * n + 1, dtype=np.uint64)
-        done = 0
-        while done < rows * n:
-            block = self._recorder.block(self._steps)[: rows * n - done]
-            part = slice(done, done + len(block))
-            for name, values in flat.items():
-                block[name] = values[part]
-            self._recorder.take(self._steps, positions[part])
-            done += len(block)
+        self._record(self._steps, flat, first + np.arange(1, rows * n + 1))
 
     def _states(self) -> NDArray[np.int64]:
         """Return the states before each row; keep those after the last."""
         states = np.empty((self._filled + 1, self._n), np.int64)
         states[0], states[1:] = self._state, self._observations[: self._filled]
         states[1:] -= self._state_start
-        for reset in self._user_resets:
+        for reset in self._block_resets:
             states[reset.row, reset.which] = reset.observation.astype(np.int64) - self._state_start
         self._state = states[-1].copy()
         return states[:-1]
 
     def _put_block_resets(self, counts: _Counts, first: int) -> None:
         """Record the resets between and within the steps of the block, in their order."""
+        # NEXT_STEP: resets in place of a step come after those that the user called before it.
         only_rows, only = np.nonzero(counts.only_reset)
-        # The row after each reset, its order among those before that row, environments, observations, seeds.
-        found: list[tuple[Any, int, NDArray[Any], NDArray[Any], Sequence[int | None]]] = [
-            (only_rows, 2, only, self._observations[only_rows, only], [None] * len(only))
-        ]
-        for final in self._finals:
-            after = self._observations[final.row, final.which]
-            found.append((final.row + 1, 0, final.which, after, [None] * len(final.which)))
-        found += [(reset.row, 1, reset.which, reset.observation, reset.seeds) for reset in self._user_resets]
-        rows = np.concatenate([np.broadcast_to(entry[0], len(entry[2])) for entry in found])
-        if not len(rows):
-            return
-        orders = np.repeat([entry[1] for entry in found], [len(entry[2]) for entry in found])
-        order = np.argsort(3 * rows + orders, kind="stable")
-        which = np.concatenate([entry[2] for entry in found])[order]
-        seeds = [seed for entry in found for seed in entry[4]]
+        observed = self._observations[only_rows, only]
+        resets = [*self._block_resets, _Reset(0, only, observed, [None] * len(only))]
+        rows = np.concatenate(
+            [*(np.full(len(reset.which), reset.row) for reset in self._block_resets), only_rows]
+        )
+        order = np.argsort(rows, kind="stable")
+        which = np.concatenate([reset.which for reset in resets])[order]
+        seeds = [seed for reset in resets for seed in reset.seeds]
         self._put_resets(
             which,
-            np.concatenate([entry[3] for entry in found])[order],
+            np.concatenate([reset.observation for reset in resets])[order],
             [seeds[i] for i in order.tolist()],
             self._episode[which] + counts.ended_before[rows[order], which],
             first + rows[order] * self._n,
         )
-
-    # --- records --------------------------------------------------------------------------------------
 
     def _put_ends(
         self,
         last: NDArray[Any],
         length: NDArray[Any],
         returns: NDArray[Any],
-        terminated: Flags | bool,
-        truncated: Flags | bool,
+        terminated: Flags,
+        truncated: Flags,
     ) -> None:
         """Record the ends of episodes, in the order in which they ended; `last` are their last steps."""
-        block = self._recorder.blank(self._episodes, len(last))
-        block["episode"] = self._ended + np.arange(len(last))
-        block["last_step"] = last
-        block["length"] = length
-        block["returns"] = returns[:, np.newaxis]
-        block["terminated"], block["truncated"] = terminated, truncated
-        self._put(self._episodes, block, last + 1)
+        columns = {
+            "episode": self._ended + np.arange(len(last)),
+            "last_step": last,
+            "length": length,
+            "returns": returns[:, np.newaxis],
+            "terminated": terminated,
+            "truncated": truncated,
+        }
+        self._record(self._episodes, columns, last + 1)
         self._ended += len(last)
 
     def _put_resets(
@@ -402,26 +378,28 @@ class VectorRows:
         steps: NDArray[Any],
     ) -> None:
         """Record resets in their order; `steps` are the steps of the phase before each."""
-        block = self._recorder.blank(self._resets, len(which))
         valid = [seed if seed is not None and 0 <= seed <= MAX_SEED else None for seed in seeds]
-        block["observation"] = observation
-        block["reset"] = self._reset_count + np.arange(len(which))
-        block["episode"] = episode
-        block["step"] = steps
-        block["environment"] = which
-        block["seed"] = [seed or 0 for seed in valid]
-        block["seeded"] = [seed is not None for seed in valid]
-        self._put(self._resets, block, steps)
+        columns = {
+            "observation": observation,
+            "reset": self._reset_count + np.arange(len(which)),
+            "episode": episode,
+            "step": steps,
+            "environment": which,
+            "seed": np.array([seed or 0 for seed in valid], np.uint64),
+            "seeded": np.array([seed is not None for seed in valid], np.bool_),
+        }
+        self._record(self._resets, columns, steps)
         self._reset_count += len(which)
 
-    def _put(self, topic: Topic, records: NDArray[Any], steps: NDArray[Any]) -> None:
-        """Copy records into the recorder's blocks; `steps` are the steps of the phase before each."""
+    def _record(self, topic: Topic, columns: Mapping[str, NDArray[Any]], steps: NDArray[Any]) -> None:
+        """Hand records, given by field, to the recorder; `steps` are the steps of the phase at each."""
         other = sum(self._recorder.steps.values()) - self._recorder.steps[self._phase]
         positions = (steps + other).astype(np.uint64)
-        raw, size, done = records.view(np.uint8), records.itemsize, 0
-        while done < len(records):
-            block = self._recorder.block(topic)
-            n = min(len(block), len(records) - done)
-            block[:n].view(np.uint8)[:] = raw[done * size : (done + n) * size]
-            self._recorder.take(topic, positions[done : done + n])
-            done += n
+        done, n = 0, len(positions)
+        while done < n:
+            block = self._recorder.block(topic)[: n - done]
+            part = slice(done, done + len(block))
+            for name, values in columns.items():
+                block[name] = values[part]
+            self._recorder.take(topic, positions[part])
+            done += len(block)
