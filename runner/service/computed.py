@@ -1,4 +1,4 @@
-"""What is computed for an answer, by a child process, so that all that is heavy stays there."""
+"""Responses that take long to compute, for child processes."""
 
 from __future__ import annotations
 
@@ -6,87 +6,94 @@ import dataclasses
 import io
 import json
 import math
+import tempfile
 from collections.abc import Sequence
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis import diff as differences
+from runner.analysis.compare import compare
+from runner.analysis.compare.moments import moment_of
+from runner.analysis.compare.statistics import require_scipy
 from runner.analysis.evaluations import evaluation_records, training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
+from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
+from runner.analysis.qtable import describe_tables, one_array, replay_at
+from runner.analysis.series import RunSeries, parse_target, read_series, title_of
 from runner.errors import RunnerError
+from runner.export.plots.curves import curves_sheet
+from runner.export.plots.image import check_suffix, save
+from runner.export.plots.metrics import panels_of
+from runner.export.rerun.selection import Request
+from runner.export.rerun.viewer import require_rerun
 from runner.recording.reader import open_recording
+from runner.runs.run import Run
 from runner.service.errors import Refused
 from runner.util.extras import require
 from runner.util.values import finite
 
-if TYPE_CHECKING:
-    from runner.analysis.series import RunSeries
-    from runner.export.rerun.selection import Request
-    from runner.runs.run import Run
-
-Which = Literal["evaluations", "training", "optimality"]
+RecordKind = Literal["evaluations", "training", "optimality"]
 
 
-def curves(path: Path, chosen: Sequence[str], start: int, stop: int | None, points: int) -> bytes:
+def curves(path: Path, metrics: Sequence[str], start: int, stop: int | None, points: int) -> bytes:
     """Return the metrics of a run over training episodes, as JSON.
 
     Args:
         path: its recording.
-        chosen: metrics; all if there are none.
+        metrics: their names; all if there are none.
         start: the first training episode.
-        stop: behind the last; None: to the end.
-        points: at most so many of a curve; of more, the lowest and the highest of each stretch are given.
+        stop: the first one not included; None for all.
+        points: the maximum of a curve; longer ones are thinned. 0 for no limit.
     """
-    from runner.analysis.series import read_series, title_of
-
     with open_recording(path) as recording:
         series = read_series(recording)
     found = {}
     for (metric, line), (episodes, values) in _lines(series).items():
-        if chosen and metric not in chosen:
+        if metrics and metric not in metrics:
             continue
         inside = (episodes >= start) & (episodes < (math.inf if stop is None else stop))
-        kept = thinned(values[inside], points)
+        chosen = thinned(values[inside], points)
         title, unit = title_of(metric)
         found[metric, line] = {
             **{"metric": metric, "line": line, "title": title, "unit": unit},
-            "episodes": episodes[inside][kept].tolist(),
-            "values": values[inside][kept].tolist(),
+            "episodes": episodes[inside][chosen].tolist(),
+            "values": values[inside][chosen].tolist(),
             "of": int(inside.sum()),
-            "thinned": bool(len(kept) < inside.sum()),
+            "thinned": bool(len(chosen) < inside.sum()),
         }
     return as_json({"run_id": series.run_id, "curves": list(found.values())})
 
 
-def records(path: Path, which: Which, start: int, stop: int, most: int) -> bytes:
-    """Return evaluations, reports of training or exact measures number `start` up to `stop`, as JSON.
+def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> bytes:
+    """Return evaluations, reports of training or exact measures from `start` to before `stop`, as JSON.
 
     Raises:
-        Refused: they are more than `most`.
+        Refused: there are more than `limit`.
         RecordingError: the recording cannot be read, or is of a loop, which has no reports of training.
     """
     with open_recording(path) as recording:
-        if which == "optimality":
+        if kind == "optimality":
             found = list(recording.optimality())
         else:
-            if which != "evaluations":
+            if kind != "evaluations":
                 recording.require_job("a report of training", "Its metrics can be had all the same.")
-            found = (evaluation_records if which == "evaluations" else training_records)(recording)
+            found = (evaluation_records if kind == "evaluations" else training_records)(recording)
         shown = found[start:stop]
-        if len(shown) > most:
-            raise too_many(len(shown), most)
-        told = {"run_id": recording.run_id, "start": start, "total": len(found), "records": shown}
-        return as_json(told)
+        if len(shown) > limit:
+            raise too_many(len(shown), limit)
+        page = {"run_id": recording.run_id, "start": start, "total": len(found), "records": shown}
+        return as_json(page)
 
 
-def too_many(found: int, most: int) -> Refused:
+def too_many(found: int, limit: int) -> Refused:
     """Return the error that a range is too long."""
     return Refused(
         HTTPStatus.UNPROCESSABLE_ENTITY,
-        f"query: found a range of {found:,} records, expected at most {most:,}; ask for them in parts.",
+        f"query: found a range of {found:,} records, expected at most {limit:,}; request them in parts.",
     )
 
 
@@ -104,31 +111,29 @@ def _lines(series: RunSeries) -> dict[tuple[str, str], tuple[NDArray[np.float64]
 
 
 def thinned(values: NDArray[np.float64], points: int) -> NDArray[np.intp]:
-    """Return which values are kept so that no extreme is lost: the lowest and the highest of each stretch.
+    """Return the indices of the lowest and the highest value of each section, so that no extreme is lost.
 
     Args:
         values: float64 [n].
-        points: at most so many are kept; 0 for all.
+        points: the maximum number of indices; 0 for all.
     """
     if points == 0 or len(values) <= points:
         return np.arange(len(values))
-    stretches = np.array_split(np.arange(len(values)), max(points // 2, 1))
+    sections = np.array_split(np.arange(len(values)), max(points // 2, 1))
     known = np.where(np.isnan(values), np.inf, values)
-    lowest = [part[np.argmin(known[part])] for part in stretches]
+    lowest = [part[np.argmin(known[part])] for part in sections]
     known = np.where(np.isnan(values), -np.inf, values)
-    highest = [part[np.argmax(known[part])] for part in stretches]
+    highest = [part[np.argmax(known[part])] for part in sections]
     return np.unique([*lowest, *highest])
 
 
 def q_table(path: Path, step: int | None, episode: int | None, state: int | None, form: str) -> bytes:
-    """Return the Q-table of a moment: `json` tells of it, of one state with its history; `npy` is all of it.
+    """Return the Q-table of a moment: a summary and the history of a state as `json`, or all of it as `npy`.
 
     Raises:
         RecordingError: there is no such moment, or the steps before it are not recorded.
         RunnerError: there is no such state.
     """
-    from runner.analysis.qtable import describe_tables, one_array, replay_at
-
     with open_recording(path) as recording:
         recording.require_job("a Q-table", "A loop's arrays are in its recording.")
         replay = replay_at(recording, step, episode)
@@ -140,7 +145,7 @@ def q_table(path: Path, step: int | None, episode: int | None, state: int | None
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
-    """Return the columns of steps or episodes number `start` up to `stop` as a stream of Arrow's IPC format.
+    """Return the columns of steps or episodes from `start` to before `stop` as an Arrow stream.
 
     Raises:
         MissingExtra: pyarrow is not installed.
@@ -164,37 +169,27 @@ def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
     return bytes(sink.getvalue())
 
 
-def plot(paths: Sequence[Path], form: str) -> bytes:
-    """Return every metric of some runs over episodes in one figure, as `svg`, `png` or `pdf`.
+def plot(path: Path, form: str) -> bytes:
+    """Return every metric of a run over episodes in one figure, as `svg`, `png` or `pdf`.
 
     Raises:
         MissingExtra: Matplotlib is not installed.
     """
-    import tempfile
-
-    from runner.analysis.groups import groups_of
-    from runner.export.plots.curves import curves_sheet
-    from runner.export.plots.image import check_suffix, save
-    from runner.export.plots.metrics import panels_of
-
     check_suffix(Path(f"plot.{form}"))
-    groups = groups_of(_series(paths))
+    groups = groups_of(_series([path]))
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder, f"plot.{form}")
-        save(curves_sheet(groups, panels_of(groups)), path)
-        return path.read_bytes()
+        picture = Path(folder, f"plot.{form}")
+        save(curves_sheet(groups, panels_of(groups)), picture)
+        return picture.read_bytes()
 
 
 def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequence[str]) -> bytes:
-    """Return in what two runs differ, as `dualtaxi diff --json` tells it.
+    """Return the differences between two runs, as `dualtaxi diff --json` prints them.
 
     Raises:
         RecordingError: a recording cannot be read.
-        RunnerError: a target is none.
+        RunnerError: a target is invalid.
     """
-    from runner.analysis import diff as differences
-    from runner.analysis.series import parse_target
-
     levels = dict(parse_target(target) for target in targets)
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
         found = differences.diff(ours, theirs, levels, first)
@@ -203,38 +198,31 @@ def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequ
 
 
 def comparison(
-    paths: Sequence[Path], by: str | None, chosen: Sequence[str], at: str, target: str | None
+    paths: Sequence[Path], by: str | None, metrics: Sequence[str], at: str, target: str | None
 ) -> bytes:
-    """Return groups of runs against each other, as `dualtaxi compare --json` tells it.
+    """Return a comparison of groups of runs, as `dualtaxi compare --json` prints it.
 
     Raises:
         MissingExtra: SciPy is not installed.
         RunnerError: there is nothing to compare.
     """
-    from runner.analysis.compare import compare
-    from runner.analysis.compare.moments import moment_of
-    from runner.analysis.compare.statistics import require_scipy
-    from runner.analysis.groups import grouped, metrics_of, require_two
-
     require_scipy()
-    moment, metrics = moment_of(at, target, chosen)
+    moment, names = moment_of(at, target, metrics)
     groups, notes = grouped(_series(paths), by)
     require_two(groups, by)
-    return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, metrics), moment, notes)))
+    return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, names), moment, notes)))
 
 
 def replay(runs: Sequence[Run], request: Request) -> Path:
-    """Return an export for the Rerun viewer, made now unless it is in the user's cache.
+    """Return an export for the Rerun viewer, from the user's cache or new.
 
     Raises:
         MissingExtra: Rerun is not installed.
-        RecordingError: a recording cannot be read, or has not what is asked for.
+        RecordingError: a recording cannot be read, or does not contain what is requested.
         StorageError: the cache cannot be written.
     """
-    from runner.export.rerun.viewer import require_rerun
-
     require_rerun("a replay")
-    from runner.export.rerun.writing import cached_export
+    from runner.export.rerun.writing import cached_export  # loads Rerun
 
     return cached_export(runs, request)[0]
 
@@ -245,12 +233,10 @@ def as_json(value: Any) -> bytes:
 
 
 def _series(paths: Sequence[Path]) -> list[RunSeries]:
-    from runner.analysis.series import read_series
-
     found = []
     for path in paths:
         with open_recording(path) as recording:
             found.append(read_series(recording))
     if not found:
-        raise RunnerError("found no run, expected one at least.")
+        raise RunnerError("found no run, expected at least one.")
     return found

@@ -1,64 +1,38 @@
-"""What routes ask for: settings, the catalogue, kept answers, the run that is meant."""
+"""Dependencies of routes: the parts of the service, and the run that a path names."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Annotated
+from collections.abc import Callable, Hashable, Iterator
+from typing import Annotated, Any
 
 from fastapi import Depends, Path, Request
 
+from runner.archive.places import at_hand
 from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.catalogue import Catalogue
 from runner.service.jobs.pool import JobPool
 from runner.service.processes import ProcessPool
-from runner.service.response_cache import ResponseCache
+from runner.service.response_cache import ALWAYS, ResponseCache
 from runner.service.settings import Settings
 
 
-def settings_of(request: Request) -> Settings:
-    """Return the settings of the service."""
-    found: Settings = request.app.state.settings
-    return found
+def _state(name: str) -> Any:
+    """Return the dependency on a part of the service, as `app.state` has it."""
+
+    def get(request: Request) -> Any:
+        return getattr(request.app.state, name)
+
+    return Depends(get)
 
 
-def catalogue_of(request: Request) -> Catalogue:
-    """Return the catalogue."""
-    found: Catalogue = request.app.state.catalogue
-    return found
-
-
-def cache_of(request: Request) -> ResponseCache:
-    """Return the answers that are kept."""
-    found: ResponseCache = request.app.state.cache
-    return found
-
-
-def jobs_of(request: Request) -> JobPool:
-    """Return the jobs, done beside the service."""
-    found: JobPool = request.app.state.jobs
-    return found
-
-
-def processes_of(request: Request) -> ProcessPool:
-    """Return what does work in processes of its own."""
-    found: ProcessPool = request.app.state.processes
-    return found
-
-
-def sweep_processes_of(request: Request) -> ProcessPool:
-    """Return the child processes that compute what pages show of sweeps."""
-    found: ProcessPool = request.app.state.sweep_processes
-    return found
-
-
-SettingsOf = Annotated[Settings, Depends(settings_of)]
-CatalogueOf = Annotated[Catalogue, Depends(catalogue_of)]
-ProcessesOf = Annotated[ProcessPool, Depends(processes_of)]
-SweepProcesses = Annotated[ProcessPool, Depends(sweep_processes_of)]
-CacheOf = Annotated[ResponseCache, Depends(cache_of)]
-JobsOf = Annotated[JobPool, Depends(jobs_of)]
+SettingsOf = Annotated[Settings, _state("settings")]
+CatalogueOf = Annotated[Catalogue, _state("catalogue")]
+ProcessesOf = Annotated[ProcessPool, _state("processes")]
+SweepProcesses = Annotated[ProcessPool, _state("sweep_processes")]
+CacheOf = Annotated[ResponseCache, _state("cache")]
+JobsOf = Annotated[JobPool, _state("jobs")]
 RunName = Annotated[
     str,
     Path(
@@ -82,24 +56,22 @@ FoundRun = Annotated[Run, Depends(found_run)]
 
 
 def recorded_run(run: FoundRun) -> Run:
-    """Return the run that the path names, with its recording at hand: restored if it is archived.
+    """Return the run that the path names, its recording restored if it is archived.
 
     Raises:
         RecordingError: it has no recording, or its archive is damaged or missing.
     """
-    from runner.archive.places import at_hand
-
-    found = at_hand(run)
-    if not found.recording.is_file():
+    restored = at_hand(run)
+    if not restored.recording.is_file():
         raise RecordingError(f"run {run.run_id} has no recording: it ended before there was one.")
-    return found
+    return restored
 
 
 RecordedRun = Annotated[Run, Depends(recorded_run)]
 
 
 def opened_recording(run: RecordedRun) -> Iterator[Recording]:
-    """Give the recording of the run that the path names, opened.
+    """Yield the opened recording of the run that the path names.
 
     Raises:
         RecordingError: it cannot be read.
@@ -112,11 +84,28 @@ OpenRecording = Annotated[Recording, Depends(opened_recording)]
 
 
 def recording_state(run: Run) -> tuple[str, int, int]:
-    """Return what tells one state of a run's recording from another: its path, size and time."""
-    facts = run.recording.stat()
-    return str(run.recording), facts.st_size, facts.st_mtime_ns
+    """Return the path, size and time of a run's recording, which change with its contents."""
+    stat = run.recording.stat()
+    return str(run.recording), stat.st_size, stat.st_mtime_ns
 
 
 def timed_recording_state(run: Run) -> tuple[str, int, int, str]:
-    """Return the same with how long the run took, which only `run.json` says, at times later."""
+    """Return the same and how long the run took, which `run.json` alone has, at times later."""
     return *recording_state(run), str(run.summary.seconds)
+
+
+class Computation:
+    """Functions of a run's recording, called in a child process, their results cached."""
+
+    def __init__(self, run: RecordedRun, cache: CacheOf, processes: ProcessesOf) -> None:
+        self._run, self._cache, self._processes = run, cache, processes
+
+    async def __call__(self, function: Callable[..., bytes], *args: Hashable) -> bytes:
+        """Return the result of a function of the recording's path and further arguments."""
+        key = (function.__name__, recording_state(self._run), *args)
+        return await self._cache.get_or_await(
+            key, lambda: self._processes(function, self._run.recording, *args), ALWAYS
+        )
+
+
+ComputationOf = Annotated[Computation, Depends()]

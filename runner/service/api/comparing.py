@@ -1,11 +1,12 @@
-"""Runs against each other: what differs between two, and groups of them with statistics."""
+"""Comparisons: the differences between two runs, and groups of runs with statistics."""
 
 from __future__ import annotations
 
 from http import HTTPStatus
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
+from starlette.concurrency import run_in_threadpool
 
 from runner.runs.run import Run
 from runner.service import computed
@@ -31,11 +32,11 @@ router = APIRouter(
         HTTPStatus.NOT_IMPLEMENTED,
     ),
 )
-MOST_RUNS = 1000
-Name = Annotated[str, Query(max_length=200, description="A run, named as anywhere.")]
+MAX_RUNS: Final = 1000
+Name = Annotated[str, Query(max_length=200, description="A run: its id, the beginning of it, its name, ...")]
 
 
-@router.get("/diff", summary="What differs between two runs, down to the first step at which they part.")
+@router.get("/diff", summary="The differences between two runs, down to the first step that differs.")
 async def diff(
     request: Request,
     catalogue: CatalogueOf,
@@ -50,46 +51,45 @@ async def diff(
     """Return what `dualtaxi diff --json` prints."""
     left, right = await found_runs(catalogue, [a, b])
     key = ("diff", *map(timed_recording_state, (left, right)), request.url.query)
-    asked = (left, right, ignore or [], first, target or [])
-    body = await cache.get_or_await(key, lambda: processes(computed.difference, *asked), ALWAYS)
+    options = (left, right, ignore or [], first, target or [])
+    body = await cache.get_or_await(key, lambda: processes(computed.difference, *options), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 
 
-@router.get("/compare", summary="Groups of runs against each other, with statistics over seeds.")
+@router.get("/compare", summary="A comparison of groups of runs, with statistics over seeds.")
 async def compare(
     request: Request,
     catalogue: CatalogueOf,
     cache: CacheOf,
     processes: ProcessesOf,
     run: Annotated[
-        list[str], Query(min_length=1, max_length=MOST_RUNS, description="Which; again for each.")
+        list[str], Query(min_length=1, max_length=MAX_RUNS, description="A run; may be repeated.")
     ],
     by: Annotated[str | None, Query(max_length=200, description="Group by this setting.")] = None,
     metric: Annotated[list[str] | None, Query(max_length=100)] = None,
     at: Annotated[str, Query(max_length=20, description="`last`, `best`, `area`, or episodes.")] = "last",
-    target: Annotated[str | None, Query(max_length=200, description="METRIC=LEVEL, instead.")] = None,
+    target: Annotated[str | None, Query(max_length=200, description="METRIC=LEVEL, instead of `at`.")] = None,
 ) -> dict[str, Any]:
     """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
     runs = await found_runs(catalogue, run, several=True)
     key = ("compare", *map(recording_state, runs), request.url.query)
-    asked = ([found.recording for found in runs], by, metric or [], at, target)
-    body = await cache.get_or_await(key, lambda: processes(computed.comparison, *asked), ALWAYS)
+    options = ([found.recording for found in runs], by, metric or [], at, target)
+    body = await cache.get_or_await(key, lambda: processes(computed.comparison, *options), ALWAYS)
     return Response(body, media_type="application/json")  # type: ignore[return-value]
 
 
 async def found_runs(catalogue: Catalogue, names: list[str], several: bool = False) -> list[Run]:
-    """Return the runs of some names, with their recordings at hand.
+    """Return the runs of some names, their recordings restored if they are archived.
 
     Args:
-        catalogue: knows them.
-        names: of runs.
-        several: whether a name stands for all runs of that name, each once.
+        catalogue: the catalogue.
+        names: the names of runs.
+        several: whether a name means all runs of that name, each once.
 
     Raises:
         RunNotFound: a name matches no run, or several and may not.
         RecordingError: a run has no recording.
     """
-    from starlette.concurrency import run_in_threadpool
 
     def find() -> list[Run]:
         if several:

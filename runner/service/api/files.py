@@ -1,4 +1,4 @@
-"""A run's recording itself, and its replay for the Rerun viewer."""
+"""A run's recording, and its export for the Rerun viewer."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final
 from fastapi import APIRouter, Header, Query, Response
 from fastapi.responses import FileResponse
 
+from runner.export.rerun.selection import Request
 from runner.runs.run import Run
 from runner.service import computed
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
@@ -23,11 +24,11 @@ router = APIRouter(
 )
 MEDIA: Final = "application/octet-stream"
 BLOCK: Final = 1 << 20
-"""Bytes of a file that are read at once."""
+"""Bytes of a file that are read at a time."""
 FILE: Final[dict[int | str, dict[str, Any]]] = {
     200: {"description": "All of it.", "content": {MEDIA: {}}},
-    206: {"description": "The ranges that were asked for.", "content": {MEDIA: {}}},
-    304: {"description": "It is as the client has it."},
+    206: {"description": "The requested ranges.", "content": {MEDIA: {}}},
+    304: {"description": "The client has it already."},
     416: {"description": "There is no such range.", "content": {"text/plain": {}}},
 }
 _RANGES: Final = re.compile(r"\d+:\d*|:\d+|\d+")
@@ -61,14 +62,14 @@ async def replay(
     ] = "",
     evaluations: Annotated[
         list[int] | None,
-        Query(max_length=100, description="The trials of the evaluation after so many training episodes."),
+        Query(max_length=100, description="Trials of the evaluation after this number of training episodes."),
     ] = None,
-    every: Annotated[int, Query(ge=0, lt=2**31, description="Each so many training episodes.")] = 0,
+    every: Annotated[int, Query(ge=0, lt=2**31, description="One of this number of training episodes.")] = 0,
     if_none_match: IfNoneMatch = None,
 ) -> Response:
-    """Return what `dualtaxi export rerun` writes; kept, so that a second look is there at once.
+    """Return what `dualtaxi export rerun` writes; cached, so that a second request is answered at once.
 
-    Of the steps, unless told otherwise, those of 20 training episodes and of the last evaluation are in it.
+    By default it has the steps of 20 training episodes and of the last evaluation.
     """
     path = await replay_of([run], cache, processes, episodes, tuple(evaluations or ()), every)
     return _file(path, f"{run.file_stem}.rrd", path.stem, if_none_match)
@@ -82,14 +83,12 @@ async def replay_of(
     evaluations: tuple[int, ...] = (),
     every: int = 0,
 ) -> Path:
-    """Return the export of some runs; made in a process of its own, once for all who ask meanwhile.
+    """Return the export of some runs, made in a child process, once for all concurrent requests.
 
     Raises:
-        Refused: the ranges of episodes are none.
-        RecordingError: a recording has not what is asked for.
+        Refused: a range of episodes is invalid.
+        RecordingError: a recording does not contain what is requested.
     """
-    from runner.export.rerun.selection import Request
-
     request = Request(_ranges(episodes), evaluations, every)
     key = ("replay", *map(recording_state, runs), request)
     return Path(
@@ -102,7 +101,7 @@ async def _made(processes: ProcessesOf, runs: list[Run], request: Any) -> bytes:
 
 
 def tag_of(run: Run) -> str:
-    """Return what tells one state of a recording from any other."""
+    """Return the ETag of a recording, which changes with every byte."""
     _, size, changed = recording_state(run)
     return f"{run.summary.get('content_digest') or 'unfinished'}-{size:x}-{changed:x}"
 

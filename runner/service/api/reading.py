@@ -1,59 +1,44 @@
-"""What a recording holds: measures, episodes, steps, tables, plots."""
+"""The contents of a recording: metrics, evaluations, episodes, steps, Q-tables, plots."""
 
 from __future__ import annotations
 
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Response
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.recording.reader import Recording
 from runner.service import computed
 from runner.service.computed import too_many
-from runner.service.dependencies import (
-    CacheOf,
-    OpenRecording,
-    ProcessesOf,
-    RecordedRun,
-    SettingsOf,
-    recording_state,
-)
+from runner.service.dependencies import ComputationOf, OpenRecording, ProcessesOf, RecordedRun, SettingsOf
 from runner.service.errors import Refused
 from runner.service.problems import error_docs, media_docs
-from runner.service.response_cache import ALWAYS
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from runner.runs.run import Run
-    from runner.service.processes import ProcessPool
-    from runner.service.response_cache import ResponseCache
-    from runner.service.settings import Settings
 
 router = APIRouter(
     prefix="/runs/{run}",
     tags=["reading"],
     responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
 )
-BUSY = error_docs(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED)
-"""What else may become of work in a process of its own."""
-ARROW = "application/vnd.apache.arrow.stream"
-MEDIA = {"svg": "image/svg+xml", "png": "image/png", "pdf": "application/pdf"}
-FEW = 1000
-"""Records in an answer unless asked otherwise."""
+BUSY: Final = error_docs(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED)
+"""Further errors of work in a child process."""
+ARROW: Final = "application/vnd.apache.arrow.stream"
+OCTETS: Final = "application/octet-stream"
+MEDIA: Final = {"svg": "image/svg+xml", "png": "image/png", "pdf": "application/pdf"}
+DEFAULT_RECORDS: Final = 1000
+"""Records in a response by default."""
 
-Number = Annotated[int, Query(ge=0, lt=2**62)]
+Count = Query(ge=0, lt=2**62)
 Start = Annotated[int, Query(ge=0, lt=2**62, description="The first, from 0.")]
 Stop = Annotated[
-    int | None, Query(ge=0, lt=2**62, description=f"Behind the last; else {FEW:,} from `start`.")
+    int | None,
+    Query(ge=0, lt=2**62, description=f"The first one not included; default: {DEFAULT_RECORDS:,} more."),
 ]
-Step = Annotated[int | None, Query(ge=0, lt=2**62, description="After so many training steps.")]
-Episode = Annotated[int | None, Query(ge=0, lt=2**62, description="After so many training episodes.")]
-
-
-InPhase = Annotated[Phase, Path(description="`train`, or `eval`: the trials of evaluations.")]
+Step = Annotated[int | None, Query(ge=0, lt=2**62, description="After this number of training steps.")]
+Episode = Annotated[int | None, Query(ge=0, lt=2**62, description="After this number of training episodes.")]
+PhasePath = Annotated[Phase, Path(description="`train`, or `eval`: the trials of evaluations.")]
 
 
 class Curve(BaseModel):
@@ -61,15 +46,15 @@ class Curve(BaseModel):
 
     metric: str
     line: str
-    """An agent or a reward; empty if it has one line only."""
+    """An agent or a reward; empty if the metric has one line only."""
     title: str
     unit: str
     episodes: list[float]
     values: list[float | None]
     of: int
-    """How many points there are between `start` and `stop`."""
+    """The number of points between `start` and `stop`."""
     thinned: bool
-    """Whether not all of them are given: of each stretch the lowest and the highest."""
+    """Whether only the lowest and the highest point of each section are included."""
 
 
 class Curves(BaseModel):
@@ -94,80 +79,59 @@ class Columns(BaseModel):
     run_id: str
     start: int
     total: int
-    """How many there are in all."""
+    """The number of all records."""
     columns: dict[str, list[Any]]
 
 
 @router.get("/metrics", response_model=Curves, responses=BUSY, summary="The curves of a run's metrics.")
 async def metrics(
-    run: RecordedRun,
-    request: Request,
-    cache: CacheOf,
-    processes: ProcessesOf,
-    metric: Annotated[list[str] | None, Query(max_length=100, description="Which; else all.")] = None,
-    start: Number = 0,
+    compute: ComputationOf,
+    metric: Annotated[list[str] | None, Query(max_length=100, description="Default: all.")] = None,
+    start: Annotated[int, Count] = 0,
     stop: Annotated[
-        int | None, Query(ge=0, lt=2**62, description="Behind the last training episode.")
+        int | None, Query(ge=0, lt=2**62, description="The first training episode not included.")
     ] = None,
-    points: Annotated[int, Query(ge=0, le=100_000, description="At most so many a curve; 0: all.")] = 0,
+    points: Annotated[int, Query(ge=0, le=100_000, description="Maximum of a curve; 0: all.")] = 0,
 ) -> Response:
     """Return every metric over training episodes, as plots show it.
 
-    With `points`, of longer curves the lowest and the highest value of each stretch are given, and
-    `thinned` says so; ask again with `start` and `stop` for a part at full resolution.
+    With `points`, longer curves have the lowest and the highest value of each section only, and `thinned` is
+    true; `start` and `stop` select a part at full resolution.
     """
-    key = ("metrics", recording_state(run), request.url.query)
-    wanted = tuple(metric or ())
-    body = await cache.get_or_await(
-        key, lambda: processes(computed.curves, run.recording, wanted, start, stop, points), ALWAYS
+    return _json(await compute(computed.curves, tuple(metric or ()), start, stop, points))
+
+
+def _add_records_route(kind: computed.RecordKind, summary: str, description: str) -> None:
+    @router.get(
+        f"/{kind}",
+        name=kind,
+        response_model=Records,
+        responses=BUSY,
+        summary=summary,
+        description=description,
     )
-    return Response(body, media_type="application/json")
+    async def records(
+        compute: ComputationOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
+    ) -> Response:
+        stop = start + DEFAULT_RECORDS if stop is None else stop
+        return _json(await compute(computed.records, kind, start, stop, settings.limits.page_records))
 
 
-@router.get(
-    "/evaluations",
-    response_model=Records,
-    responses=BUSY,
-    summary="The evaluations, with every event counted.",
+_add_records_route(
+    "evaluations",
+    "The evaluations, with every event counted.",
+    "Evaluations as `dualtaxi show --json` has them under `eval`.",
 )
-async def evaluations(
-    run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
-    settings: SettingsOf,
-    start: Start = 0,
-    stop: Stop = None,
-) -> Response:
-    """Return evaluations as `dualtaxi show --json` has them under `eval`."""
-    return await _records(run, cache, processes, settings, "evaluations", start, stop)
-
-
-@router.get("/training", response_model=Records, responses=BUSY, summary="The reports of training.")
-async def training(
-    run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
-    settings: SettingsOf,
-    start: Start = 0,
-    stop: Stop = None,
-) -> Response:
-    """Return reports of training as `dualtaxi show --json` has them under `train`."""
-    return await _records(run, cache, processes, settings, "training", start, stop)
-
-
-@router.get(
-    "/optimality", response_model=Records, responses=BUSY, summary="The exact measures of evaluations."
+_add_records_route(
+    "training",
+    "The reports of training.",
+    "Reports of training as `dualtaxi show --json` has them under `train`.",
 )
-async def optimality(
-    run: RecordedRun,
-    cache: CacheOf,
-    processes: ProcessesOf,
-    settings: SettingsOf,
-    start: Start = 0,
-    stop: Stop = None,
-) -> Response:
-    """Return what evaluations know exactly; nothing unless `evaluation.exact` was set."""
-    return await _records(run, cache, processes, settings, "optimality", start, stop)
+_add_records_route(
+    "optimality",
+    "The exact measures of evaluations.",
+    "The exact measures of evaluations; none unless `evaluation.exact` was set.",
+)
 
 
 @router.get(
@@ -181,26 +145,25 @@ async def arrow(
     processes: ProcessesOf,
     settings: SettingsOf,
     table: Literal["steps", "episodes"],
-    phase: InPhase,
+    phase: PhasePath,
     start: Start = 0,
     stop: Stop = None,
 ) -> Response:
     """Return the same columns as a stream of Arrow's IPC format."""
-    most = settings.limits.page_arrow
-    stop = start + FEW if stop is None else stop
-    if stop - start > most:
-        raise too_many(stop - start, most)
+    stop = start + DEFAULT_RECORDS if stop is None else stop
+    if stop - start > settings.limits.page_arrow:
+        raise too_many(stop - start, settings.limits.page_arrow)
     body = await processes(computed.arrow, run.recording, table, phase, start, stop)
     return Response(body, media_type=ARROW)
 
 
 @router.get("/episodes/{phase}", response_model=Columns, summary="Episodes by range.")
 def episodes(
-    recording: OpenRecording, settings: SettingsOf, phase: InPhase, start: Start = 0, stop: Stop = None
+    recording: OpenRecording, settings: SettingsOf, phase: PhasePath, start: Start = 0, stop: Stop = None
 ) -> Response:
     """Return episodes as columns: length, return of each agent, events, how it ended."""
     total = recording.count(recording.topic(f"/{phase}/episode"))
-    stop = _bounded(start, stop, total, settings.limits.page_records)
+    stop = _stop(start, stop, total, settings.limits.page_records)
     return _columns(recording, episode_columns(recording, phase, start, stop), start, total)
 
 
@@ -208,57 +171,48 @@ def episodes(
 def steps(
     recording: OpenRecording,
     settings: SettingsOf,
-    phase: InPhase,
+    phase: PhasePath,
     start: Start = 0,
     stop: Stop = None,
     episode: Annotated[int | None, Query(ge=0, lt=2**62, description="Instead: all of this one.")] = None,
 ) -> Response:
     """Return steps as columns: state, joint action, next state, reward of each agent, ..."""
-    most = settings.limits.page_records
+    limit = settings.limits.page_records
     total = recording.count(recording.topic(f"/{phase}/step"))
-    if episode is not None:
-        columns = step_columns(recording, phase, episode=episode)
-        if len(columns["step"]) > most:
-            raise too_many(len(columns["step"]), most)
-        return _columns(recording, columns, int(columns["step"][0]), total)
-    columns = step_columns(recording, phase, start=start, stop=_bounded(start, stop, total, most))
-    return _columns(recording, columns, start, total)
+    if episode is None:
+        stop = _stop(start, stop, total, limit)
+        return _columns(recording, step_columns(recording, phase, start=start, stop=stop), start, total)
+    columns = step_columns(recording, phase, episode=episode)
+    if len(columns["step"]) > limit:
+        raise too_many(len(columns["step"]), limit)
+    return _columns(recording, columns, int(columns["step"][0]), total)
 
 
-@router.get("/qtable", responses=BUSY, summary="The Q-table at any step: what is told of it.")
+@router.get("/qtable", responses=BUSY, summary="A summary of the Q-table at any step.")
 async def q_table(
-    run: RecordedRun,
-    request: Request,
-    cache: CacheOf,
-    processes: ProcessesOf,
+    compute: ComputationOf,
     step: Step = None,
     episode: Episode = None,
     state: Annotated[
         int | None, Query(ge=0, lt=2**31, description="Also the values of this state, with their history.")
     ] = None,
 ) -> dict[str, Any]:
-    """Return size, fill and range of each learner's exact table, as `dualtaxi qtable --json` tells it."""
-    body = await _q_table(run, request, cache, processes, step, episode, state, "json")
-    return Response(body, media_type="application/json")  # type: ignore[return-value]
+    """Return size, fill and range of each learner's exact table, as `dualtaxi qtable --json` prints it."""
+    _refuse_both(step, episode)
+    return _json(await compute(computed.q_table, step, episode, state, "json"))  # type: ignore[return-value]
 
 
 @router.get(
     "/qtable.npy",
     response_class=Response,
-    responses=media_docs("application/octet-stream") | BUSY,
-    summary="The Q-table at any step, whole.",
+    responses=media_docs(OCTETS) | BUSY,
+    summary="The whole Q-table at any step.",
 )
-async def q_table_whole(
-    run: RecordedRun,
-    request: Request,
-    cache: CacheOf,
-    processes: ProcessesOf,
-    step: Step = None,
-    episode: Episode = None,
-) -> Response:
-    """Return the exact table as a NumPy file: float64 [states, actions], of several [learners, ...]."""
-    body = await _q_table(run, request, cache, processes, step, episode, None, "npy")
-    return Response(body, media_type="application/octet-stream")
+async def whole_q_table(compute: ComputationOf, step: Step = None, episode: Episode = None) -> Response:
+    """Return the exact table as a NumPy file: float64 [states, actions], or [learners, states, actions]."""
+    _refuse_both(step, episode)
+    body = await compute(computed.q_table, step, episode, None, "npy")
+    return Response(body, media_type=OCTETS)
 
 
 @router.get(
@@ -267,65 +221,33 @@ async def q_table_whole(
     responses=media_docs(*MEDIA.values()) | BUSY,
     summary="Every metric in one figure.",
 )
-async def plot(
-    run: RecordedRun, cache: CacheOf, processes: ProcessesOf, form: Literal["svg", "png", "pdf"]
-) -> Response:
+async def plot(compute: ComputationOf, form: Literal["svg", "png", "pdf"]) -> Response:
     """Return the figure that `dualtaxi plot` draws."""
-    key = ("plot", recording_state(run), form)
-    body = await cache.get_or_await(key, lambda: processes(computed.plot, [run.recording], form), ALWAYS)
-    return Response(body, media_type=MEDIA[form])
+    return Response(await compute(computed.plot, form), media_type=MEDIA[form])
 
 
-async def _q_table(
-    run: Run,
-    request: Request,
-    cache: ResponseCache,
-    processes: ProcessPool,
-    step: int | None,
-    episode: int | None,
-    state: int | None,
-    form: Literal["json", "npy"],
-) -> bytes:
+def _refuse_both(step: int | None, episode: int | None) -> None:
     if step is not None and episode is not None:
         raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "query: found step and episode, expected one of them.")
-    key = ("qtable", recording_state(run), request.url.query, form)
-    return await cache.get_or_await(
-        key, lambda: processes(computed.q_table, run.recording, step, episode, state, form), ALWAYS
-    )
 
 
-def _bounded(start: int, stop: int | None, total: int, most: int) -> int:
-    """Return behind which record to stop.
+def _stop(start: int, stop: int | None, total: int, limit: int) -> int:
+    """Return the end of a range.
 
     Raises:
-        Refused: that is too many.
+        Refused: the range is too long.
     """
-    stop = min(start + FEW if stop is None else stop, total)
-    if stop - start > most:
-        raise too_many(stop - start, most)
+    stop = min(start + DEFAULT_RECORDS if stop is None else stop, total)
+    if stop - start > limit:
+        raise too_many(stop - start, limit)
     return stop
 
 
-async def _records(
-    run: Run,
-    cache: ResponseCache,
-    processes: ProcessPool,
-    settings: Settings,
-    which: computed.Which,
-    start: int,
-    stop: int | None,
-) -> Response:
-    """Return some records; found in a process of its own, as all of them are read for it."""
-    stop = start + FEW if stop is None else stop
-    key = ("records", recording_state(run), which, start, stop)
-    most = settings.limits.page_records
-    body = await cache.get_or_await(
-        key, lambda: processes(computed.records, run.recording, which, start, stop, most), ALWAYS
-    )
+def _json(body: bytes) -> Response:
     return Response(body, media_type="application/json")
 
 
 def _columns(recording: Recording, columns: dict[str, NDArray[Any]], start: int, total: int) -> Response:
     lists = {name: values.tolist() for name, values in columns.items()}
-    told = {"run_id": recording.run_id, "start": start, "total": total, "columns": lists}
-    return Response(computed.as_json(told), media_type="application/json")
+    page = {"run_id": recording.run_id, "start": start, "total": total, "columns": lists}
+    return _json(computed.as_json(page))

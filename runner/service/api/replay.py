@@ -1,4 +1,4 @@
-"""Episodes as a page plays them: where everything stands at each step, in words and in places."""
+"""Episodes as the pages replay them: states, positions, rewards and Q-values at each step."""
 
 from __future__ import annotations
 
@@ -28,18 +28,20 @@ router = APIRouter(
 )
 
 STEPS = 500
-"""Steps in an answer unless asked otherwise."""
-MOST_STEPS = 2000
+"""Steps in a response by default."""
+MAX_STEPS = 2000
 LONG = 3600.0
-"""Seconds that a part is kept, unless the recording changes."""
+"""Seconds that a part is cached, unless the recording changes."""
 
 Number = Annotated[int, Path(ge=0, lt=2**62, description="Counted from 0.")]
-After = Annotated[int, Path(ge=0, lt=2**62, description="The evaluation after so many training episodes.")]
+After = Annotated[
+    int, Path(ge=0, lt=2**62, description="The evaluation after this number of training episodes.")
+]
 Start = Annotated[int, Query(ge=0, lt=2**62, description="The first step, from 0.")]
-Steps = Annotated[int, Query(ge=1, le=MOST_STEPS, description="At most so many steps.")]
+Steps = Annotated[int, Query(ge=1, le=MAX_STEPS, description="Maximum number of steps.")]
 
 
-class PlayedEpisode(BaseModel, extra="allow"):
+class ReplayedEpisode(BaseModel, extra="allow"):
     """A part of an episode; frame k is the state after k steps."""
 
     title: str
@@ -49,13 +51,13 @@ class PlayedEpisode(BaseModel, extra="allow"):
     first: int
     """The step with which this part begins."""
     before: list[float]
-    """What each learner's rewards before it sum to; nothing at the beginning."""
+    """The sum of each learner's earlier rewards; empty at the beginning."""
     states: list[str]
-    """In words, each once."""
+    """The descriptions of states, each once."""
     places: list[list[int]]
-    """Of each state: x, y (hundredths of a cell) and size (percent) of each thing of the scene."""
+    """For each state: x, y (hundredths of a cell) and size (percent) of each thing of the scene."""
     state: list[int]
-    """Which of the states each frame is."""
+    """The index of each frame in `states`."""
     action: list[int]
     reward: list[list[float]]
     event: list[int]
@@ -66,7 +68,7 @@ class PlayedEpisode(BaseModel, extra="allow"):
 
 
 class Part(BaseModel):
-    """A part of an episode, and the words for what is in it."""
+    """A part of an episode, and the names of actions, learners and events."""
 
     actions: list[str]
     choices: list[list[str]]
@@ -74,10 +76,10 @@ class Part(BaseModel):
     events: list[str]
     trail: int
     scene: dict[str, Any] | None
-    episode: PlayedEpisode
+    episode: ReplayedEpisode
 
 
-@router.get("/train/{episode}", response_model=Part, summary="A part of a training episode, to be played.")
+@router.get("/train/{episode}", response_model=Part, summary="A part of a training episode, to be replayed.")
 async def training(
     run: RecordedRun,
     cache: CacheOf,
@@ -86,11 +88,11 @@ async def training(
     start: Start = 0,
     steps: Steps = STEPS,
 ) -> Response:
-    """Return steps of a training episode with the states, places, rewards, events and Q-values at each."""
+    """Return steps of a training episode: states, positions, rewards, events and Q-values."""
     return _json(await part_of(run, cache, processes, (episode,), start, steps))
 
 
-@router.get("/eval/{after}/{trial}", response_model=Part, summary="A part of a trial, to be played.")
+@router.get("/eval/{after}/{trial}", response_model=Part, summary="A part of a trial, to be replayed.")
 async def trial(
     run: RecordedRun,
     cache: CacheOf,
@@ -100,7 +102,7 @@ async def trial(
     start: Start = 0,
     steps: Steps = STEPS,
 ) -> Response:
-    """Return steps of a trial of an evaluation, as those of training."""
+    """Return steps of a trial of an evaluation, in the same form."""
     return _json(await part_of(run, cache, processes, (after, trial), start, steps))
 
 
@@ -110,12 +112,12 @@ async def part_of(
     """Return a part of an episode as JSON.
 
     Args:
-        run: whose, its recording at hand.
+        run: the run.
         cache: the cached responses.
         processes: the pool that does the work.
         which: (episode,) of training, or (training episodes before, trial) of an evaluation.
         start: the first step.
-        steps: at most so many.
+        steps: the largest number of steps.
 
     Raises:
         RecordingError: there is no such episode or step.

@@ -13,13 +13,13 @@ from fastapi.responses import RedirectResponse
 
 from runner.export.reports.rendering import View
 from runner.service.addresses import Paging
-from runner.service.api.jobs import JobResponse, Number, QueueResponse, queue_response, told
+from runner.service.api.jobs import JobResponse, Number, job_response
 from runner.service.api.uploads import OwnerOf, UploadsOf, list_uploads
 from runner.service.dependencies import JobsOf
 from runner.service.pages.rendering import page
 
 if TYPE_CHECKING:
-    from runner.service.jobs.pool import JobPool
+    from runner.service.jobs.pool import JobPool, QueueStatus
     from runner.service.jobs.store import Job
 
 router = APIRouter(prefix="/queue", include_in_schema=False)
@@ -47,7 +47,7 @@ class QueueRowsView(View):
 
     TEMPLATE: ClassVar = "queue_rows.html"
     jobs: list[ShownJob]
-    status: QueueResponse
+    status: QueueStatus
     is_active: bool
     """Whether a job is running or queued."""
     paging: Paging
@@ -123,7 +123,7 @@ def resume(jobs: JobsOf, number: Number) -> Response:
 
 def shown_job(job: Job, jobs: JobPool) -> ShownJob:
     """Return a job with its progress."""
-    facts = told(job, jobs)
+    facts = job_response(job, jobs)
     now = facts.progress
     if not now or job.state != "running":
         return ShownJob(facts, None, "")
@@ -135,12 +135,12 @@ def shown_job(job: Job, jobs: JobPool) -> ShownJob:
     return ShownJob(facts, share, f"{now['episode']:,} of {now['episodes']:,} episodes{run}")
 
 
-def _rows(jobs: JobPool, number: int) -> tuple[list[ShownJob], QueueResponse, bool, Paging]:
+def _rows(jobs: JobPool, number: int) -> tuple[list[ShownJob], QueueStatus, bool, Paging]:
     """Return the fields of `QueueRowsView`."""
     newest_first = list(reversed(jobs.store.jobs()))
     shown = [shown_job(job, jobs) for job in newest_first[(number - 1) * ROWS : number * ROWS]]
     is_active = any(job.state in ("queued", "running") for job in newest_first)
-    return shown, queue_response(jobs.status()), is_active, Paging(number, len(newest_first), ROWS, "/queue")
+    return shown, jobs.status(), is_active, Paging(number, len(newest_first), ROWS, "/queue")
 
 
 def _seconds(job: Job) -> float | None:
