@@ -1,4 +1,4 @@
-"""The catalogue as the service asks it: the index, looked after by one thread for all who ask."""
+"""The catalogue of the service: the index of runs, which one thread updates for all requests."""
 
 from __future__ import annotations
 
@@ -20,76 +20,81 @@ from runner.runs.run import Run, run_of_id
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index
 
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
-FRESH_SECONDS: Final = 1.0
-"""Folders that were looked at so recently are not looked at again; up to five, where that takes long."""
-SHARE: Final = 20
-"""One part in so many of the time is spent on looking."""
-MOST_SECONDS: Final = 5.0
-CLOSE_SECONDS: Final = 60.0
-"""How often a look also finds files that were changed in place, which takes thrice as long."""
-FIRST_SECONDS: Final = 1.0
-"""How long `can_list` waits for the first look."""
+MIN_INTERVAL: Final = 1.0
+"""Folders that were scanned this recently are not scanned again; longer where a scan takes long."""
+INTERVAL_FACTOR: Final = 20
+"""The interval between scans in units of their duration: they take a twentieth of the time."""
+MAX_INTERVAL: Final = 5.0
+FULL_INTERVAL: Final = 60.0
+"""Time between scans that also find files changed in place, which take three times as long."""
+FIRST_SCAN_SECONDS: Final = 1.0
+"""How long `can_list` waits for the first scan."""
 NEVER: Final = float("-inf")
 NOTHING: Final = Version(-1, 0)
 
 
 class Catalogue:
-    """The index of recordings folders; what it tells is a second or so old, or of now after a change here."""
+    """The index of recordings folders; a second or so old, and up to date after a change by the service.
 
-    def __init__(self, roots: Sequence[Path], tell: Callable[[str], None] = lambda _: None) -> None:
+    Args:
+        roots: the recordings folders.
+        log: called with warnings.
+    """
+
+    def __init__(self, roots: Sequence[Path], log: Callable[[str], None] = lambda _: None) -> None:
         self.roots = tuple(roots)
-        self._tell = tell
-        self._looker = ThreadPoolExecutor(1, thread_name_prefix="catalogue")
+        self._log = log
+        self._scanner = ThreadPoolExecutor(1, thread_name_prefix="catalogue")
         self._lock = threading.Lock()
-        self._look: Future[None] | None = None
-        self._asked = self._changed = self._looked = self._looked_closely = NEVER
-        self._took = 0.0
-        self._seen = NOTHING
+        self._scan: Future[None] | None = None
+        self._started = self._changed = self._scanned = self._fully_scanned = NEVER
+        self._duration = 0.0
+        self._scanned_version = NOTHING
 
     def close(self) -> None:
-        """Wait for the look that is under way, and begin none again."""
-        self._looker.shutdown(cancel_futures=True)
+        """Wait for the running scan, and start no more."""
+        self._scanner.shutdown(cancel_futures=True)
 
     def version(self) -> Version | None:
-        """Return what changes with every change of what is known; None if that must be looked for first."""
+        """Return what changes with every change of the index; None if the folders must be scanned first."""
         now = version()
-        if now is None or not self._is_known(now):
+        if now is None or not self._is_current(now):
             return None
-        self._look_if_due()
+        self._scan_if_due()
         return now
 
     def changed(self) -> None:
-        """Say that a run is not as it was: whoever asks from now on is told of it as it is."""
+        """Note that a run has changed: later requests see the change."""
         self._changed = time.monotonic()
 
     def state(self) -> Hashable:
-        """Return what an answer depends on: it may be given again while this is the same."""
+        """Return a key of cached responses, which changes with the runs."""
         return self.version() or self._changed
 
     def prepare(self) -> None:
-        """Begin the first look, so that the first request need not wait for all of it."""
-        self._begin_look()
+        """Start the first scan, so that the first request need not wait for all of it."""
+        self._start_scan()
 
-    def read(self, work: Callable[[Index], Found]) -> Found:
-        """Return what some work finds in the index.
+    def read(self, work: Callable[[Index], Result]) -> Result:
+        """Return the result of a function of the index.
 
         Raises:
             StorageError: a recordings folder cannot be read.
         """
         if self.version() is None:
-            self._begin_look().result()
-        return look(self.roots, work, self._tell, cached=self.version() is not None)
+            self._start_scan().result()
+        return look(self.roots, work, self._log, cached=self.version() is not None)
 
     def can_list(self) -> bool:
-        """Return whether runs can be listed, by what the last look found; waits for none but the first."""
-        if self._looked == NEVER or time.monotonic() - self._asked > CLOSE_SECONDS:
-            self._begin_look()
-        latest = self._look
+        """Return whether runs can be listed, according to the last scan; waits for the first scan only."""
+        if self._scanned == NEVER or time.monotonic() - self._started > FULL_INTERVAL:
+            self._start_scan()
+        latest = self._scan
         try:
-            if latest is not None and (self._looked == NEVER or latest.done()):
-                latest.result(FIRST_SECONDS)
+            if latest is not None and (self._scanned == NEVER or latest.done()):
+                latest.result(FIRST_SCAN_SECONDS)
             for root in filter(os.path.lexists, self.roots):  # a missing one has no runs
                 with os.scandir(root) as entries:
                     next(entries, None)
@@ -98,7 +103,7 @@ class Catalogue:
         return True
 
     def find(self, name: str) -> Run:
-        """Return the run that an id, the beginning of one, a name or `@latest` names; no path does.
+        """Return the run with an id, the beginning of one, a name or `@latest`; never by a path.
 
         Raises:
             RunNotFound: no run matches the name, or several do.
@@ -109,8 +114,8 @@ class Catalogue:
             if known is not None:
                 return known
         candidates = self.read(lambda index: matching(name, index))
-        if len(candidates) != 1:  # it may be newer than the last look
-            candidates = look(self.roots, lambda index: matching(name, index), self._tell)
+        if len(candidates) != 1:  # it may be newer than the last scan
+            candidates = look(self.roots, lambda index: matching(name, index), self._log)
         if not candidates:
             raise self.read(lambda index: not_found(name, index, self.roots[0]))
         return choose(name, candidates).run()
@@ -125,38 +130,38 @@ class Catalogue:
         alike = self.read(lambda index: of_name(name, index))
         return [found.run() for found in alike] or [self.find(name)]
 
-    def _is_known(self, now: Version) -> bool:
-        """Return whether a look not long ago saw to it that the index agrees with the folders."""
-        recent = time.monotonic() - self._looked < 3 * self._interval
-        same_file = now.file == self._seen.file and now.changes >= self._seen.changes
-        return recent and same_file and self._looked > self._changed
+    def _is_current(self, now: Version) -> bool:
+        """Return whether a recent scan has updated the index."""
+        recent = time.monotonic() - self._scanned < 3 * self._interval
+        same_file = now.file == self._scanned_version.file and now.changes >= self._scanned_version.changes
+        return recent and same_file and self._scanned > self._changed
 
     @property
     def _interval(self) -> float:
-        return min(max(FRESH_SECONDS, SHARE * self._took), MOST_SECONDS)
+        return min(max(MIN_INTERVAL, INTERVAL_FACTOR * self._duration), MAX_INTERVAL)
 
-    def _look_if_due(self) -> None:
-        if time.monotonic() - self._asked > self._interval:
-            self._begin_look()
+    def _scan_if_due(self) -> None:
+        if time.monotonic() - self._started > self._interval:
+            self._start_scan()
 
-    def _begin_look(self) -> Future[None]:
-        """Return a look that begins now, or that is under way and began after the last change."""
+    def _start_scan(self) -> Future[None]:
+        """Return a scan that starts now, or one that runs and started after the last change."""
         with self._lock:
-            if self._look is None or self._look.done() or self._asked <= self._changed:
-                self._asked = time.monotonic()
-                self._look = self._looker.submit(self._do_look)
-            return self._look
+            if self._scan is None or self._scan.done() or self._started <= self._changed:
+                self._started = time.monotonic()
+                self._scan = self._scanner.submit(self._do_scan)
+            return self._scan
 
-    def _do_look(self) -> None:
+    def _do_scan(self) -> None:
         began = time.monotonic()
-        closely = began - self._looked_closely > CLOSE_SECONDS
-        look(self.roots, lambda _: None, self._tell, depth=Depth.FILES if closely else Depth.FOLDERS)
-        self._seen = version() or NOTHING
-        self._looked = began
-        if closely:
-            self._looked_closely = began
+        is_full = began - self._fully_scanned > FULL_INTERVAL
+        look(self.roots, lambda _: None, self._log, depth=Depth.FILES if is_full else Depth.FOLDERS)
+        self._scanned_version = version() or NOTHING
+        self._scanned = began
+        if is_full:
+            self._fully_scanned = began
         else:
-            self._took = time.monotonic() - began
+            self._duration = time.monotonic() - began
 
 
 def _refuse_path(name: str) -> None:

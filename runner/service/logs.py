@@ -1,4 +1,4 @@
-"""What the service says of itself: a JSON object a line, of every request and event; no secret is in it."""
+"""The service's log: a JSON object a line, for every request and event, without secrets."""
 
 from __future__ import annotations
 
@@ -13,128 +13,117 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from logging.handlers import QueueHandler, QueueListener
-from typing import TYPE_CHECKING, Any, Final, TextIO
+from typing import Any, Final, TextIO
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from runner.service.tokens import PREFIX
 
-if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
-
 NAME: Final = "dualtaxi.service"
 LOG: Final = logging.getLogger(NAME)
+MAX_WAITING: Final = 5_000
+"""Lines that wait to be written; more, if nobody reads them, are dropped and counted."""
+FLUSH_SECONDS: Final = 2.0
+"""How long the remaining lines may take at the end."""
 _LOGGERS: Final = (NAME, "uvicorn.error")
 _SECRET: Final = re.compile(re.escape(PREFIX) + r"[\w-]{20,}")
 _OWN: Final = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName", "color_message"}
-MOST_WAITING: Final = 5_000
-"""Lines that wait to be written; more, if nobody reads them, are left out, and counted."""
-GOODBYE_SECONDS: Final = 2.0
-"""How long, in the end, those that still wait may take."""
-_LONGEST_PATH: Final = 2_000
+_MAX_PATH: Final = 2_000
 _QUIET: Final = ("/healthz", "/readyz", "/static/")
-"""Requests that are not logged when all went well."""
+"""Successful requests below these paths are not logged."""
 
 
-class JsonLines(logging.Formatter):
-    """A record as one line of JSON: time, level, event, and what was said besides."""
+class TextFormatter(logging.Formatter):
+    """Formats a record as a line for people, without secrets."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
+        return _SECRET.sub(f"{PREFIX}***", self.line(record))
+
+    def line(self, record: logging.LogRecord) -> str:
+        """Return the line, perhaps with secrets."""
+        return super().format(record)
+
+
+class JsonFormatter(TextFormatter):
+    """Formats a record as one line of JSON: time, level, event, and its extra fields; without secrets."""
+
+    def line(self, record: logging.LogRecord) -> str:
+        """Return the line, perhaps with secrets."""
         moment = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-        told = {"time": moment, "level": record.levelname.lower(), "event": record.getMessage()}
-        told |= {key: value for key, value in vars(record).items() if key not in _OWN}
+        fields = {"time": moment, "level": record.levelname.lower(), "event": record.getMessage()}
+        fields |= {key: value for key, value in vars(record).items() if key not in _OWN}
         if record.exc_info:
-            told["traceback"] = self.formatException(record.exc_info)
-        return without_secrets(json.dumps(told, ensure_ascii=False, default=str))
-
-
-class Plain(logging.Formatter):
-    """A record as a line for people."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
-        return without_secrets(super().format(record))
-
-
-def without_secrets(text: str) -> str:
-    """Return a text without the tokens in it."""
-    return _SECRET.sub(f"{PREFIX}***", text)
+            fields["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(fields, ensure_ascii=False, default=str)
 
 
 @contextlib.contextmanager
 def logged_to(stream: TextIO, for_people: bool = False) -> Iterator[None]:
-    """Have the service log to a file or a pipe: everything as JSON lines, or to people what went wrong.
+    """Log to a file or a pipe in the block: everything as JSON lines, or warnings as text for people.
 
-    It is written by a thread of its own: a pipe that nobody reads keeps nobody waiting but that thread.
+    A thread of its own writes the log, so that a pipe that nobody reads does not block the service.
     """
-    waiting: queue.Queue[logging.LogRecord] = queue.Queue(MOST_WAITING)
-    output = _Waiting(waiting)
-    output.setFormatter(Plain() if for_people else JsonLines())
+    lines: queue.Queue[logging.LogRecord] = queue.Queue(MAX_WAITING)
+    handler = _DroppingHandler(lines)
+    handler.setFormatter(TextFormatter() if for_people else JsonFormatter())
     for name in _LOGGERS:
         logger = logging.getLogger(name)
-        logger.handlers, logger.propagate = [output], False
+        logger.handlers, logger.propagate = [handler], False
         logger.setLevel(logging.WARNING if for_people else logging.INFO)
-    listener = _Writer(waiting, _Lines(stream.fileno()))
+    listener = _Listener(lines, _DescriptorHandler(stream.fileno()))
     listener.start()
     try:
         yield
     finally:
         for name in _LOGGERS:
-            logging.getLogger(name).removeHandler(output)
+            logging.getLogger(name).removeHandler(handler)
         end = threading.Thread(target=listener.stop, daemon=True)
         end.start()
-        end.join(GOODBYE_SECONDS)
+        end.join(FLUSH_SECONDS)
 
 
-class _Waiting(QueueHandler):
-    """Puts lines where they wait to be written; those that find no room are counted."""
+class _DroppingHandler(QueueHandler):
+    """Drops and counts records while the queue is full, where a `QueueHandler` prints a traceback each."""
 
-    left_out = 0
+    dropped = 0
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Have a line wait, behind the notice of those that were left out."""
         try:
-            if self.left_out:
-                self.queue.put_nowait(self.prepare(self._notice()))
-                self.left_out = 0
+            if self.dropped:
+                fields = {"name": NAME, "levelno": logging.WARNING, "levelname": "WARNING"}
+                fields |= {"msg": "lines left out", "lines": self.dropped}
+                self.queue.put_nowait(self.prepare(logging.makeLogRecord(fields)))
+                self.dropped = 0
             self.queue.put_nowait(record)
         except queue.Full:
-            self.left_out += 1
-
-    def _notice(self) -> logging.LogRecord:
-        facts = {"name": NAME, "levelno": logging.WARNING, "levelname": "WARNING", "msg": "lines left out"}
-        return logging.makeLogRecord(facts | {"lines": self.left_out})
+            self.dropped += 1
 
 
-class _Writer(QueueListener):
-    """Writes the lines that wait."""
-
+class _Listener(QueueListener):
     def enqueue_sentinel(self) -> None:
-        """Have it end behind the last line, also where there is no room for a sign of that yet."""
+        """Wait for a place in the queue, where a `QueueListener` would raise `queue.Full`."""
         self.queue.put(self._sentinel)  # type: ignore[attr-defined]
 
 
-class _Lines(logging.Handler):
-    """Writes lines to a file descriptor, for one thread, without buffer or lock: a process may end then."""
+class _DescriptorHandler(logging.Handler):
+    """Writes lines to a file descriptor, without buffer or lock: the process may end during a write."""
 
     def __init__(self, descriptor: int) -> None:
         super().__init__()
         self._descriptor = descriptor
 
     def handle(self, record: logging.LogRecord) -> bool:
-        """Write a line, without the lock that the end of a process asks for."""
-        self.emit(record)
-        return True
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Write a line; one that cannot be written is no reason to stop."""
+        """Write a line, without the lock that `logging.shutdown` waits for."""
         line = memoryview(f"{record.getMessage()}\n".encode(errors="replace"))
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # a log that cannot be written does not stop the service
             while line:
                 line = line[os.write(self._descriptor, line) :]
+        return True
 
 
 class AccessLog:
-    """Logs each request when its answer is over: who, what, how it went, how long it took."""
+    """Middleware that logs each request when its response is complete."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -144,30 +133,26 @@ class AccessLog:
         if scope["type"] != "http" or not LOG.isEnabledFor(logging.INFO):
             await self._app(scope, receive, send)
             return
-        began, answer = time.perf_counter(), {"status": 0, "bytes": 0}
+        began, status, size = time.perf_counter(), 0, 0
 
-        async def sending(message: Message) -> None:
+        async def count(message: Message) -> None:
+            nonlocal status, size
             if message["type"] == "http.response.start":
-                answer["status"] = message["status"]
-            answer["bytes"] += len(message.get("body", b""))
+                status = message["status"]
+            size += len(message.get("body", b""))
             await send(message)
 
         try:
-            await self._app(scope, receive, sending)
+            await self._app(scope, receive, count)
         finally:
-            if answer["status"] >= 400 or not scope["path"].startswith(_QUIET):
-                LOG.info("request", extra=_told(scope) | answer | {"seconds": _since(began)})
-
-
-def _told(scope: Scope) -> dict[str, Any]:
-    client = scope.get("client")
-    query = scope["query_string"].decode("latin-1")
-    return {
-        "client": client[0] if client else None,
-        "method": scope["method"],
-        "path": (scope["path"] + (f"?{query}" if query else ""))[:_LONGEST_PATH],
-    }
-
-
-def _since(began: float) -> float:
-    return round(time.perf_counter() - began, 4)
+            path, query = scope["path"], scope["query_string"].decode("latin-1")
+            if status >= 400 or not path.startswith(_QUIET):
+                fields: dict[str, Any] = {
+                    "client": scope["client"][0] if scope.get("client") else None,
+                    "method": scope["method"],
+                    "path": (f"{path}?{query}" if query else path)[:_MAX_PATH],
+                    "status": status,
+                    "bytes": size,
+                    "seconds": round(time.perf_counter() - began, 4),
+                }
+                LOG.info("request", extra=fields)

@@ -1,4 +1,4 @@
-"""The service, run: a server that gives slow clients up and stops without cutting anything off."""
+"""Running the service: slow clients are cut off, and running requests are completed at a stop."""
 
 from __future__ import annotations
 
@@ -6,29 +6,27 @@ import asyncio
 import socket
 import struct
 from types import FrameType
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import uvicorn
+from fastapi import FastAPI
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from runner.errors import RunnerError
+from runner.service.settings import Limits, Settings
 
-if TYPE_CHECKING:
-    from fastapi import FastAPI
-
-    from runner.service.settings import Limits, Settings
-
-MOST_HEAD_BYTES: Final = 64 << 10
-"""Of a request's address and headers."""
+MAX_HEAD_BYTES: Final = 64 << 10
+"""Size of a request's target and headers."""
 BACKLOG: Final = 1024
-_AT_ONCE: Final = struct.pack("ii", 1, 0)
+_DISCARD: Final = struct.pack("ii", 1, 0)
+"""The option SO_LINGER: discard unsent data when the socket is closed."""
 
 
 def bind(settings: Settings) -> socket.socket:
-    """Return the socket that the service will listen on; its port is known now.
+    """Return the socket that the service will listen on, so that its port is known before it starts.
 
     Raises:
-        RunnerError: the host or port cannot be had.
+        RunnerError: the host or port is not available.
     """
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
@@ -36,7 +34,7 @@ def bind(settings: Settings) -> socket.socket:
     except OSError as error:
         raise RunnerError(
             f"{settings.host}:{settings.port}: cannot listen there ({error.strerror}); choose another by "
-            "--port (0: any that is free) or --host."
+            "--port (0 for any free one) or --host."
         ) from error
 
 
@@ -47,10 +45,10 @@ def url_of(listening: socket.socket) -> str:
 
 
 def serve(app: FastAPI, settings: Settings, listening: socket.socket) -> None:
-    """Serve until the process is told to stop, then let what is under way come to its end.
+    """Serve until SIGINT or SIGTERM, then complete running requests.
 
     Raises:
-        RunnerError: the service cannot begin: another one serves these recordings.
+        RunnerError: another process serves these recordings.
     """
     config = uvicorn.Config(
         app,
@@ -78,7 +76,7 @@ def serve(app: FastAPI, settings: Settings, listening: socket.socket) -> None:
 
 
 class _Server(uvicorn.Server):
-    """Tells answers that go on for long (events) that they are to end."""
+    """Ends event streams when the server stops."""
 
     def __init__(self, config: uvicorn.Config, stopping: asyncio.Event) -> None:
         super().__init__(config)
@@ -86,12 +84,15 @@ class _Server(uvicorn.Server):
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         super().handle_exit(sig, frame)
-        self._captured_signals.clear()  # which would be raised again behind a stop that went well
+        self._captured_signals.clear()  # uvicorn would raise them again after the stop
         self._stopping.set()
 
 
 def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
-    """Return HTTP/1.1 as uvicorn speaks it, with limits on how long and how slow a client may be."""
+    """Return uvicorn's HTTP/1.1 with limits on the head of a request and on slow clients.
+
+    Uvicorn itself has no such limits, see docs/decisions/uvicorn-limits.md.
+    """
 
     class Protocol(HttpToolsProtocol):
         _timer: asyncio.TimerHandle | None = None
@@ -100,19 +101,19 @@ def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
             connection = transport.get_extra_info("socket")
-            if connection is not None:  # asyncio does it for sockets that it made itself alone
+            if connection is not None:  # asyncio does this only for sockets that it made itself
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._await(limits.header_seconds)
+            self._set_timer(limits.header_seconds)
 
         def connection_lost(self, exc: Exception | None) -> None:
-            self._await(None)
+            self._set_timer(None)
             super().connection_lost(exc)
 
         def data_received(self, data: bytes) -> None:
             super().data_received(data)
-            idle = self.cycle is None or self.cycle.response_complete
-            if idle and self._timer is None and not self.transport.is_closing():
-                self._await(limits.header_seconds)
+            is_idle = self.cycle is None or self.cycle.response_complete
+            if is_idle and self._timer is None and not self.transport.is_closing():
+                self._set_timer(limits.header_seconds)
 
         def on_message_begin(self) -> None:
             self._head_bytes = 0
@@ -127,33 +128,33 @@ def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
             super().on_header(name, value)
 
         def on_headers_complete(self) -> None:
-            self._await(None)
+            self._set_timer(None)
             super().on_headers_complete()
 
         def pause_writing(self) -> None:
             super().pause_writing()
-            self._await(limits.idle_seconds)
+            self._set_timer(limits.idle_seconds)
 
         def resume_writing(self) -> None:
-            self._await(None)
+            self._set_timer(None)
             super().resume_writing()
 
         def _count(self, part: bytes) -> None:
             self._head_bytes += len(part) + 4
-            if self._head_bytes > MOST_HEAD_BYTES:
-                raise ValueError("the head of a request is too long")
+            if self._head_bytes > MAX_HEAD_BYTES:
+                raise ValueError("the head of the request is too long")
 
-        def _await(self, seconds: float | None) -> None:
-            """Cut the connection off unless something comes in time; None: it came."""
+        def _set_timer(self, seconds: float | None) -> None:
+            """Close the connection unless this is called again in time; None to stop the timer."""
             if self._timer is not None:
                 self._timer.cancel()
-            self._timer = None if seconds is None else self.loop.call_later(seconds, self._cut_off)
+            self._timer = None if seconds is None else self.loop.call_later(seconds, self._abort)
 
-        def _cut_off(self) -> None:
+        def _abort(self) -> None:
             self._timer = None
             connection = self.transport.get_extra_info("socket")
-            if connection is not None:  # so that the system does not go on sending what it has
-                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
+            if connection is not None:  # else the system would go on sending
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _DISCARD)
             self.transport.abort()
 
     return Protocol

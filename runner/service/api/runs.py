@@ -30,12 +30,12 @@ router = APIRouter(tags=["runs"])
 
 
 class RunsPage(BaseModel):
-    """Some of the runs that fit."""
+    """Some of the matching runs."""
 
     runs: list[dict[str, Any]]
-    """Each by column, as `dualtaxi ls --json` tells of it."""
+    """Each by column, as in `dualtaxi ls --json`."""
     total: int
-    """How many fit."""
+    """The number of matching runs."""
     offset: int
     limit: int
 
@@ -44,16 +44,16 @@ class RunsPage(BaseModel):
     "/runs",
     response_model=RunsPage,
     responses=error_docs(HTTPStatus.BAD_REQUEST),
-    summary="List the runs that fit a filter, the newest first.",
+    summary="List the runs that match a filter, the newest first.",
 )
 async def list_runs(
     request: Request,
     catalogue: CatalogueOf,
     cache: CacheOf,
     settings: SettingsOf,
-    filter: Annotated[str, Query(max_length=3000, description="As `dualtaxi ls` takes it.")] = "",  # noqa: A002
-    sort: Annotated[str, Query(max_length=500, description="Fields; `-FIELD`: the largest first.")] = "",
-    columns: Annotated[str, Query(max_length=1500, description="Fields to tell; else the usual ones.")] = "",
+    filter: Annotated[str, Query(max_length=3000, description="As for `dualtaxi ls`.")] = "",  # noqa: A002
+    sort: Annotated[str, Query(max_length=500, description="Fields; `-FIELD` for descending order.")] = "",
+    columns: Annotated[str, Query(max_length=1500, description="Fields; default: the usual ones.")] = "",
     limit: Annotated[int, Query(ge=0)] = 50,
     offset: Annotated[int, Query(ge=0, lt=2**31)] = 0,
 ) -> Response:
@@ -79,19 +79,19 @@ async def list_runs(
     return Response(await cache.get_or_make(key, make), media_type="application/json")
 
 
-class Labels(BaseModel):
-    """What is to be changed in what people say of a run; what is left out stays."""
+class LabelChanges(BaseModel):
+    """Changes to the labels of a run; what is omitted stays."""
 
     name: Annotated[
-        str | None, Field(max_length=100, description="What it is called; empty: as at first.")
+        str | None, Field(max_length=100, description="The new name; empty for the original one.")
     ] = None
     tag: Annotated[list[str], Field(max_length=MAX_TAGS, description="Tags to add.")] = []
     untag: Annotated[list[str], Field(max_length=MAX_TAGS, description="Tags to remove.")] = []
-    note: Annotated[str | None, Field(max_length=MAX_NOTE, description="Empty: none.")] = None
+    note: Annotated[str | None, Field(max_length=MAX_NOTE, description="Empty for none.")] = None
 
 
-class Labelled(BaseModel):
-    """What people say of a run."""
+class LabelsResponse(BaseModel):
+    """The labels of a run."""
 
     run_id: str
     name: str
@@ -99,8 +99,8 @@ class Labelled(BaseModel):
     note: str
 
 
-class Described(BaseModel, extra="allow"):
-    """All about a run but its series, which have addresses of their own."""
+class RunResponse(BaseModel, extra="allow"):
+    """Everything about a run except its series, which have routes of their own."""
 
     run_id: str
     name: str
@@ -116,23 +116,23 @@ class Described(BaseModel, extra="allow"):
 
 @router.get(
     "/runs/{run}",
-    response_model=Described,
+    response_model=RunResponse,
     responses=error_docs(HTTPStatus.NOT_FOUND),
-    summary="All about a run.",
+    summary="Everything about a run.",
 )
 def one_run(run: FoundRun, settings: SettingsOf) -> Response:
-    """Return what `dualtaxi show --json` tells, with the last evaluation instead of all series."""
+    """Return what `dualtaxi show --json` prints, with the last evaluation instead of all series."""
     return Response(as_json(summary_of(run, settings)), media_type="application/json")
 
 
 def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
-    """Return all about a run but its series; what `run.json` says if its recording cannot be read."""
+    """Return everything about a run except its series; only `run.json` if its recording cannot be read."""
     problems: list[str] = []
     error = run.summary.error
-    told = describe_run(run, problems.append)
-    series = {name: told.pop(name) for name in ("eval", "train", "optimality")}
-    del told["path"]
-    return told | {
+    facts = describe_run(run, problems.append)
+    series = {name: facts.pop(name) for name in ("eval", "train", "optimality")}
+    del facts["path"]
+    return facts | {
         "tags": list(run.tags),
         "note": run.note,
         "last_evaluation": (series["eval"] or [None])[-1],
@@ -144,17 +144,17 @@ def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
 
 @router.patch(
     "/runs/{run}",
-    response_model=Labelled,
+    response_model=LabelsResponse,
     responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
-    summary="Rename, tag, and note.",
+    summary="Change name, tags and note.",
 )
-def label_run(run: FoundRun, labels: Labels, catalogue: CatalogueOf) -> dict[str, Any]:
+def label_run(run: FoundRun, labels: LabelChanges, catalogue: CatalogueOf) -> dict[str, Any]:
     """Change the labels of a run as `dualtaxi label` does, and return them."""
     return relabelled(run, labels, catalogue)
 
 
-def relabelled(run: Run, labels: Labels, catalogue: Catalogue) -> dict[str, Any]:
-    """Change the labels of a run, and return them; errors as of `label`."""
+def relabelled(run: Run, labels: LabelChanges, catalogue: Catalogue) -> dict[str, Any]:
+    """Change the labels of a run, and return them; errors as for `label`."""
     now = label(run, labels.name, labels.note, labels.tag, labels.untag)
     catalogue.changed()
     return {"run_id": run.run_id, "name": now.name or run.file.name, "tags": list(now.tags), "note": now.note}

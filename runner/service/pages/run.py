@@ -26,7 +26,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.api.replay import LONG
-from runner.service.api.runs import Labels, relabelled
+from runner.service.api.runs import LabelChanges, relabelled
 from runner.service.dependencies import (
     CacheOf,
     CatalogueOf,
@@ -152,7 +152,7 @@ def label(
 ) -> Response:
     """Change the labels of a run."""
     tags = form.get("tags", "").split()
-    changed = Labels.model_construct(
+    changed = LabelChanges.model_construct(
         name=form.get("name", "").strip(),
         tag=tags,
         untag=sorted(set(run.tags) - set(tags)),
