@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from runner.analysis.frames import transition_columns
 from runner.cli import Command
 from runner.cli.options import (
     FILE,
@@ -162,6 +161,7 @@ def table_command(env_id: str, overrides: tuple[str, ...], as_json: bool) -> Non
       dualtaxi table --set env.kwargs.slip=0.1 > slippery.csv
       dualtaxi table --env FrozenLake-v1 --set env.kwargs.is_slippery=false
     """
+    from runner.analysis.frames import transition_columns
     from runner.config import from_mapping
     from runner.environments.loading import load_mdp
 

@@ -230,7 +230,7 @@ def test_a_killed_run_is_archived_and_restored(run, recordings, command):
     back = find_run(run.run_id, recordings)
     assert back.status == "interrupted"
     assert back.recording.exists()
-    assert "it was there already" in done(command("archive", run.run_id, "--remove"))
+    assert "existed already" in done(command("archive", run.run_id, "--remove"))
     assert not back.recording.exists()
 
 
@@ -292,7 +292,7 @@ def test_two_processes_do_not_write_the_same_archive_at_once(run, recordings, co
         assert folder.is_dir()
         with open_recording(run.recording) as recording:
             writing.write_archive(recording, folder)
-    assert "it was there already" in done(command("archive", run.run_id, "--remove"))
+    assert "existed already" in done(command("archive", run.run_id, "--remove"))
     assert [path.name for path in to.iterdir()] == [run.run_id]
 
 

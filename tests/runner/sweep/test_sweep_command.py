@@ -51,7 +51,7 @@ def test_a_sweep_is_run_shown_and_its_best_is_a_configuration(type_in, file, tmp
 
 def test_a_limit_stops_it_and_a_raised_one_goes_on(type_in, file, tmp_path):
     stopped = type_in("run", str(file(limits={"runs": 3})), "--workers", "1", code=1)
-    assert "limits.runs: 3 runs were started. --resume goes on from there." in stopped.output
+    assert "limits.runs: 3 runs were started. --resume continues from there." in stopped.output
     assert len(list_runs(tmp_path / "runs")) == 3
     type_in("run", str(file()), "--workers", "1", "--resume")
     assert len(list_runs(tmp_path / "runs")) == 12
