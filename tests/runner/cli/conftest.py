@@ -1,4 +1,4 @@
-"""What the tests of the command line share: a way to call it, and a recordings folder with a run."""
+"""Fixtures of the tests of the command line: a caller, and a recordings folder with a run."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ seed: 3
 evaluation: {every: 10, trials: 5}
 log: {every_steps: 200, window: 100}
 """
-"""Done in a blink: 30 episodes of at most 40 steps, evaluations after 0, 10, 20 and 30."""
+"""Takes milliseconds: 30 episodes of at most 40 steps, evaluations after 0, 10, 20 and 30."""
 
 
 class Command:
-    """The command line, called in this process; with the folder of runs that it is to use."""
+    """The command line, called in this process, with a recordings folder."""
 
     def __init__(self, recordings: Path) -> None:
         self.recordings = recordings
 
     def __call__(self, *words: object, **kwargs: object) -> Result:
         return CliRunner().invoke(
-            cli, [str(word) for word in words], env={"DUALTAXI_RECORDINGS": str(self.recordings)}, **kwargs
+            cli, list(map(str, words)), env={"DUALTAXI_RECORDINGS": str(self.recordings)}, **kwargs
         )
 
     def json(self, *words: object) -> object:
-        """Return what a command prints with --json."""
+        """Return the object that a command prints with --json."""
         result = self(*words, "--json")
         assert result.exit_code == 0, result.output
         return json.loads(result.stdout)

@@ -29,7 +29,7 @@ def test_several_problems_follow_the_word_error(command, bad):
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["show", "nosuch"], "no run 'nosuch'"),
         (["ls", "status:::"], "unexpected ':'"),
@@ -39,15 +39,15 @@ def test_several_problems_follow_the_word_error(command, bad):
     ],
     ids=lambda words: " ".join(words) if isinstance(words, list) else "",
 )
-def test_an_error_is_said_to_be_one_in_words_and_as_json(command, words, said):
+def test_an_error_is_text_or_json(command, words, message):
     plain = command(*words)
     assert plain.exit_code == 2
     assert "Error: " in plain.stderr
-    assert said in plain.stderr
+    assert message in plain.stderr
     if words[0] == "view":
         return  # has nothing to print as JSON
     error = json.loads(command(*words, "--json").stderr.splitlines()[-1])["error"]
-    assert said in error["message"]
+    assert message in error["message"]
     assert (error["exit_code"], error["problems"]) == (2, [])
 
 
@@ -65,14 +65,14 @@ def test_runs_that_cannot_be_pushed_are_errors_too(command):
     assert json.loads(command(*words, "--json").stderr)["error"]["run"] == "nosuch"
 
 
-def test_a_place_that_cannot_be_written_is_wrong_input_and_a_full_disk_is_not():
+def test_an_unwritable_path_is_wrong_usage_and_a_full_disk_is_not():
     for number, code in ((errno.ENOENT, 2), (errno.EACCES, 2), (errno.ENOSPC, 1), (errno.EIO, 1)):
         error = StorageError("cannot be written")
         error.__cause__ = OSError(number, "x")
         assert exit_code_of(error) == code
 
 
-def test_the_folders_of_a_new_file_are_made(recorded, tmp_path):
+def test_parent_folders_of_output_are_created(recorded, tmp_path):
     path = tmp_path / "none" / "deep" / "plot.svg"
     assert recorded("plot", "tiny", "-o", path).exit_code == 0
     assert path.is_file()

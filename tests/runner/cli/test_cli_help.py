@@ -1,4 +1,4 @@
-"""Help is complete, true and quick."""
+"""Help is complete, correct and quick."""
 
 import inspect
 import itertools
@@ -31,7 +31,7 @@ NAMES = [" ".join(path) for path, _ in EVERY]
 
 
 @pytest.mark.parametrize(("path", "command"), EVERY, ids=NAMES)
-def test_every_command_tells_what_it_does_with_an_example(path, command):
+def test_help_has_an_example_for_every_command(path, command):
     text = CliRunner().invoke(cli, [*path, "--help"]).stdout
     assert "Example" in text
     assert f"dualtaxi {' '.join(path)}" in text
@@ -84,10 +84,10 @@ def test_the_table_of_commands_is_what_help_shows():
             assert any(line.split() == [name, *about.split()] for line in text.splitlines())
 
 
-def test_help_tells_the_exit_codes_and_the_folder():
+def test_help_names_the_exit_codes_and_the_folder():
     text = CliRunner().invoke(cli, ["--help"]).stdout
-    for told in ("130", "interrupted", "wrong usage", "DUALTAXI_RECORDINGS", "@latest", "NO_COLOR"):
-        assert told in text
+    for values in ("130", "interrupted", "wrong usage", "DUALTAXI_RECORDINGS", "@latest", "NO_COLOR"):
+        assert values in text
 
 
 def test_an_unknown_command_is_refused_with_the_nearest():

@@ -1,4 +1,4 @@
-"""A run that is told to stop ends properly."""
+"""Interrupted runs end properly."""
 
 import json
 import signal
@@ -20,7 +20,7 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signa
 
 
 def _heeding():
-    """Undo what a shell does to the background: there SIGINT is ignored."""
+    """Restore SIGINT, which a shell ignores for background processes."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -53,17 +53,17 @@ def test_a_signal_ends_a_run_properly(tiny, tmp_path, number):
     process.send_signal(number)
     out, err = process.communicate(timeout=30)
 
-    told = json.loads(out)
+    values = json.loads(out)
     (run,) = list_runs(recordings)
     assert process.returncode == 130, err
     assert "Interrupted: " in err
     assert str(run.recording) in err
     assert "Traceback" not in err
-    assert run.status == told["status"] == "interrupted"
+    assert run.status == values["status"] == "interrupted"
     with runner.open_recording(run.recording) as recording:
         assert recording.finished
-        assert recording.result["content_digest"] == told["content_digest"]
-        assert len(recording.episodes("train")) == told["episodes"] > 0
+        assert recording.result["content_digest"] == values["content_digest"]
+        assert len(recording.episodes("train")) == values["episodes"] > 0
 
 
 class Interrupting:
@@ -79,7 +79,7 @@ class Interrupting:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_from_python_it_raises_when_the_file_is_closed(tiny, tmp_path, number):
+def test_from_python_an_interrupt_raises_after_the_file_is_closed(tiny, tmp_path, number):
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with pytest.raises(KeyboardInterrupt, match="was interrupted; what it recorded is in"):
         runner.run(tiny, overrides=LONG[1::2], recordings=tmp_path / "runs", report=Interrupting(number))
@@ -89,7 +89,7 @@ def test_from_python_it_raises_when_the_file_is_closed(tiny, tmp_path, number):
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
 
-def test_beside_the_main_thread_signals_are_left_alone(tiny, tmp_path):
+def test_signals_are_caught_only_on_the_main_thread(tiny, tmp_path):
     found = []
     before = signal.getsignal(signal.SIGINT)
 
@@ -115,7 +115,7 @@ def test_the_second_signal_is_not_caught():
     assert came == [signal.SIGTERM]
 
 
-def test_the_second_signal_is_what_it_was_unless_told():
+def test_the_second_signal_has_the_previous_handler_by_default():
     with interruptible():
         signal.raise_signal(signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):
@@ -140,8 +140,8 @@ def test_only_an_empty_run_is_removed(tiny, tmp_path, recorded):
 
 @posix
 @pytest.mark.parametrize("module", ["click", "runner.errors", "runner.api"])
-def test_a_signal_while_the_command_line_is_loaded_is_no_traceback(tiny, tmp_path, module):
-    """The signal comes just when this module is imported."""
+def test_a_signal_during_imports_prints_no_traceback(tiny, tmp_path, module):
+    """The signal arrives while this module is imported."""
     program = f"""
 import signal, sys
 

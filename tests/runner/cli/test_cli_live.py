@@ -7,7 +7,7 @@ import socket
 from runner.export.rerun import live, viewer
 
 
-def test_a_run_goes_on_when_its_viewer_takes_nothing(command, tiny, monkeypatch):
+def test_a_run_continues_when_its_viewer_stops_reading(command, tiny, monkeypatch):
     monkeypatch.setattr(live, "END_SECONDS", 2.0)
     with socket.create_server((viewer.LOOPBACK, 0)) as silent:
         url = f"rerun+http://{viewer.LOOPBACK}:{silent.getsockname()[1]}/proxy"
@@ -17,7 +17,7 @@ def test_a_run_goes_on_when_its_viewer_takes_nothing(command, tiny, monkeypatch)
     assert [run["status"] for run in command.json("ls")["runs"]] == ["finished"]
 
 
-def test_a_run_without_its_viewer_does_not_begin(command, tiny):
+def test_a_run_without_its_viewer_does_not_start(command, tiny):
     done = command("run", tiny, "--live-url", f"rerun+http://{viewer.LOOPBACK}:{viewer.free_port()}/proxy")
     assert done.exit_code == 1
     assert "nothing answers there" in done.stderr

@@ -11,12 +11,12 @@ from runner.runs.run import RUN_FILE, create_run
 
 
 def test_json_lists_the_runs(recorded, recorded_run):
-    (told,) = recorded.json("ls")["runs"]
-    assert told["run_id"] == recorded_run.run_id
-    assert (told["name"], told["config"], told["seed"]) == ("tiny", "tiny", 3)
-    assert (told["status"], told["episodes"], told["episodes_to_do"]) == ("finished", 30, 30)
-    assert told["bytes"] == recorded_run.recording.stat().st_size
-    assert told["success_percent"] == recorded_run.summary["last_evaluation"]["success_percent"]
+    (values,) = recorded.json("ls")["runs"]
+    assert values["run_id"] == recorded_run.run_id
+    assert (values["name"], values["config"], values["seed"]) == ("tiny", "tiny", 3)
+    assert (values["status"], values["episodes"], values["episodes_to_do"]) == ("finished", 30, 30)
+    assert values["bytes"] == recorded_run.recording.stat().st_size
+    assert values["success_percent"] == recorded_run.summary["last_evaluation"]["success_percent"]
 
 
 def test_text_lists_the_runs(recorded, recorded_run):
@@ -47,18 +47,18 @@ def test_no_runs_yet(command, made):
     assert command.json("ls")["runs"] == []
 
 
-def test_a_run_that_never_recorded_and_one_that_runs(command, tiny):
+def test_a_run_without_a_recording_and_a_running_one(command, tiny):
     running = create_run(command.recordings, experiment_of(tiny), 3)
     died = create_run(command.recordings, experiment_of(tiny), 4)
     died.update(owner=died.facts["owner"] | {"process_started": 1.0})
-    told = {run["run_id"]: run["status"] for run in command.json("ls")["runs"]}
-    assert told == {running.run_id: "running", died.run_id: "interrupted"}
+    values = {run["run_id"]: run["status"] for run in command.json("ls")["runs"]}
+    assert values == {running.run_id: "running", died.run_id: "interrupted"}
     assert command("ls").exit_code == 0
     assert "– of 30" in command("ls").stdout
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[1]", '{"run_id": 3}', "\xff", '{"created": "yesterday"}'])
-def test_what_is_no_run_is_left_alone(command, tiny, content):
+def test_other_files_are_ignored(command, tiny, content):
     (command.recordings / "stray").mkdir(parents=True)
     (command.recordings / "stray" / RUN_FILE).write_text(content, encoding="latin-1")
     (command.recordings / "note.txt").write_text("mine")
@@ -69,15 +69,15 @@ def test_values_of_the_wrong_kind_make_a_damaged_run(command, tiny):
     run = create_run(command.recordings, experiment_of(tiny), 3)
     for key, wrong in (("created", "soon"), ("seed", "x"), ("summary", []), ("config", 3), ("owner", "me")):
         (run.folder / RUN_FILE).write_text(json.dumps(run.facts | {"status": "finished", key: wrong}))
-        (told,) = command.json("ls")["runs"]
-        assert (told["run_id"], told["status"]) == (run.run_id, "damaged"), key
+        (values,) = command.json("ls")["runs"]
+        assert (values["run_id"], values["status"]) == (run.run_id, "damaged"), key
 
 
 def test_the_folder_may_be_given(recorded, recorded_run, command):
     assert command.json("ls", "--recordings", recorded.recordings)["runs"][0]["run_id"] == recorded_run.run_id
 
 
-def test_a_folder_that_is_none(command, tmp_path):
+def test_a_missing_recordings_folder(command, tmp_path):
     command.recordings = tmp_path / "file"
     command.recordings.write_text("")
     result = command("ls")
@@ -96,7 +96,7 @@ def test_the_folder_is_the_working_directorys_by_default(recorded_run, tmp_path,
     assert os.environ.get("DUALTAXI_RECORDINGS") is None
 
 
-def test_json_of_no_run_and_of_two_is_an_array(command):
+def test_json_of_no_run_and_of_two_is_a_named_list(command):
     assert command.json("ls")["runs"] == []
     runs = [create_run(command.recordings, from_mapping({"name": "some", "episodes": 5}), n) for n in (1, 2)]
     assert {run["run_id"] for run in command.json("ls")["runs"]} == {run.run_id for run in runs}

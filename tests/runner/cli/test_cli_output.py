@@ -1,4 +1,4 @@
-"""How results look: numbers in words, tables that fit, drawings."""
+"""Printed results: numbers, tables that fit the terminal, drawings."""
 
 import pytest
 from click.testing import CliRunner
@@ -59,7 +59,7 @@ def test_age(seconds, words):
     assert humanize.age(seconds) == words
 
 
-def test_numbers_that_are_unknown_are_a_dash():
+def test_unknown_numbers_are_a_dash():
     assert [humanize.number(value) for value in (None, float("nan"), 98.54)] == ["–", "–", "98.5"]
     assert humanize.number(1234.5, 0) == "1,234"
 
@@ -105,7 +105,7 @@ def test_the_table_of_evaluations_fits(width):
     assert ("No room for: pickup" in text) == (width <= 80)
 
 
-def test_wrapped_cells_begin_beside_the_rest_of_their_row():
+def test_wrapped_cells_are_aligned_with_their_row():
     table = output.table("in\nepisode", "about", left=("about",), shrinking=("about",))
     table.add_row("7", "a text that takes several lines")
     console = Console(width=20)
@@ -117,7 +117,7 @@ def test_wrapped_cells_begin_beside_the_rest_of_their_row():
     assert lines[-1] == ["lines"]
 
 
-def test_successes_are_told_apart_and_other_events_summed():
+def test_successes_are_per_agent_and_other_events_summed():
     events = dict.fromkeys(NAMES, 4) | {"taxi_1.drop_off": 12, "taxi_2.drop_off": 9, "collision": 3}
     *_, line = _lines([_record(events)], ["taxi_1.drop_off", "taxi_2.drop_off"], 200)
     assert line.split() == ["50,000", "98.5", "1,500.0", "1,499.9", "12/9", "3", "8", "8", "8", "78/78"]
@@ -129,7 +129,7 @@ def test_an_environment_without_events():
     assert line.split() == ["50,000", "–", "1,500.0", "1,499.9", "12.3"]
 
 
-def test_some_evaluations_stand_for_many():
+def test_many_evaluations_are_thinned_evenly():
     records = [_record({}, episode) for episode in range(0, 51_000, 1000)]
     shown = [record["episode"] for record in spread(records)]
     assert (len(shown), shown[0], shown[-1]) == (20, 0, 50_000)
@@ -152,7 +152,7 @@ SCENE = {
 }
 
 
-def test_a_drawing_says_everything_in_letters():
+def test_a_drawing_needs_no_colours():
     drawing = Drawing(SCENE)
     assert drawing.draw([1, 5, 1, 0], [-1, -1, 0, -1]).plain.splitlines() == [
         "+-----+-----+-----+",

@@ -68,7 +68,7 @@ def test_a_trial_of_an_evaluation(recorded, recorded_run, trial, number):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (["--eval", "21:0"], "found no evaluation after 21 episodes; it has 4, the nearest after 20"),
         (["--eval", "20:5"], "found no trial 5 of the evaluation after 20 episodes; it has 5, from 0"),
@@ -80,10 +80,10 @@ def test_a_trial_of_an_evaluation(recorded, recorded_run, trial, number):
         (["--episode", "1", "--eval", "20:0"], "exclude each other"),
     ],
 )
-def test_what_is_not_there_is_refused(recorded, words, told):
+def test_missing_episodes_are_refused(recorded, words, message):
     result = recorded("play", "tiny", *words)
     assert result.exit_code == 2
-    assert told in result.stderr
+    assert message in result.stderr
 
 
 def test_without_evaluations_the_last_episode_is_played(command, tiny):

@@ -1,4 +1,4 @@
-"""The Python side of the same: `runner.run`, `runner.run_all`, and the package's names."""
+"""`runner.run` and `runner.run_all`, and the public names."""
 
 import os
 import signal
@@ -52,7 +52,7 @@ def test_importing_it_imports_nothing_heavy():
 
 
 @pytest.mark.parametrize("kind", ["path", "text", "mapping", "config"])
-def test_a_configuration_may_be_anything_that_means_one(tiny, tmp_path, recorded_run, kind):
+def test_a_configuration_may_be_a_path_text_mapping_or_object(tiny, tmp_path, recorded_run, kind):
     config = {
         "path": tiny,
         "text": str(tiny),
@@ -79,7 +79,7 @@ def test_the_seed_of_an_object_may_be_changed(tiny, tmp_path):
     assert config.seeds == (3,)
 
 
-def test_several_seeds_are_for_run_all(tiny, tmp_path):
+def test_run_refuses_several_seeds(tiny, tmp_path):
     several = ["seeds=[1, 2]"]
     with pytest.raises(ConfigError, match="found 2 seeds"):
         runner.run(tiny, overrides=several, recordings=tmp_path / "runs")
@@ -92,27 +92,27 @@ def test_several_seeds_are_for_run_all(tiny, tmp_path):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_each_of_several_seeds_has_the_name_and_reports(tiny, tmp_path, workers):
-    told = []
+    values = []
     several = ["seeds=[1, 2]", "recording.steps=none"]
     runs = runner.run_all(
-        tiny, overrides=several, name="both", recordings=tmp_path, report=told.append, workers=workers
+        tiny, overrides=several, name="both", recordings=tmp_path, report=values.append, workers=workers
     )
     assert [(run.seed, run.name) for run in runs] == [(1, "both"), (2, "both")]
-    assert {progress.episodes for progress in told} == {30}
-    assert len({id(progress) for progress in told}) == 2
+    assert {progress.episodes for progress in values} == {30}
+    assert len({id(progress) for progress in values}) == 2
 
 
-def test_seeds_side_by_side_record_what_each_records_alone(tiny, tmp_path):
+def test_parallel_seeds_record_what_each_records_alone(tiny, tmp_path):
     several = ["seeds=[1, 2, 3, 4, 5]", "recording.steps=none"]
-    abreast = list(runner.run_all(tiny, overrides=several, recordings=tmp_path / "abreast", workers=3))
+    parallel = list(runner.run_all(tiny, overrides=several, recordings=tmp_path / "parallel", workers=3))
     alone = list(runner.run_all(tiny, overrides=several, recordings=tmp_path / "alone"))
     digests = [run.summary["content_digest"] for run in alone]
-    assert [run.seed for run in abreast] == [1, 2, 3, 4, 5]
-    assert [run.summary["content_digest"] for run in abreast] == digests
-    assert rerecord(abreast[3]).summary["content_digest"] == digests[3]
+    assert [run.seed for run in parallel] == [1, 2, 3, 4, 5]
+    assert [run.summary["content_digest"] for run in parallel] == digests
+    assert rerecord(parallel[3]).summary["content_digest"] == digests[3]
 
 
-def test_seeds_side_by_side_that_are_interrupted_or_left_are_closed(tiny, tmp_path):
+def test_interrupted_or_abandoned_parallel_seeds_are_closed(tiny, tmp_path):
     long = ["seeds={count: 50}", "episodes=100000", "recording.steps=none"]
     runs = runner.run_all(tiny, overrides=long, recordings=tmp_path, workers=2)
     threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT)).start()
@@ -146,7 +146,7 @@ def test_recordings_go_where_the_variable_says(tiny, tmp_path, monkeypatch):
     assert runner.run(tiny).folder.parent == tmp_path / "there"
 
 
-def test_errors_are_the_projects_own(tiny, tmp_path):
+def test_errors_belong_to_the_error_family(tiny, tmp_path):
     with pytest.raises(ConfigError, match="name: found"):
         runner.run(tiny, name="/", recordings=tmp_path / "runs")
     with pytest.raises(EnvironmentNotUsable) as caught:

@@ -1,4 +1,4 @@
-"""The commands for runs that stopped, were damaged, or are looked at more closely."""
+"""Commands for interrupted and damaged runs, and for their tables."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _aged(run: Run) -> Run:
 
 
 def flip(path: Path) -> None:
-    """Turn a byte around in the first chunk of training steps."""
+    """Invert a byte in the first chunk of training steps."""
     index = next(one.index for one in survey(path).chunks if one.channel == schema.TRAIN_STEP.channel)
     data = bytearray(path.read_bytes())
     data[index.chunk_start_offset + index.chunk_length // 2] ^= 1
@@ -53,7 +53,7 @@ def flip(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_what_is_not_there(command, name):
+def test_missing_runs(command, name):
     for missing in ("nothing", "nothing.mcap", "@latest", "some/where"):
         result = command(name, missing)
         assert result.exit_code == 2
@@ -62,7 +62,7 @@ def test_what_is_not_there(command, name):
 
 
 @pytest.mark.parametrize("name", ["verify", "repair", "qtable"])
-def test_another_writers_file(command, tmp_path, name):
+def test_a_file_of_another_writer(command, tmp_path, name):
     path = tmp_path / "other.mcap"
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -87,7 +87,7 @@ def test_a_run_that_was_killed_before_it_had_a_recording(command, copied, name):
     assert f"`dualtaxi resume {copied.run_id}` trains it from the beginning" in result.stderr
 
 
-def test_what_a_missing_recording_leaves_to_do_depends_on_the_run(command, copied):
+def test_the_hint_for_a_missing_recording_depends_on_the_run(command, copied):
     copied.recording.unlink()
     assert command.json("show", copied.run_id)["status"] == "finished"
     loop = copied.update(config={"made_by": "runner.record"})
@@ -96,35 +96,35 @@ def test_what_a_missing_recording_leaves_to_do_depends_on_the_run(command, copie
     assert "it has just begun" in command("play", copied.run_id).stderr
 
 
-def test_ls_says_how_far_a_killed_run_got(command, copied):
+def test_ls_shows_the_progress_of_a_killed_run(command, copied):
     cut(copied, 0.7)
-    (told,) = command.json("ls")["runs"]
+    (values,) = command.json("ls")["runs"]
     with open_recording(copied.recording) as recording:
-        assert told["episodes"] == recording.count(schema.TRAIN_EPISODE) < told["episodes_to_do"]
-    assert f"{told['episodes']:,} of {told['episodes_to_do']:,}" in command("ls").stdout
+        assert values["episodes"] == recording.count(schema.TRAIN_EPISODE) < values["episodes_to_do"]
+    assert f"{values['episodes']:,} of {values['episodes_to_do']:,}" in command("ls").stdout
     copied.recording.write_bytes(b"nothing that can be read")
     assert command.json("ls")["runs"][0]["episodes"] is None
 
 
-def test_a_run_is_told_by_the_path_that_it_was_found_by(command, copied, monkeypatch):
+def test_a_run_is_printed_with_the_path_it_was_found_by(command, copied, monkeypatch):
     monkeypatch.chdir(command.recordings.parent)
     cut(copied)
     words = ["resume", "@latest", "--recordings", command.recordings.name]
-    said = CliRunner().invoke(cli, words).stdout
-    assert str(Path(command.recordings.name, copied.run_id)) in said
-    assert str(command.recordings) not in said
+    output = CliRunner().invoke(cli, words).stdout
+    assert str(Path(command.recordings.name, copied.run_id)) in output
+    assert str(command.recordings) not in output
 
 
 def test_resume(command, copied, recorded_run):
     cut(copied)
     assert command.json("ls")["runs"][0]["status"] == "interrupted"
-    told = command.json("resume", "@latest")
-    assert told["status"] == "finished"
-    assert told["content_digest"] == recorded_run.summary["content_digest"]
+    values = command.json("resume", "@latest")
+    assert values["status"] == "finished"
+    assert values["content_digest"] == recorded_run.summary["content_digest"]
     assert command.json("ls")["runs"][0]["status"] == "finished"
 
 
-def test_resume_in_words(command, copied):
+def test_resume_as_text(command, copied):
     cut(copied)
     result = command("resume", copied.run_id[:4])
     assert result.exit_code == 0
@@ -172,9 +172,9 @@ def test_accepted_changes(command, copied, monkeypatch):
 
 def test_verify(recorded, recorded_run):
     for name in ("@latest", recorded_run.name, recorded_run.folder, recorded_run.recording):
-        told = recorded.json("verify", name)
-        assert told["verdict"] == "sound"
-        assert told["content_digest"] == recorded_run.summary["content_digest"]
+        values = recorded.json("verify", name)
+        assert values["verdict"] == "sound"
+        assert values["content_digest"] == recorded_run.summary["content_digest"]
     result = recorded("verify", "@latest", "--rerun")
     assert result.exit_code == 0
     assert "identical" in result.stdout
@@ -189,9 +189,9 @@ def test_verify_names_what_is_wrong(command, copied, tmp_path):
     path = altered(copied.recording, tmp_path / "x.mcap", schema.TRAIN_STEP, change)
     result = command("verify", path, "--json")
     assert result.exit_code == 1
-    told = json.loads(result.stdout)
-    assert told["verdict"] == "wrong"
-    assert told["difference"] | {"expected": None} == {
+    values = json.loads(result.stdout)
+    assert values["verdict"] == "wrong"
+    assert values["difference"] | {"expected": None} == {
         "topic": "/train/step",
         "episode": 1,
         "step": 50,
@@ -212,20 +212,20 @@ def test_repair_of_a_killed_run(command, copied):
     cut(copied)
     result = command("repair", "@latest", "--json")
     assert result.exit_code == 1  # what was being written is gone
-    told = json.loads(result.stdout)
-    assert not told["lossless"]
-    assert not told["lost"]
-    assert told["lost_bytes"] > 0
+    shown = json.loads(result.stdout)
+    assert not shown["lossless"]
+    assert not shown["lost"]
+    assert shown["lost_bytes"] > 0
     with copied.recording.open("rb") as stream:
         summary = make_reader(stream, validate_crcs=True).get_summary()
-    assert sum(told["kept"].values()) == summary.statistics.message_count
+    assert sum(shown["kept"].values()) == summary.statistics.message_count
     assert command("repair", "@latest").exit_code == 0
     assert "nothing to do" in command("repair", "@latest").stdout
     assert command("verify", "@latest").exit_code == 0
     assert command("resume", "@latest").exit_code == 0
 
 
-def test_repair_tells_what_was_lost_and_resume_brings_it_back(command, copied, recorded_run):
+def test_repair_lists_losses_and_resume_restores_them(command, copied, recorded_run):
     flip(copied.recording)
     damaged = copied.recording.read_bytes()
     result = command("repair", copied.run_id)
@@ -243,8 +243,8 @@ def test_repair_tells_what_was_lost_and_resume_brings_it_back(command, copied, r
     assert "training steps 0 to " in again.stdout
     assert f"dualtaxi resume {copied.run_id}" in again.stdout
     assert command("qtable", copied.run_id, "--step", 5).exit_code == 2
-    told = command.json("resume", copied.run_id)
-    assert told["content_digest"] == recorded_run.summary["content_digest"]
+    values = command.json("resume", copied.run_id)
+    assert values["content_digest"] == recorded_run.summary["content_digest"]
     assert command("verify", copied.run_id).exit_code == 0
 
 
@@ -255,8 +255,8 @@ def test_repair_by_path_when_nothing_opens(command, copied, tmp_path):
     path.write_bytes(data)
     assert command("qtable", path).exit_code == 2
     assert command("verify", path).exit_code == 1
-    told = command.json("repair", path)
-    assert told["lossless"]
+    values = command.json("repair", path)
+    assert values["lossless"]
     assert command("verify", path).exit_code == 0
     assert {one.name for one in tmp_path.iterdir()} == {"alone.mcap", "recordings"}
     (copied.folder / "run.json").unlink()
@@ -266,7 +266,7 @@ def test_repair_by_path_when_nothing_opens(command, copied, tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"hello"])
-def test_what_cannot_be_repaired_stays(command, tmp_path, content):
+def test_an_irreparable_file_is_left_as_it_is(command, tmp_path, content):
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     result = command("repair", path)
@@ -292,7 +292,7 @@ def test_qtable(recorded, recorded_run, tmp_path):
     assert recorded.json("qtable", "@latest")["step"] == recorded_run.summary["train_steps"]
 
 
-def test_qtable_replaces_a_file_only_when_asked(recorded, tmp_path):
+def test_qtable_replaces_a_file_only_with_force(recorded, tmp_path):
     out = tmp_path / "mine"
     out.write_text("mine")
     result = recorded("qtable", "@latest", "-o", out)
@@ -308,21 +308,21 @@ def test_qtable_of_a_state(recorded, recorded_run):
     with open_recording(recorded_run.recording) as recording:
         step = next(recording.blocks(schema.TRAIN_STEP))[0]
         state, action = int(step["state"]), int(step["action"])
-    told = recorded.json("qtable", "@latest", "--state", state, "--step", 1)
-    assert told["visits"] == 1
-    assert "taxi 1" in told["state_in_words"]
-    assert [one["agent"] for one in told["values"]] == ["taxi_1"] * 6 + ["taxi_2"] * 6
-    visited = [one for one in told["values"] if one["visits"]]
+    shown = recorded.json("qtable", "@latest", "--state", state, "--step", 1)
+    assert shown["visits"] == 1
+    assert "taxi 1" in shown["state_in_words"]
+    assert [one["agent"] for one in shown["values"]] == ["taxi_1"] * 6 + ["taxi_2"] * 6
+    visited = [one for one in shown["values"] if one["visits"]]
     assert [one["action"] for one in visited] == [action // 6, action % 6]
-    assert all(one["changed_step"] in (0, None) for one in told["values"])
-    assert sum(one["greedy"] for one in told["values"]) == 2
+    assert all(one["changed_step"] in (0, None) for one in shown["values"])
+    assert sum(one["greedy"] for one in shown["values"]) == 2
     result = recorded("qtable", "@latest", "--state", state)
     assert "drop-off" in result.stdout
     assert "greedy" in result.stdout
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("--step", 10**9), "expected at least 1000000000"),
         (("--episode", 31), "found 30 training episodes"),
@@ -332,10 +332,10 @@ def test_qtable_of_a_state(recorded, recorded_run):
         (("-o", "/dev/null/table.npy"), "/dev/null is a file, expected a folder"),
     ],
 )
-def test_qtable_of_what_is_not_there(recorded, words, told):
+def test_qtable_of_missing_states_and_steps(recorded, words, message):
     result = recorded("qtable", "@latest", *words)
     assert result.exit_code == 2
-    assert told in result.stderr
+    assert message in result.stderr
     assert not result.stdout
 
 
@@ -343,19 +343,19 @@ def test_qtable_of_what_is_not_there(recorded, words, told):
 
 
 def test_evaluate(command, copied):
-    told = command.json("evaluate", copied.run_id, "--step", 200, "--trials", 7, "--seed", 5)
-    assert told["origin"] == {"run": copied.run_id, "step": 200}
-    assert told["episodes"] == 0
-    assert told["seed"] == 5
-    assert command.json("verify", told["run_id"])["verdict"] == "sound"
-    assert command("play", told["run_id"], "--eval", "0:6").exit_code == 0
+    values = command.json("evaluate", copied.run_id, "--step", 200, "--trials", 7, "--seed", 5)
+    assert values["origin"] == {"run": copied.run_id, "step": 200}
+    assert values["episodes"] == 0
+    assert values["seed"] == 5
+    assert command.json("verify", values["run_id"])["verdict"] == "sound"
+    assert command("play", values["run_id"], "--eval", "0:6").exit_code == 0
     result = command("evaluate", copied.run_id, "--trials", 3)
     assert f"of run {copied.run_id} after {copied.summary['train_steps']:,} training steps" in result.stdout
     assert len(list_runs(command.recordings)) == 3
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("--start", "each", "--trials", 3), "leave out --trials"),
         (("--step", 10**9), "expected at least"),
@@ -363,10 +363,10 @@ def test_evaluate(command, copied):
         (("--seed", -1), "-1"),
     ],
 )
-def test_what_cannot_be_evaluated(command, copied, words, told):
+def test_invalid_evaluations_are_refused(command, copied, words, message):
     result = command("evaluate", copied.run_id, *words)
     assert result.exit_code == 2
-    assert told in result.stderr
+    assert message in result.stderr
     assert len(list_runs(command.recordings)) == 1
 
 
@@ -375,9 +375,9 @@ def test_rerecord(command, tiny):
     refused = command("qtable", "@latest", "--step", 5)
     assert refused.exit_code == 2
     assert "`dualtaxi rerecord`" in refused.stderr
-    told = command.json("rerecord", "@latest")
-    assert told["content_digest"] == before["content_digest"]
-    assert told["bytes"] > before["bytes"]
+    values = command.json("rerecord", "@latest")
+    assert values["content_digest"] == before["content_digest"]
+    assert values["bytes"] > before["bytes"]
     assert command("play", "@latest").exit_code == 0
     again = command("rerecord", "@latest")
     assert again.exit_code == 0

@@ -49,7 +49,7 @@ def test_the_same_seed_gives_the_same_digest_and_another_id(command, tiny):
     assert [run.name for run in list_runs(command.recordings)] == ["tiny", "tiny"]
 
 
-def test_the_summary_says_what_came_of_it_and_what_to_type_next(command, tiny):
+def test_the_summary_has_results_and_what_to_type_next(command, tiny):
     result = command("run", tiny, "--name", "mine")
     (run,) = list_runs(command.recordings)
     assert result.exit_code == 0
@@ -65,7 +65,7 @@ def test_the_summary_says_what_came_of_it_and_what_to_type_next(command, tiny):
 @pytest.mark.parametrize(
     "settings", ["log.window=40", "recording.steps=none", "evaluation=null", "episodes=0"]
 )
-def test_what_it_tells_to_type_next_works(command, tiny, settings):
+def test_the_suggested_commands_work(command, tiny, settings):
     result = command("run", tiny, "--set", settings)
     assert "dualtaxi show" in result.stdout
     for line in result.stdout.splitlines():
@@ -73,13 +73,13 @@ def test_what_it_tells_to_type_next_works(command, tiny, settings):
             assert command(*line.partition("dualtaxi ")[2].split()).exit_code == 0
 
 
-def test_what_has_no_episode_is_not_said_to_be_played(command, tiny):
-    said = command("run", tiny, "--set", "evaluation=null", "--set", "episodes=0").stdout
-    assert "dualtaxi show" in said
-    assert "dualtaxi play" not in said
+def test_play_is_not_suggested_without_an_episode(command, tiny):
+    output = command("run", tiny, "--set", "evaluation=null", "--set", "episodes=0").stdout
+    assert "dualtaxi show" in output
+    assert "dualtaxi play" not in output
 
 
-def test_an_environment_that_cannot_be_used_is_told_before_any_estimate(command, tiny):
+def test_an_unusable_environment_is_refused_before_the_estimate(command, tiny):
     result = command("run", tiny, "--set", "env.kwargs={sloop: 0.1}")
     assert result.exit_code == 2
     assert "sloop" in result.stderr
@@ -93,7 +93,7 @@ def test_the_estimate_comes_first_and_on_stderr(command, tiny):
     assert len(result.stdout.splitlines()) == 1
 
 
-def test_a_small_disk_is_warned_of_where_nobody_answers(command, tiny, monkeypatch):
+def test_a_small_disk_is_warned_about_without_a_terminal(command, tiny, monkeypatch):
     monkeypatch.setattr(estimate, "free_bytes", lambda _: 1000)
     result = command("run", tiny, "--json")
     assert result.exit_code == 0
@@ -101,7 +101,7 @@ def test_a_small_disk_is_warned_of_where_nobody_answers(command, tiny, monkeypat
 
 
 @pytest.mark.parametrize(("answer", "code", "runs"), [("n\n", 1, 0), ("y\n", 0, 1), ("", 130, 0)])
-def test_a_small_disk_is_asked_about_on_a_terminal(command, tiny, monkeypatch, answer, code, runs):
+def test_a_small_disk_needs_confirmation_on_a_terminal(command, tiny, monkeypatch, answer, code, runs):
     monkeypatch.setattr(estimate, "free_bytes", lambda _: 1000)
     monkeypatch.setattr(run_command, "_is_interactive", lambda: True)
     result = command("run", tiny, "--json", input=answer)
@@ -110,7 +110,7 @@ def test_a_small_disk_is_asked_about_on_a_terminal(command, tiny, monkeypatch, a
     assert "Continue?" in result.stderr
 
 
-def test_a_bad_configuration_is_told_line_by_line(command, tiny):
+def test_problems_of_a_configuration_are_listed_one_per_line(command, tiny):
     result = command("run", tiny, "--set", "episodez=3", "--set", "epsilon=2")
     assert result.exit_code == 2
     assert "--set epsilon=2: epsilon: found 2" in result.stderr
@@ -119,22 +119,22 @@ def test_a_bad_configuration_is_told_line_by_line(command, tiny):
 
 
 @pytest.mark.parametrize(
-    ("env", "told"),
+    ("env", "message"),
     [
         ("Nothing-v1", "Gymnasium knows no such id"),
         ("CartPole-v1", "no transition table"),
         ("nowhere:Nothing-v1", "no module"),
     ],
 )
-def test_an_unusable_environment_leaves_no_half_run(command, tiny, env, told):
+def test_an_unusable_environment_leaves_no_partial_run(command, tiny, env, message):
     result = command("run", tiny, "--set", f"env={{id: '{env}'}}", "--set", "mode=cooperative")
     assert result.exit_code == 2
-    assert told in result.stderr
+    assert message in result.stderr
     assert "Nothing was recorded; the empty run" in result.stderr
     assert list(command.recordings.iterdir()) == []
 
 
-def test_a_name_that_cannot_be_one_is_refused(command, tiny):
+def test_an_invalid_name_is_refused(command, tiny):
     result = command("run", tiny, "--name", "a b")
     assert result.exit_code == 2
     assert "name: found 'a b'" in result.stderr
@@ -150,26 +150,26 @@ def test_a_folder_that_cannot_be_written(command, tiny, tmp_path):
 
 
 @pytest.mark.parametrize("seed", ["-1", "x", 2**64])
-def test_a_seed_that_is_none(command, tiny, seed):
+def test_an_invalid_seed_is_refused(command, tiny, seed):
     assert command("run", tiny, "--seed", seed).exit_code == 2
 
 
 def test_without_evaluation(command, tiny):
-    told = command.json("run", tiny, "--set", "evaluation=null")
-    assert told["last_evaluation"] is None
-    assert told["eval_steps"] == 0
+    values = command.json("run", tiny, "--set", "evaluation=null")
+    assert values["last_evaluation"] is None
+    assert values["eval_steps"] == 0
     result = command("run", tiny, "--set", "evaluation=null")
     assert "--episode 0" in result.stdout
 
 
-def test_where_success_is_unknown_it_is_null(command, tiny):
+def test_an_unknown_success_rate_is_null(command, tiny):
     env = "env={id: tests.runner.corridor:Corridor-v0}"
     words = ("run", tiny, "--set", env, "--set", "mode=cooperative")
     assert command.json(*words)["last_evaluation"]["success_percent"] is None
     assert "–" in command(*words).stdout
 
 
-def test_a_run_stands_on_disk_before_anything_heavy_is_imported(tiny, tmp_path):
+def test_a_run_is_on_disk_before_heavy_imports(tiny, tmp_path):
     program = (
         "import sys\nimport runner.runs.run as runs\nmake = runs.create_run\n"
         "def spy(*args):\n    run = make(*args)\n    assert (run.folder / 'run.json').is_file()\n"

@@ -19,24 +19,24 @@ def _numbers(value):
         yield value
 
 
-def test_json_has_it_all(recorded, recorded_run):
-    told = recorded.json("show", "tiny")
+def test_json_is_complete(recorded, recorded_run):
+    values = recorded.json("show", "tiny")
     summary = recorded_run.summary
     for key in ("content_digest", "train_steps", "eval_steps", "bytes", "seconds", "episodes"):
-        assert told[key] == summary[key]
-    assert told["status"] == "finished"
-    assert told["run_id"] == recorded_run.run_id
-    assert told["config"] == recorded_run.facts["config"]
-    assert next(iter(told["config"])) == "name"
-    assert told["provenance"]["python"]
-    assert [table["agent"] for table in told["tables"]] == ["taxi_1", "taxi_2"]
-    assert all(math.isfinite(number) for number in _numbers(told))
+        assert values[key] == summary[key]
+    assert values["status"] == "finished"
+    assert values["run_id"] == recorded_run.run_id
+    assert values["config"] == recorded_run.facts["config"]
+    assert next(iter(values["config"])) == "name"
+    assert values["provenance"]["python"]
+    assert [table["agent"] for table in values["tables"]] == ["taxi_1", "taxi_2"]
+    assert all(math.isfinite(number) for number in _numbers(values))
 
 
 def test_json_has_the_whole_series(recorded):
-    told = recorded.json("show", "@latest")
-    assert [evaluation["episode"] for evaluation in told["eval"]] == [0, 10, 20, 30]
-    for evaluation in told["eval"]:
+    values = recorded.json("show", "@latest")
+    assert [evaluation["episode"] for evaluation in values["eval"]] == [0, 10, 20, 30]
+    for evaluation in values["eval"]:
         assert evaluation["trials"] == 5
         assert 0 <= evaluation["success_percent"] <= 100
         assert 1 <= evaluation["mean_length"] <= 40
@@ -49,34 +49,34 @@ def test_json_has_the_whole_series(recorded):
             "taxi_2.illegal_pickup",
             "taxi_1.illegal_drop_off",
         } <= evaluation["events"].keys()
-    assert told["eval"][0]["training"]["mean_length"] is None  # no episode yet
-    steps = [report["step"] for report in told["train"]]
-    assert steps == list(range(200, told["train_steps"] + 1, 200))
-    assert told["train"][0]["percent_filled"].keys() == {"taxi_1", "taxi_2"}
+    assert values["eval"][0]["training"]["mean_length"] is None  # no episode yet
+    steps = [report["step"] for report in values["train"]]
+    assert steps == list(range(200, values["train_steps"] + 1, 200))
+    assert values["train"][0]["percent_filled"].keys() == {"taxi_1", "taxi_2"}
 
 
-def test_the_text_says_what_a_random_policy_achieves(recorded):
+def test_the_text_compares_with_a_random_policy(recorded):
     assert "A random policy succeeds in " in recorded("show", "tiny").stdout
 
 
-def test_text_tells_the_same(recorded, recorded_run):
+def test_text_shows_the_same(recorded, recorded_run):
     result = recorded("show", recorded_run.run_id)
     assert result.exit_code == 0
-    for told in (
+    for values in (
         recorded_run.summary["content_digest"],
         "Evaluations",
         "Tables",
         "Configuration",
         "Provenance",
     ):
-        assert told in result.stdout
+        assert values in result.stdout
     assert "name         tiny" in result.stdout
     assert "taxi_2  " in result.stdout
     assert all(line == line.rstrip() for line in result.stdout.splitlines())
 
 
 @pytest.mark.parametrize("how", ["id", "prefix", "name", "latest", "named latest", "folder", "file"])
-def test_a_run_is_named_in_many_ways(recorded, recorded_run, how):
+def test_a_run_is_found_by_id_prefix_name_and_path(recorded, recorded_run, how):
     name = {
         "id": recorded_run.run_id,
         "prefix": recorded_run.run_id[:3],
@@ -96,19 +96,19 @@ def test_an_unknown_run_is_refused_with_the_nearest(recorded):
     assert "Did you mean 'tiny'?" in result.stderr
 
 
-def test_an_ambiguous_name_is_refused_with_all_it_could_be(command, tiny):
+def test_an_ambiguous_name_is_refused_with_all_matches(command, tiny):
     ids = [command.json("run", tiny)["run_id"] for _ in range(2)]
     result = command("show", "tiny")
     assert result.exit_code == 2
     assert all(run_id in result.stderr for run_id in ids)
 
 
-def test_a_recording_alone_tells_all_but_the_duration(recorded_run, command, tmp_path):
+def test_a_recording_alone_shows_all_but_the_duration(recorded_run, command, tmp_path):
     alone = tmp_path / "alone.mcap"
     shutil.copy(recorded_run.recording, alone)
-    told = command.json("show", alone)
-    assert told["run_id"] == recorded_run.run_id
-    assert told["content_digest"] == recorded_run.summary["content_digest"]
+    values = command.json("show", alone)
+    assert values["run_id"] == recorded_run.run_id
+    assert values["content_digest"] == recorded_run.summary["content_digest"]
     assert command("show", alone).exit_code == 0
 
 
@@ -120,9 +120,9 @@ def test_a_run_that_was_cut_off(recorded_run, command):
     facts = json.loads((folder / RUN_FILE).read_text())
     facts |= {"status": "running", "owner": {"host": "elsewhere"}, "summary": {}}
     (folder / RUN_FILE).write_text(json.dumps(facts))
-    told = command.json("show", "@latest")
-    assert told["content_digest"] is None
-    assert told["train_steps"] > 0
+    values = command.json("show", "@latest")
+    assert values["content_digest"] is None
+    assert values["train_steps"] > 0
     assert command("show", "@latest").exit_code == 0
 
 
@@ -132,14 +132,14 @@ def test_a_run_without_a_recording(command, tiny):
     run = create_run(command.recordings, experiment_of(tiny), 3).update(
         status="failed", summary={"error": "why"}
     )
-    told = command.json("show", run.run_id)
-    assert (told["status"], told["eval"], told["content_digest"]) == ("failed", [], None)
+    values = command.json("show", run.run_id)
+    assert (values["status"], values["eval"], values["content_digest"]) == ("failed", [], None)
     result = command("show", run.run_id)
     assert "why" in result.stdout
     assert "no recording" in result.stdout
 
 
-def test_a_damaged_recording_is_told_without_a_traceback(command, tmp_path):
+def test_a_damaged_recording_is_reported_without_a_traceback(command, tmp_path):
     (tmp_path / "noise.mcap").write_bytes(b"noise" * 100)
     result = command("show", tmp_path / "noise.mcap")
     assert result.exit_code == 2

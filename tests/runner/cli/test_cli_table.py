@@ -48,7 +48,7 @@ def test_an_unknown_environment(command):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a POSIX shell")
-def test_a_reader_that_leaves_is_no_error():
+def test_a_closed_pipe_is_no_error():
     line = f"{sys.executable} -m runner table | head -n 2; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
     assert done.stdout.startswith("state,action,")
@@ -66,7 +66,7 @@ def test_a_configuration_is_checked_and_spelled_out(command, tiny):
     assert command.json("config", "check", tiny, "--set", "episodes=50")["config"] == spelled
 
 
-def test_what_is_wrong_with_a_configuration_is_told_with_its_place(command, tmp_path):
+def test_problems_of_a_configuration_have_their_place(command, tmp_path):
     path = tmp_path / "wrong.yaml"
     path.write_text("episodes: 10\nepsilon: 3\nseedd: 1\n")
     result = command("config", "check", path)
@@ -115,7 +115,7 @@ def test_names_of_several_runs_complete_to_the_newest(command, tiny, monkeypatch
     assert _completions(["show"], "ti") == [("tiny@latest", "plain")]
 
 
-def test_completion_is_silent_where_there_is_nothing(monkeypatch, tmp_path):
+def test_completion_is_silent_without_runs(monkeypatch, tmp_path):
     monkeypatch.setenv("DUALTAXI_RECORDINGS", str(tmp_path / "nowhere"))
     assert _completions(["show"], "") == []
     (tmp_path / "file").write_text("")

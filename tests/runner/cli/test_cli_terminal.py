@@ -17,7 +17,7 @@ pty = pytest.importorskip("pty", reason="a POSIX terminal", exc_type=ImportError
 
 
 def _typed(words, recordings, keys=b"", once="", **environment):
-    """Return what a command shows on a terminal of 80 columns; keys are pressed once it shows a text."""
+    """Return the output of a command on a terminal of 80 columns; keys are pressed once it shows a text."""
     ours, theirs = pty.openpty()
     process = subprocess.Popen(
         [sys.executable, "-m", "runner", *map(str, words)],
@@ -52,7 +52,7 @@ def test_a_run_shows_its_progress(command, tiny):
     assert "steps/s" in shown
 
 
-def test_colours_only_repeat_what_letters_say(recorded):
+def test_colours_only_repeat_the_text(recorded):
     words = ["play", "tiny", "--episode", 0, "--speed", 1000]
     coloured = _typed(words, recorded.recordings)
     plain = _typed(words, recorded.recordings, NO_COLOR="1")
@@ -78,18 +78,18 @@ def test_a_compilation_is_announced_once_when_it_happens():
     def second(x):
         return first(x) + 1
 
-    told = []
-    with announced(lambda: told.append("now")):
-        assert told == []
+    values = []
+    with announced(lambda: values.append("now")):
+        assert values == []
         assert second(1) == 3
-        assert told == ["now"]
+        assert values == ["now"]
         assert second(1) == 3
-    with announced(lambda: told.append("again")):
+    with announced(lambda: values.append("again")):
         assert second(2) == 4
-    assert told == ["now"]
+    assert values == ["now"]
 
 
-def test_what_is_cached_is_not_announced(command, tiny):
+def test_a_cached_kernel_is_not_announced(command, tiny):
     command("run", tiny)
     done = subprocess.run(
         [sys.executable, "-m", "runner", "run", str(tiny), "--recordings", str(command.recordings)],
@@ -111,10 +111,10 @@ def test_what_is_cached_is_not_announced(command, tiny):
     ],
     ids=lambda words: words[0],
 )
-def test_what_may_take_long_shows_what_it_does(command, tiny, tmp_path, words, stages):
+def test_long_commands_show_a_spinner(command, tiny, tmp_path, words, stages):
     command("run", tiny)
     command("run", tiny, "--name", "tiny2", "--set", "discount=0.5")
-    shown = _typed([str(word).format(folder=tmp_path) for word in words], command.recordings)
+    shown = _typed([str(each).format(folder=tmp_path) for each in words], command.recordings)
     assert [stage for stage in stages if stage not in shown] == []
 
 
@@ -138,6 +138,6 @@ def test_play_pauses_steps_and_quits(recorded):
 @pytest.mark.parametrize(
     "words", [["qtable", "tiny", "--state", 300], ["du"], ["ls"]], ids=lambda words: words[0]
 )
-def test_a_narrow_terminal_cuts_no_figure_and_no_heading(recorded, words):
+def test_a_narrow_terminal_truncates_no_number_and_no_heading(recorded, words):
     shown = _typed(words, recorded.recordings, COLUMNS="60")
     assert "…" not in shown

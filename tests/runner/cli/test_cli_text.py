@@ -1,4 +1,4 @@
-"""Text that UTF-8 cannot hold, as arguments, folder names and command lines in Latin-1 bring it."""
+"""Text that is not UTF-8, in arguments, folder names and command lines in Latin-1."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_run_from_a_folder_whose_name_is_not_utf8_ends_as_any_other(command, t
     assert provenance["directory"].endswith("caf\\xe9")
 
 
-def test_nothing_runs_into_a_folder_whose_name_is_not_utf8(command, tiny, tmp_path):
+def test_output_to_a_folder_whose_name_is_not_utf8_is_refused(command, tiny, tmp_path):
     result = command("run", tiny, "--recordings", tmp_path / LATIN)
     assert "not UTF-8" in result.stderr
     assert not (tmp_path / LATIN).exists()

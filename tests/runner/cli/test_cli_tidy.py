@@ -1,4 +1,4 @@
-"""Labels, du, rm, prune and index rebuild: what people keep in order, and what must not go."""
+"""Labels, ls, rm, prune, du and index rebuild."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CONFIG = from_mapping({"name": "some", "episodes": 5})
 
 @pytest.fixture
 def make(command):
-    """Return a way to make a run that is over."""
+    """Return a function that makes a finished run."""
 
     def made(days=0.0, status="finished", config=CONFIG, size=1000):
         run = create_run(command.recordings, config, 1)
@@ -40,7 +40,7 @@ def make(command):
 
 @pytest.fixture
 def answer(monkeypatch):
-    """Return a way to answer as at a terminal."""
+    """Return a function that types an answer at a terminal."""
 
     def answers(text):
         class Terminal(io.StringIO):
@@ -60,7 +60,7 @@ def there(command):
 # --- labels ----------------------------------------------------------------------------------------
 
 
-def test_tags_notes_and_names_stand_beside_the_recording(command, make):
+def test_labels_are_stored_next_to_the_recording(command, make):
     run = make()
     before = (run.folder / RUN_FILE).read_bytes()
     assert "fig-3 keep" in command("label", run.run_id, "--tag", "keep", "--tag", "fig-3").stdout
@@ -75,8 +75,8 @@ def test_tags_notes_and_names_stand_beside_the_recording(command, make):
         "tags": ["keep"],
         "note": "first\nsecond",
     }
-    (told,) = command.json("ls", "patient", "tag:keep", "note:SECOND")["runs"]
-    assert (told["name"], told["tags"], told["note"]) == ("patient", ["keep"], "first\nsecond")
+    (values,) = command.json("ls", "patient", "tag:keep", "note:SECOND")["runs"]
+    assert (values["name"], values["tags"], values["note"]) == ("patient", ["keep"], "first\nsecond")
     assert command.json("show", "patient")["name"] == "patient"
     command("label", "patient", "--name", "")
     assert command("label", "some", "--note", "").exit_code == 0
@@ -90,7 +90,7 @@ def test_a_note_from_stdin(command, make):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("label", "some", "--tag", "two words"), "expected 1 to 64 letters"),
         (("label", "some", *(f"--tag={i}" for i in range(101))), "at most 100"),
@@ -98,11 +98,11 @@ def test_a_note_from_stdin(command, make):
         (("label", "some", "--name", "../x"), "expected 1 to 100 letters"),
     ],
 )
-def test_what_cannot_be_said_of_a_run(command, make, words, told):
+def test_invalid_labels_are_refused(command, make, words, message):
     make()
     result = command(*words)
     assert result.exit_code == 2
-    assert told in result.stderr
+    assert message in result.stderr
 
 
 # --- ls --------------------------------------------------------------------------------------------
@@ -118,8 +118,8 @@ def test_filters_sorting_columns_and_paging(command, make):
     assert "Shown are 2 of 5 runs" in result.stderr
     assert "--offset 3" in result.stderr
     assert command("ls", "-q", "age:>2.5d").stdout.split() == [run.run_id for run in runs[3:]]
-    told = command.json("ls", "--columns", "id,config.episodes,bytes", "--limit", 1)["runs"]
-    assert told == [{"id": runs[0].run_id, "config.episodes": 5, "bytes": 5000}]
+    values = command.json("ls", "--columns", "id,config.episodes,bytes", "--limit", 1)["runs"]
+    assert values == [{"id": runs[0].run_id, "config.episodes": 5, "bytes": 5000}]
     assert command("ls", "bytes:>1MB").stderr == f"No run in {command.recordings} matches.\n"
 
 
@@ -127,9 +127,9 @@ def test_csv_has_what_json_has(command, make):
     run = make()
     command("label", run.run_id, "--tag", "a", "--tag", "b", "--note", 'with "quotes", and\nlines')
     (row,) = csv.DictReader(io.StringIO(command("ls", "--csv").stdout))
-    (told,) = command.json("ls")["runs"]
-    assert list(row) == list(told)
-    assert (row["note"], row["tags"]) == (told["note"], "a b")
+    (values,) = command.json("ls")["runs"]
+    assert list(row) == list(values)
+    assert (row["note"], row["tags"]) == (values["note"], "a b")
     assert command("ls", "--csv", "--quiet").exit_code == 2
 
 
@@ -147,7 +147,7 @@ def test_a_name_cannot_paint_the_terminal(command, make):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("--sort", "sede"), "Did you mean 'seed'?"),
         (("--columns", "id,bites"), "Did you mean 'bytes'?"),
@@ -155,10 +155,10 @@ def test_a_name_cannot_paint_the_terminal(command, make):
         (("sede:3",), "Did you mean 'seed'?"),
     ],
 )
-def test_wrong_fields_are_refused_with_the_nearest(command, words, told):
+def test_wrong_fields_are_refused_with_the_nearest(command, words, message):
     result = command("ls", *words)
     assert result.exit_code == 2
-    assert told in result.stderr
+    assert message in result.stderr
 
 
 def test_the_same_content_is_shown_as_such(recorded, command, recorded_run):
@@ -173,9 +173,9 @@ def test_the_same_content_is_shown_as_such(recorded, command, recorded_run):
     }
     assert "same as" in command("ls").stdout
     assert "same as" not in recorded("ls").stdout
-    told = command.json("du")
-    copied = {run["run_id"]: run["total"] for run in told["runs"]}
-    assert told["freeable"]["same_content"] == copied["two"]
+    values = command.json("du")
+    copied = {run["run_id"]: run["total"] for run in values["runs"]}
+    assert values["freeable"]["same_content"] == copied["two"]
 
 
 def test_an_archived_run_stays_listed(command, make):
@@ -183,8 +183,8 @@ def test_an_archived_run_stays_listed(command, make):
     assert command.json("ls")["runs"][0]["status"] == "finished"
     run.recording.unlink()
     for _ in range(2):
-        (told,) = command.json("ls", "status:archived archive:*")["runs"]
-        assert (told["status"], told["archive"], told["bytes"]) == ("archived", "/archives/a", None)
+        (values,) = command.json("ls", "status:archived archive:*")["runs"]
+        assert (values["status"], values["archive"], values["bytes"]) == ("archived", "/archives/a", None)
         assert command("index", "rebuild").exit_code == 0
     assert command("prune", "--older-than", "0s", "--yes").stderr.startswith("Left alone: 1 archived.")
     result = command("rm", run.run_id, "--yes")
@@ -195,13 +195,13 @@ def test_an_archived_run_stays_listed(command, make):
 # --- rm --------------------------------------------------------------------------------------------
 
 
-def test_rm_tells_asks_and_frees(command, make, answer):
+def test_rm_shows_asks_and_frees(command, make, answer):
     run, other = make(), make()
     assert command("rm", run.run_id).exit_code == 2
     assert "no terminal" in command("rm", run.run_id).stderr
     size = sum(path.stat().st_size for path in run.folder.iterdir())
-    told = command.json("rm", run.run_id, "--dry-run")
-    assert (told["dry_run"], told["freed"]) == (True, size)
+    values = command.json("rm", run.run_id, "--dry-run")
+    assert (values["dry_run"], values["freed"]) == (True, size)
     assert there(command) == {run.run_id, other.run_id}
     result = command("rm", run.run_id, "--yes")
     assert result.stdout.splitlines()[-1].startswith("Removed 1 run, freed ")
@@ -209,20 +209,20 @@ def test_rm_tells_asks_and_frees(command, make, answer):
     assert [path.name for path in command.recordings.iterdir()] == [other.run_id]
 
 
-def test_rm_refuses_what_is_to_stay_and_then_removes_nothing(command, make):
+def test_rm_removes_nothing_if_a_run_is_protected(command, make):
     free, kept, busy, running = make(), make(), make(), create_run(command.recordings, CONFIG, 1)
     command("label", kept.run_id, "--tag", "keep")
-    for run, told in ((kept, "--untag keep"), (running, "is running")):
+    for run, values in ((kept, "--untag keep"), (running, "is running")):
         result = command("rm", free.run_id, run.run_id, "--yes")
         assert result.exit_code == 2
-        assert told in result.stderr
+        assert values in result.stderr
     with locked(busy):
         assert "worked on by another process" in command("rm", busy.run_id, "--yes").stderr
     assert there(command) == {run.run_id for run in (free, kept, busy, running)}
 
 
 @pytest.mark.parametrize("damaged", ['{"tags": ["keep"', '{"tags": 3}', "[]"])
-def test_what_may_have_been_tagged_keep_stays(command, make, damaged):
+def test_a_run_with_damaged_labels_stays(command, make, damaged):
     run = make()
     (run.folder / "labels.json").write_text(damaged)
     for words in (("rm", run.run_id, "--yes"), ("prune", "config:*", "--yes")):
@@ -266,7 +266,7 @@ def test_rm_follows_no_link_and_stays_in_its_folder(command, make, tmp_path, rec
     assert "stands alone" in command("rm", alone, "--yes").stderr
 
 
-def test_what_a_cut_off_removal_left_is_cleaned_later(command, make):
+def test_an_interrupted_removal_is_completed_later(command, make):
     run, other = make(), make()
     stray = command.recordings / ".removed-abc-01234567"
     run.folder.rename(stray)
@@ -286,9 +286,9 @@ def test_prune_criteria_are_joined_by_and(command, make):
     make(50, "finished")
     make(5, "interrupted")
     words = ("prune", "--older-than", "30d", "--keep-last", 2, "--status", "interrupted")
-    told = command.json(*words, "--dry-run")
-    assert {run["run_id"] for run in told["removed"]} == {run.run_id for run in old[1:]}
-    assert told["freed"] == sum(run["bytes"] for run in told["removed"]) > 2000
+    values = command.json(*words, "--dry-run")
+    assert {run["run_id"] for run in values["removed"]} == {run.run_id for run in old[1:]}
+    assert values["freed"] == sum(run["bytes"] for run in values["removed"]) > 2000
     assert len(there(command)) == 5
     assert command(*words).exit_code == 2
     assert command(*words, "--yes").exit_code == 0
@@ -300,13 +300,13 @@ def test_prune_keeps_the_last_of_each_configuration(command, make):
     configs = [from_mapping({"name": name, "episodes": 5}) for name in ("one", "two")]
     newest = [make(day, config=config).run_id for config in configs for day in (1, 2)]
     older = [make(day, config=config).run_id for config in configs for day in (3, 4)]
-    told = command.json("prune", "--keep-last", 2, "--dry-run")
-    assert {run["run_id"] for run in told["removed"]} == set(older)
+    values = command.json("prune", "--keep-last", 2, "--dry-run")
+    assert {run["run_id"] for run in values["removed"]} == set(older)
     command("prune", "config:one", "--keep-last", 0, "--yes")
     assert there(command) == {newest[2], newest[3], older[2], older[3]}
 
 
-def test_prune_leaves_what_is_protected_and_says_so(command, make):
+def test_prune_reports_protected_runs(command, make):
     kept, strange, goes = make(9), make(9), make(9)
     running = create_run(command.recordings, CONFIG, 1)
     command("label", kept.run_id, "--tag", "keep")
@@ -320,14 +320,14 @@ def test_prune_leaves_what_is_protected_and_says_so(command, make):
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [((), "which runs?"), (("--older-than", "soon"), "expected an age"), (("  ",), "which runs?")],
 )
-def test_prune_wants_to_know_which(command, make, words, told):
+def test_prune_requires_a_criterion(command, make, words, message):
     make()
     result = command("prune", *words, "--yes")
     assert result.exit_code == 2
-    assert told in result.stderr
+    assert message in result.stderr
     assert len(there(command)) == 1
 
 
@@ -341,25 +341,25 @@ def test_du_adds_up_by_kind(command, make, tmp_path, monkeypatch):
     exports.mkdir(parents=True)
     (exports / f"{large.run_id}+{small.run_id}-0123.rrd").write_bytes(bytes(700))
     (small.folder / "recording.damaged-1.mcap").write_bytes(bytes(300))
-    told = command.json("du")
-    first, second = told["runs"]
+    values = command.json("du")
+    first, second = values["runs"]
     assert (first["run_id"], first["recording"], first["exports"]) == (large.run_id, 5000, 700)
     assert (second["recording"], second["exports"]) == (10, 0)
     assert second["other"] > 300
-    assert told["total"]["total"] == first["total"] + second["total"]
-    assert told["freeable"]["left_over"] == 300
-    assert told["freeable"]["unfinished"] == second["total"]
-    assert told["freeable"]["cached"] == 700
+    assert values["total"]["total"] == first["total"] + second["total"]
+    assert values["freeable"]["left_over"] == 300
+    assert values["freeable"]["unfinished"] == second["total"]
+    assert values["freeable"]["cached"] == 700
     text = command("du", "--limit", 1).stdout
     assert large.run_id in text
     assert "1 more" in text
 
 
-def test_index_rebuild_says_what_it_found(command, make):
+def test_index_rebuild_counts_runs_and_problems(command, make):
     make()
     make(status="failed")
-    told = command.json("index", "rebuild")
-    assert (told["runs"], told["statuses"], told["problems"]) == (2, {"failed": 1, "finished": 1}, [])
+    values = command.json("index", "rebuild")
+    assert (values["runs"], values["statuses"], values["problems"]) == (2, {"failed": 1, "finished": 1}, [])
     (command.recordings / "stray").mkdir()
     (command.recordings / "stray" / RUN_FILE).write_text("{")
     result = command("index", "rebuild")
