@@ -12,7 +12,8 @@ from runner.environments.naming import action_names, actions_in_words, states_in
 from runner.errors import RunnerError
 from runner.recording.reader import Recording
 from runner.replay.history import history_of
-from runner.replay.tables import TableReplay, last_step, step_of_episode
+from runner.replay.steps import last_step, step_of_episode
+from runner.replay.tables import TableReplay
 
 
 class TableSummary(TypedDict):

@@ -16,7 +16,8 @@ from runner.environments.mdp import Mdp
 from runner.errors import RunnerError
 from runner.learning.learner import Held
 from runner.recording.reader import Recording, open_recording
-from runner.replay.tables import held_at, initially_held, last_step
+from runner.replay.steps import last_step
+from runner.replay.tables import held_at, initially_held
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
 

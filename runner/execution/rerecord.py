@@ -18,7 +18,8 @@ from runner.learning.learner import Learner
 from runner.recording.metadata import write_result
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
-from runner.replay.tables import last_step, tables_at
+from runner.replay.steps import last_step
+from runner.replay.tables import tables_at
 from runner.runs import run as runs
 from runner.runs.locking import locked
 from runner.runs.provenance import provenance

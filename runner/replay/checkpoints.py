@@ -1,8 +1,8 @@
-"""Q-tables in the user's cache, one set every million steps of a replay, so that the next one begins nearby.
+"""Q-tables in the user's cache, one set every million steps of a replay, from which later replays start.
 
 A recording has snapshots by episodes, which may lie a hundred million steps apart. The first replay
-over such a stretch leaves checkpoints behind; from then on the tables at any step are a short replay away.
-They can be removed at any time: the recording alone is the truth.
+over such a stretch saves checkpoints; from then on the tables at any step are a short replay away.
+They can be removed at any time: everything in them follows from the recording.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from runner.util.files import TABLES, cache_folder, replacing
 CHECKPOINT_STEPS: Final = 1 << 20
 """Training steps between checkpoints: replayed in well under half a second."""
 MAX_CACHE_BYTES: Final = 2 << 30
-"""Size of all checkpoints of all runs; those not used for longest are removed beyond it."""
+"""The most that all checkpoints of all runs take; beyond it the least recently used are removed."""
 
 
 class Checkpoints:
@@ -58,7 +58,7 @@ class Checkpoints:
         return -1, []
 
     def save(self, step: int, tables: Sequence[NDArray[np.float64]]) -> None:
-        """Keep the tables at a step, unless they are there."""
+        """Save the tables at a step, unless they are there."""
         path = self._path(step)
         if not self._prefix or path.exists():
             return
@@ -70,7 +70,7 @@ class Checkpoints:
             self._saved = True
 
     def prune(self) -> None:
-        """Remove the checkpoints not used for longest, of any run, where they take too much space."""
+        """Remove the least recently used checkpoints, of any run, if they take too much space."""
         if not self._saved:
             return
         self._saved = False
@@ -111,7 +111,7 @@ class Checkpoints:
 
 
 def _key(recording: Recording) -> str:
-    """Return what tells the tables of this file, replayed by this code, from any others."""
+    """Return a key of the tables of this file as replayed by this code."""
     facts = recording.path.stat()
     parts = [str(recording.path.absolute()), str(facts.st_size), str(facts.st_mtime_ns)]
     parts += [str(recording.result.get("content_digest")), _code()]
@@ -120,7 +120,7 @@ def _key(recording: Recording) -> str:
 
 @cache
 def _code() -> str:
-    """Return a hash of the code that learns: tables made by other code may be others."""
+    """Return a hash of the code that learns: other code may compute other tables."""
     digest = blake3()
     for file in sorted(Path(next(iter(runner.learning.__path__))).glob("*.py")):
         digest.update(file.read_bytes())

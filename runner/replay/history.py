@@ -31,7 +31,7 @@ class StateHistory:
 
 
 def history_of(recording: Recording, state: int, step: int) -> StateHistory:
-    """Return what happened to a state's values within the first `step` training steps, by replaying them.
+    """Return the history of a state's values in the first `step` training steps, by replaying them.
 
     Raises:
         RecordingError: the steps are not recorded.
@@ -55,7 +55,7 @@ def history_of(recording: Recording, state: int, step: int) -> StateHistory:
 
 
 def _count(visits: NDArray[np.int64], own: NDArray[np.int32]) -> None:
-    """Count own actions, [visits, learners]."""
+    """Count each learner's own actions, [visits, learners]."""
     for i in range(len(visits)):
         visits[i] += np.bincount(own[:, i], minlength=visits.shape[1])
 
@@ -63,7 +63,7 @@ def _count(visits: NDArray[np.int64], own: NDArray[np.int32]) -> None:
 def _note_changes(
     history: StateHistory, steps: NDArray[np.void], rows: NDArray[np.float64]
 ) -> tuple[NDArray[np.void], NDArray[np.float64]]:
-    """Note which visit last changed each value; return the last visit, whose effect only the next one shows.
+    """Note which visit last changed each value; return the last visit, whose effect only the next shows.
 
     Args:
         history: where to note it.

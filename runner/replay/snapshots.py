@@ -1,4 +1,4 @@
-"""Snapshots as the recorded steps make them: an archive leaves these out, and a restore makes them again."""
+"""Snapshots that follow from the recorded steps: an archive omits them, and a restore derives them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from runner.replay.tables import StepReplay
 
 
 class DerivedTables:
-    """The tables of a run as far as its steps determine them, moved forward by the steps as they come.
+    """The tables of a run as far as its steps determine them, updated by the steps as they come.
 
     Args:
         replay: at the run's first step.
@@ -41,17 +41,17 @@ class DerivedTables:
         self._given.clear()
 
     def at(self, step: int, table: int) -> NDArray[np.float64] | None:
-        """Return a table after so many training steps, a view; None if the steps do not determine it."""
+        """Return a table after `step` training steps, a view; None if the steps do not determine it."""
         tables = self._replay.snapshot()
         known = self._known and step == self._replay.step and 0 <= table < len(tables)
         return tables[table] if known else None
 
     def give(self, step: int, table: int, values: NDArray[np.float64]) -> None:
-        """Set a table to its recorded values; when all of a step are given, the tables are known again."""
+        """Set a table to its recorded values; once all tables of a step are set, they are known again."""
         replay = self._replay
         tables = replay.snapshot()
         if not 0 <= table < len(tables) or tables[table].shape != values.shape:
-            return  # archived as it is, but nothing can be derived from it
+            return  # it is archived as it is, but nothing can be derived from it
         if step != replay.step:
             replay.step, self._known = step, False
             self._given.clear()
@@ -73,7 +73,7 @@ S = TypeVar("S", bound=Snapshot)
 
 
 class SnapshotVisitor(Generic[S]):
-    """Calls a function with each snapshot of a run when the training steps before it were taken.
+    """Calls a function with each snapshot of a run, after the training steps before it were applied.
 
     Args:
         tables: moved forward by the steps.

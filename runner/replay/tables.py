@@ -25,7 +25,7 @@ from runner.recording import schema
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
 from runner.replay.checkpoints import CHECKPOINT_STEPS, Checkpoints
-from runner.replay.checks import check_steps
+from runner.replay.steps import check_steps
 
 NEAR_STEPS: Final = 200_000
 """`TableReplay.seek` replays this many steps rather than load a snapshot on the way."""
@@ -33,12 +33,12 @@ _NO_ROWS = np.empty((0, 0, 0))
 
 
 class StateProbe(NamedTuple):
-    """Values and greedy actions of some states, to be read before some of the steps of a block."""
+    """Values and greedy actions of some states, read before some of the steps of a block."""
 
     before: NDArray[np.int64]
     """[k]: rows of the block, ascending."""
     states: NDArray[np.int32]
-    """[k, n]: the states to read before each of these rows; -1 for none."""
+    """[k, n]: the states that are read before each of these rows; -1 for none."""
     value: NDArray[np.float32]
     """[k, learners, n]: filled with the highest value of each state; nan for none."""
     greedy: NDArray[np.int32]
@@ -79,7 +79,7 @@ class StepReplay:
 
     @property
     def held(self) -> list[Held]:
-        """All that each learner holds at `step`, by name: views that `apply` changes; `q` is its table."""
+        """All tables of each learner at `step`, by name: views that `apply` changes; `q` is its Q-table."""
         return [self._learner.held(i) for i in range(len(self.agents))]
 
     @property
@@ -93,11 +93,11 @@ class StepReplay:
         return self._learner.tables.greedy
 
     def snapshot(self) -> list[NDArray[np.float64]]:
-        """Return all tables as a snapshot numbers them, those of one kind together: views."""
+        """Return all tables in the order of a snapshot, those of one kind together: views."""
         return self._learner.snapshot()
 
     def rewind(self, step: int, held: list[Held]) -> None:
-        """Set the tables to what the learners held at a step."""
+        """Set all tables to those of a step."""
         self._learner.set_held(held)
         self.step = step
 
@@ -207,7 +207,7 @@ class TableReplay(StepReplay):
         return seen
 
     def seek(self, step: int) -> None:
-        """Go to any step, from here or from the nearest snapshot before it, whichever takes less.
+        """Go to any step, from here or from the nearest snapshot before it, whichever is shorter.
 
         Raises:
             RecordingError: there is no such step, or the steps from the nearest snapshot are not recorded.
@@ -221,7 +221,7 @@ class TableReplay(StepReplay):
         self.advance(step)
 
     def rewind(self, step: int, held: list[Held]) -> None:
-        """Set the tables to what the learners held at a step; from there on no checkpoints are kept."""
+        """Set all tables to those of a step; from there on no checkpoints are saved."""
         super().rewind(step, held)
         self._origin = None
 
@@ -243,7 +243,7 @@ class TableReplay(StepReplay):
     def _advance(self, stop: int, seen: NDArray[np.float64] | None) -> None:
         first = self.step
         if stop < first:
-            raise RecordingError(f"a replay at step {first} cannot go back to {stop}; begin another.")
+            raise RecordingError(f"a replay at step {first} cannot go back to {stop}; start another.")
         if stop > max(self._recorded, first):
             raise self._missing(stop)
         for block in self._recording.blocks(schema.TRAIN_STEP, first, stop) if stop > first else ():
@@ -269,11 +269,11 @@ class TableReplay(StepReplay):
             return RecordingError(
                 f"{recording.path}: found {taken} training steps, expected at least {stop}."
             )
-        behind = next((snapshot.step for snapshot in recording.snapshots() if snapshot.step >= stop), None)
+        later = next((snapshot.step for snapshot in recording.snapshots() if snapshot.step >= stop), None)
         return RecordingError(
-            f"{recording.path}: was recorded without steps (recording.steps: none), and this takes the first "
+            f"{recording.path}: was recorded without steps (recording.steps: none), and this needs the first "
             f"{stop:,}; `dualtaxi rerecord` records them. The nearest Q-tables are those after {self.step:,}"
-            + (f" and {behind:,} steps." if behind is not None else " steps.")
+            + (f" and {later:,} steps." if later is not None else " steps.")
         )
 
 
@@ -314,7 +314,7 @@ def _replay_probed(
 
 
 def _check_probe(probe: StateProbe, mdp: Mdp) -> None:
-    """Refuse states that the tables do not have: compiled code would read beside them."""
+    """Refuse states that the tables do not have: compiled code would read outside of them."""
     if probe.states.size and not -1 <= probe.states.min() <= probe.states.max() < mdp.states:
         raise IndexError(f"found states up to {probe.states.max()}, expected less than {mdp.states}.")
 
@@ -329,7 +329,7 @@ def tables_at(recording: Recording, step: int) -> list[NDArray[np.float64]]:
 
 
 def held_at(recording: Recording, step: int) -> list[Held]:
-    """Return all that the learners held after `step` training steps, by name; `q` are the tables.
+    """Return all tables of the learners after `step` training steps, by name; `q` are the Q-tables.
 
     Raises:
         RecordingError: as for `tables_at`.
@@ -338,9 +338,9 @@ def held_at(recording: Recording, step: int) -> list[Held]:
 
 
 def known_steps(recording: Recording) -> list[tuple[int, int]]:
-    """Return the steps at which the tables can be had, as ascending ranges (first, last) without overlap.
+    """Return the steps at which the tables are known, as ascending ranges (first, last) without overlap.
 
-    That is from each snapshot on up to the first step that was lost in a repair, or not recorded.
+    They are known from each snapshot up to the first step that was lost in a repair, or not recorded.
     """
     lost = sorted((start, stop) for start, stop in recording.lost.get(schema.TRAIN_STEP.name, []))
     recorded = recording.count(schema.TRAIN_STEP)
@@ -355,33 +355,8 @@ def known_steps(recording: Recording) -> list[tuple[int, int]]:
     return found
 
 
-def step_of_episode(recording: Recording, episode: int) -> int:
-    """Return how many training steps were taken when `episode` episodes had ended.
-
-    Raises:
-        RecordingError: fewer episodes were recorded, or the last of them was lost.
-    """
-    ended = recording.count(schema.TRAIN_EPISODE)
-    if not 0 <= episode <= ended:
-        raise RecordingError(
-            f"{recording.path}: found {ended} training episodes, expected at least {episode}."
-        )
-    if episode == 0:
-        return 0
-    record = recording.episodes("train", episode - 1, episode)
-    if not len(record):
-        raise RecordingError(f"{recording.path}: training episode {episode - 1} was lost.")
-    return int(record[0]["last_step"]) + 1
-
-
-def last_step(recording: Recording) -> int:
-    """Return the last training step at which the tables can be had."""
-    snapshots = max((snapshot.step for snapshot in recording.snapshots()), default=0)
-    return max(snapshots, recording.count(schema.TRAIN_STEP))
-
-
 def initially_held(recording: Recording) -> list[Held] | None:
-    """Return what the learners held before training, by the first snapshot; None if that is missing."""
+    """Return the learners' tables before training, from the first snapshot; None if that is missing."""
     nearest = _snapshot_before(recording, 0, kinds_of(from_mapping(recording.config)))
     return nearest and nearest[1]
 

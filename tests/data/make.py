@@ -22,7 +22,8 @@ from runner.config.job import Job
 from runner.execution import session
 from runner.loops import loop
 from runner.recording.reader import open_recording
-from runner.replay.tables import last_step, tables_at
+from runner.replay.steps import last_step
+from runner.replay.tables import tables_at
 from runner.runs.run import Run
 from tests.runner.loops.making import Leaving, drive, parallel, play
 from tests.runner.loops.making import make as make_env

@@ -19,7 +19,7 @@ from runner.environments.naming import actions_in_words, agent_actions, explorat
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.replay.checks import check_steps
+from runner.replay.steps import check_steps
 
 if TYPE_CHECKING:
     from runner.learning.learner import Held

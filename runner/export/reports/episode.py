@@ -29,7 +29,7 @@ from runner.errors import RecordingError
 from runner.export.contents import require_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.replay.checks import check_steps
+from runner.replay.steps import check_steps
 from runner.replay.tables import TableReplay, tables_at
 
 MAX_STEPS: Final = 1000

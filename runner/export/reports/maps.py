@@ -18,7 +18,8 @@ from runner.environments.mdp import Mdp
 from runner.environments.naming import spoken, states_in_words
 from runner.errors import RecordingError
 from runner.recording.reader import Recording
-from runner.replay.tables import step_of_episode, tables_at
+from runner.replay.steps import step_of_episode
+from runner.replay.tables import tables_at
 
 Values = NDArray[np.float64]
 Bounds = tuple[float, float]

@@ -23,7 +23,7 @@ from runner.export.rerun.steps import StepWriter
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import leaves_of
-from runner.replay.checks import check_steps
+from runner.replay.steps import check_steps
 
 BATCH: Final = 8_192
 """Rows sent at a time: larger columns are dropped by the web viewer."""

@@ -39,7 +39,7 @@ from runner.export.rerun.selection import Request, Selection, Span, select
 from runner.export.rerun.steps import StepWriter
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
-from runner.replay.checks import check_steps
+from runner.replay.steps import check_steps
 from runner.runs.run import Run
 from runner.util import files
 from runner.util.files import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR, storage_errors

@@ -15,7 +15,8 @@ from runner.recording import schema
 from runner.recording.blocks import blank_records, block_counts
 from runner.recording.reader import open_recording
 from runner.replay.history import history_of
-from runner.replay.tables import TableReplay, last_step, step_of_episode, tables_at
+from runner.replay.steps import last_step, step_of_episode
+from runner.replay.tables import TableReplay, tables_at
 from tests.runner.altering import altered, without_chunk
 from tests.runner.recording.making import TAXIS, experiment, make_run
 

@@ -1,0 +1,58 @@
+"""Training steps by episode, and checks of steps; a module of its own, as it needs no compiled code."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.environments.mdp import Mdp
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.reader import Recording
+
+
+def step_of_episode(recording: Recording, episode: int) -> int:
+    """Return the number of training steps taken when `episode` episodes had ended.
+
+    Raises:
+        RecordingError: fewer episodes were recorded, or the last of them was lost.
+    """
+    ended = recording.count(schema.TRAIN_EPISODE)
+    if not 0 <= episode <= ended:
+        raise RecordingError(
+            f"{recording.path}: found {ended} training episodes, expected at least {episode}."
+        )
+    if episode == 0:
+        return 0
+    record = recording.episodes("train", episode - 1, episode)
+    if not len(record):
+        raise RecordingError(f"{recording.path}: training episode {episode - 1} was lost.")
+    return int(record[0]["last_step"]) + 1
+
+
+def last_step(recording: Recording) -> int:
+    """Return the last training step at which the tables can be had."""
+    snapshots = max((snapshot.step for snapshot in recording.snapshots()), default=0)
+    return max(snapshots, recording.count(schema.TRAIN_STEP))
+
+
+def check_steps(block: NDArray[np.void], mdp: Mdp, where: str, phase: str = "training") -> None:
+    """Refuse steps with a state or an action that the environment does not have: they are used as indices.
+
+    Args:
+        block: the steps; not empty.
+        mdp: the environment.
+        where: the recording or archive, for the error.
+        phase: of the steps, for the error.
+
+    Raises:
+        RecordingError: there is such a step.
+    """
+    bounds = {"state": mdp.states, "next_state": mdp.states, "action": mdp.joint_actions}
+    for name, bound in bounds.items():
+        if (found := int(block[name].max())) >= bound:
+            step = int(block["step"][int(block[name].argmax())])
+            raise RecordingError(
+                f"{where}: found {name} {found} in {phase} step {step}, expected less than {bound}; "
+                "`dualtaxi verify` checks the whole recording."
+            )
