@@ -1,12 +1,11 @@
-"""A run as one MCAP file to give away: the recording, with the run's labels in its metadata."""
+"""A run as one MCAP file to share: the recording, with the run's labels in its metadata."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from runner.errors import RecordingError, RunnerError
 from runner.export.places import write_new
@@ -17,20 +16,19 @@ from runner.runs.importing import EXPORT_RECORD
 from runner.runs.run import Run
 
 PRIVATE: Final = ("host", "user", "command", "directory")
-"""The entries of provenance that name persons and places."""
+"""The entries of provenance that identify persons and places."""
 LEFT_OUT: Final = "left out"
 
 
-@dataclass(frozen=True)
-class Exported:
+class McapExport(NamedTuple):
     """The result of an export."""
 
     path: Path
-    warnings: tuple[str, ...]
-    """What an anonymous file still tells of persons or places."""
+    warnings: list[str]
+    """What an anonymous file still contains of persons or places."""
 
 
-def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = False) -> Exported:
+def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = False) -> McapExport:
     """Write a run into one MCAP file, which `import_recording` reads; the same run gives the same bytes.
 
     Args:
@@ -57,15 +55,14 @@ def export_mcap(run: Run, target: Path, anonymous: bool = False, force: bool = F
             return None
         return _without_names(name, entries, run.recording) if anonymous else entries
 
-    def write(fresh: Path) -> None:
-        rewrite(run.recording, fresh, change, {EXPORT_RECORD: record})
-
-    write_new(target, force, write)
-    return Exported(target, tuple(_warnings(run)) if anonymous else ())
+    write_new(
+        target, force, lambda temporary: rewrite(run.recording, temporary, change, {EXPORT_RECORD: record})
+    )
+    return McapExport(target, list(_warnings(run)) if anonymous else [])
 
 
 def _record(run: Run, anonymous: bool) -> dict[str, Any]:
-    """Return what an importer cannot know from the recording alone."""
+    """Return what an importer needs besides the recording."""
     summary = {key: run.summary[key] for key in ("seconds", "error", "bytes") if key in run.summary}
     if anonymous and "error" in summary:
         summary["error"] = LEFT_OUT
@@ -78,7 +75,7 @@ def _without_names(name: str, entries: dict[str, str], recording: Path) -> dict[
     """Return the entries of a metadata record without host, user, command line and folder.
 
     Raises:
-        RecordingError: the record cannot be understood.
+        RecordingError: the record cannot be parsed.
     """
     if name in {"provenance", "rerecord"} or name.startswith("resume/"):
         return {key: text for key, text in entries.items() if key not in PRIVATE}
@@ -98,17 +95,17 @@ def _without_names(name: str, entries: dict[str, str], recording: Path) -> dict[
 
 
 def _warnings(run: Run) -> Iterator[str]:
-    """Yield what stays in an anonymous file although it may tell of a person or a place."""
+    """Yield a sentence for each part of an anonymous file that may identify a person or a place."""
     with open_recording(run.recording) as recording:
         for key, text in _texts(recording.config, ""):
             if Path(text).is_absolute():
-                yield f"The configuration names a path, which is part of the job and stays: {key}: {text}"
+                yield f"The configuration contains a path, which is part of the job and stays: {key}: {text}"
     if run.labels != Labels():
         yield "The labels of the run (name, tags and note) stay as they are."
 
 
 def _texts(value: Any, place: str) -> Iterator[tuple[str, str]]:
-    """Yield the place and text of every text in a configuration."""
+    """Yield every text in a configuration with its path."""
     if isinstance(value, str):
         yield place, value
     elif isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Runs in a notebook: a run shows itself, plots of several, and the Rerun viewer inline.
+"""Runs in a notebook: the report of a run, plots of several, and the Rerun viewer inline.
 
     import runner
     from runner.export.notebook import plot, rerun_view
@@ -8,7 +8,7 @@
     plot(run, other)          # the learning curves of both
     rerun_view(run)           # the Rerun viewer, where rerun-notebook is installed
 
-All of it is read from the recordings.
+Everything is read from the recordings.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from runner.runs.run import Run
 from runner.util.extras import require
 
 HEIGHT: Final = 760
-"""Pixels of a notebook's page that a run takes; it scrolls inside."""
-
+"""Height of a report in pixels; it scrolls inside."""
 
 _FRAME_STYLE: Final = """<style>
 .picture { display: flex; flex-direction: column; }
@@ -37,8 +36,8 @@ _FRAME_STYLE: Final = """<style>
 
 
 @dataclass(frozen=True)
-class Shown:
-    """Something that a notebook shows as HTML."""
+class Html:
+    """HTML that a notebook displays."""
 
     html: str = field(repr=False)
 
@@ -48,7 +47,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture that a notebook shows."""
+    """A PNG that a notebook displays."""
 
     png: bytes = field(repr=False)
 
@@ -57,7 +56,7 @@ class Picture:
 
 
 def register_formatters() -> None:
-    """Have the running IPython shell display each `Run` as its report; do nothing outside of a shell."""
+    """Make IPython display each `Run` as its report; without a running shell, do nothing."""
     from IPython import get_ipython
 
     shell = get_ipython()
@@ -66,10 +65,7 @@ def register_formatters() -> None:
 
 
 def run_html(run: Run) -> str:
-    """Return how a run shows itself: its result as a sentence, with its report in a frame below.
-
-    Where packages are missing it shows its facts instead.
-    """
+    """Return the result of a run as a sentence, and its report in a frame; facts if packages are missing."""
     if not run.recording.is_file():
         return facts_html(run)
     try:
@@ -78,7 +74,7 @@ def run_html(run: Run) -> str:
         return facts_html(run) + f"<p>{escape(str(error))}</p>"
 
 
-def report(*runs: Run, height: int = HEIGHT) -> Shown:
+def report(*runs: Run, height: int = HEIGHT) -> Html:
     """Return the report of runs (summary, replay, plots, maps) in a frame of its own.
 
     Raises:
@@ -91,7 +87,7 @@ def report(*runs: Run, height: int = HEIGHT) -> Shown:
     page, _ = render_report([at_hand(run).recording for run in runs])
     page = page.replace("</head>", f"{_FRAME_STYLE}</head>", 1)
     title = ", ".join(f"{run.name}, run {run.run_id}" for run in runs)
-    return Shown(
+    return Html(
         f'<iframe title="{escape(title)}" srcdoc="{escape(page)}" width="100%" height="{height}" '
         'style="border: 1px solid #8888; border-radius: 6px" sandbox="allow-scripts"></iframe>'
     )
@@ -132,15 +128,15 @@ def rerun_view(
     """Return the Rerun viewer with runs in it, as a widget.
 
     Args:
-        runs: what to show.
-        episodes: ranges of training episodes (start, stop); a spread of them unless given.
-        evaluations: evaluations, named by the training episodes before them.
-        width: pixels.
-        height: pixels.
+        runs: the runs.
+        episodes: ranges of training episodes (start, stop), by default a selection.
+        evaluations: the number of training episodes before each evaluation to show.
+        width: in pixels.
+        height: in pixels.
 
     Raises:
         MissingExtra: rerun-notebook is not installed.
-        RecordingError: a recording cannot be read, or has not what is asked for.
+        RecordingError: a recording cannot be read, or does not have these episodes.
     """
     notebook = require("rerun_notebook", extra="notebook", purpose="the Rerun viewer in a notebook")
     from runner.export.rerun.selection import Request
@@ -153,7 +149,7 @@ def rerun_view(
 
 
 def _result_html(run: Run) -> str:
-    """Return the last evaluation of a run as a sentence: where frames are not shown, all that there is."""
+    """Return the last evaluation of a run as a sentence, for programs that do not display frames."""
     last = run.summary.last_evaluation
     if last is None:
         return f"<p><b>{escape(run.title)}</b></p>"
@@ -164,12 +160,12 @@ def _result_html(run: Run) -> str:
 
 
 def facts_html(run: Run) -> str:
-    """Return what `run.json` says of a run, as a small table."""
+    """Return the facts of a run in `run.json` as a small table."""
     last = run.summary.last_evaluation
     evaluation = {"episode": last.episode, "trials": last.trials, **last.values} if last else {}
     facts = {
         "run": f"{run.run_id}, {run.status}",
-        "name": f"{run.title}",
+        "name": run.title,
         "recording": str(run.recording),
         **{f"last evaluation: {key.replace('_', ' ')}": value for key, value in evaluation.items()},
     }

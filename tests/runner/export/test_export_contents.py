@@ -1,4 +1,4 @@
-"""What is said of a recording that is not whole."""
+"""Messages about a recording that is incomplete."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from runner.export.contents import shortcomings
 from runner.recording.reader import Recording, open_recording
 
 
-def test_what_a_recording_lacks_is_told_though_it_does_not_say_what_was_planned(lake, monkeypatch):
+def test_shortcomings_of_a_recording_whose_plan_is_invalid(lake, monkeypatch):
     with open_recording(lake.recording) as recording:
         monkeypatch.setattr(Recording, "status", "interrupted")
         monkeypatch.setattr(Recording, "config", {"episodes": "many"})
-        (told,) = shortcomings(recording)
-    assert told.endswith("training episodes.")
-    assert "many" not in told
+        (sentence,) = shortcomings(recording)
+    assert sentence.endswith("training episodes.")
+    assert "many" not in sentence

@@ -1,4 +1,4 @@
-"""Minari datasets of somebody's own loops: what Minari reads is what the loop saw."""
+"""Minari datasets of recorded loops: Minari reads what the loop observed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ pytest.importorskip("minari")
 
 
 def exported(run: Any, folder: Path, monkeypatch: Any, *words: str) -> tuple[Any, str]:
-    """Return the dataset of a run, as Minari loads it, and what was said."""
+    """Return the dataset of a run, as Minari loads it, and the output of the command."""
     import minari
 
     call = ["export", "minari", str(run.recording), "-o", str(folder / "minari"), *words]
@@ -32,7 +32,7 @@ def exported(run: Any, folder: Path, monkeypatch: Any, *words: str) -> tuple[Any
 
 
 def same(space: gymnasium.Space[Any], found: Any, seen: list[Any]) -> None:
-    """Compare what a dataset has of a space with what was seen, one by one."""
+    """Assert that the values of a space in a dataset equal those observed."""
     if isinstance(space, spaces.Dict):
         for name, part in space.spaces.items():
             same(part, found[name], [value[name] for value in seen])
@@ -46,7 +46,7 @@ def same(space: gymnasium.Space[Any], found: Any, seen: list[Any]) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(set(NAMES) - {"CliffWalking-v1"}))  # at random it does not end
-def test_observations_and_actions_are_as_they_were(name, tmp_path, monkeypatch):
+def test_observations_and_actions_equal_those_of_the_loop(name, tmp_path, monkeypatch):
     env = make(name)
     with runner.record(env, tmp_path, name="loop") as rec:
         entries = list(play(rec, 300))
@@ -85,7 +85,7 @@ def test_images_are_kept_exactly(tmp_path, monkeypatch):
     np.testing.assert_array_equal(first.observations, seen[: len(first.observations)])
 
 
-def test_an_episode_that_was_reset_before_its_end_is_marked_truncated_and_said(tmp_path, monkeypatch):
+def test_an_episode_that_was_reset_before_its_end_is_marked_truncated_and_reported(tmp_path, monkeypatch):
     with runner.record(make("CartPole-v1"), tmp_path, name="loop") as rec:
         rec.reset(seed=1)
         rec.reset(seed=2)
@@ -94,17 +94,17 @@ def test_an_episode_that_was_reset_before_its_end_is_marked_truncated_and_said(t
             rec.step(0)
         rec.reset()
         rec.step(1)
-    dataset, said = exported(rec.run, tmp_path, monkeypatch)
+    dataset, output = exported(rec.run, tmp_path, monkeypatch)
     (episode,) = dataset.iterate_episodes()
     assert episode.truncations.tolist() == [False, False, True]
     np.testing.assert_array_equal(episode.observations[0], first)
-    assert "1 episodes were reset before their end" in said
-    assert "The last training episode never ended" in said
+    assert "1 episodes were reset before their end" in output
+    assert "The last training episode never ended" in output
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.name)
-def test_environments_side_by_side_give_whole_episodes_each(mode, tmp_path, monkeypatch):
-    """Each is what one environment alone does with the same seed and actions."""
+def test_parallel_environments_give_whole_episodes_each(mode, tmp_path, monkeypatch):
+    """Each equals the episode of a single environment with the same seed and actions."""
     envs = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * 3, autoreset_mode=mode)
     with runner.record_vector(envs, tmp_path, name="loop", chunk_steps=256) as rec:
         rec.reset(seed=7)
@@ -130,7 +130,7 @@ def test_environments_side_by_side_give_whole_episodes_each(mode, tmp_path, monk
     assert all(one.terminations[-1] for one in found)
 
 
-def test_chosen_episodes_and_games(tmp_path, monkeypatch):
+def test_selected_episodes_of_a_game(tmp_path, monkeypatch):
     from dualtaxi.parallel import DualTaxiParallelEnv
 
     with runner.record_parallel(DualTaxiParallelEnv(max_steps=9), tmp_path, name="game") as rec:
@@ -171,5 +171,5 @@ def test_a_phase_without_an_episode_is_refused(tmp_path):
     ],
     ids=str,
 )
-def test_a_space_is_made_again_from_its_description(space):
+def test_a_space_is_restored_from_its_description(space):
     assert restore_space(describe_space(space)) == space

@@ -1,4 +1,4 @@
-"""Which steps are exported, what is said about it, and what is refused."""
+"""Which steps are exported, the messages about them, and what is refused."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def invoke(*arguments):
     return CliRunner().invoke(cli, [str(argument) for argument in arguments])
 
 
-class TestChoice:
-    """What is chosen."""
+class TestSelection:
+    """The selected steps."""
 
     def test_default_is_a_spread_and_the_last_evaluation(self, rivals):
         selection = select(rivals, Request())
@@ -48,7 +48,7 @@ class TestChoice:
         assert selection.steps == rivals.count(schema.TRAIN_STEP) + rivals.count(schema.EVAL_STEP)
         assert not selection.left_out
 
-    def test_ranges_every_and_evaluations_come_together(self, rivals):
+    def test_ranges_every_and_evaluations_are_combined(self, rivals):
         request = Request(episodes=((0, 2), (38, None)), evaluations=(20,), every=15)
         selection = select(rivals, request)
         first = episodes_of(rivals, "train").first_step
@@ -81,15 +81,15 @@ class TestChoice:
             locate(run, Request(), (20, 6, 0))
 
 
-def test_an_environment_without_a_scene_is_named(pictured):
+def test_an_environment_without_a_scene_is_reported(pictured):
     with open_recording(pictured("corridor").recording) as recording:
         assert "no scene: state and action" in select(recording, Request()).warnings[0]
 
 
 class TestWithoutSteps:
-    """A run of which only metrics were recorded."""
+    """A run recorded without steps."""
 
-    def test_metrics_are_exported_and_the_rest_is_named(self, pictured, tmp_path):
+    def test_metrics_are_exported_and_the_rest_is_reported(self, pictured, tmp_path):
         run = pictured("rivals", recording={"steps": "none"})
         result = invoke("export", "rerun", run.folder, "-o", tmp_path / "a.rrd")
         assert result.exit_code == 0, result.output
@@ -102,7 +102,7 @@ class TestWithoutSteps:
         assert "rerecord" in result.output
 
 
-def test_an_interrupted_run_is_exported_as_far_as_it_came(pictured, tmp_path):
+def test_an_interrupted_run_is_exported_as_far_as_recorded(pictured, tmp_path):
     whole = pictured("rivals", recording={"chunk_steps": 256}).recording
     part = tmp_path / "part.mcap"
     part.write_bytes(whole.read_bytes()[: whole.stat().st_size * 8 // 10])
@@ -112,7 +112,7 @@ def test_an_interrupted_run_is_exported_as_far_as_it_came(pictured, tmp_path):
 
 
 class TestCommand:
-    """What the commands refuse."""
+    """Arguments that the commands refuse."""
 
     def test_a_screenshot_that_exists_needs_force(self, pictured, tmp_path):
         picture = tmp_path / "mine.png"
@@ -134,20 +134,20 @@ class TestCommand:
         assert "steps, in" in result.output
         assert path.read_bytes()[:4] == b"RRF2"
 
-    def test_a_place_where_no_file_can_be_is_told(self, pictured, tmp_path):
+    def test_a_path_that_cannot_be_written_is_reported(self, pictured, tmp_path):
         (tmp_path / "file").touch()
         path = tmp_path / "file" / "a.rrd"
         result = invoke("export", "rerun", pictured("lake").folder, "-o", path)
         assert result.exit_code == 2
         assert f"{path}: cannot be written (" in result.stderr
 
-    def test_without_a_place_it_is_written_to_exports(self, pictured, tmp_path, monkeypatch):
+    def test_the_default_path_is_in_exports(self, pictured, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         assert invoke("export", "rerun", pictured("lake").folder).exit_code == 0
         assert [path.suffix for path in (tmp_path / "exports").iterdir()] == [".rrd"]
 
     @pytest.mark.parametrize("text", ["x", "1-2", ":x", ""])
-    def test_ranges_that_are_none(self, pictured, text):
+    def test_texts_that_are_no_ranges(self, pictured, text):
         result = invoke("export", "rerun", pictured("lake").folder, "--episodes", text)
         assert result.exit_code == 2
         assert "START:STOP" in result.output

@@ -1,4 +1,4 @@
-"""What an export says, read back and compared with the recording, step by step."""
+"""An export, read back and compared with the recording step by step."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def exported(request, pictured, tmp_path_factory):
         yield Exported(recording, tmp_path_factory.mktemp("rerun") / "run.rrd")
 
 
-def saw(recording, phase, steps):
-    """Return what the learners saw at each step, [n, learners, widest]: by the replay alone."""
+def seen_values(recording, phase, steps):
+    """Return the values that the learners saw at each step, [n, learners, most actions], from a replay."""
     if phase == "train":
         return TableReplay(recording, 0).rows(len(steps))
     trained = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS - steps["step"] - 1
@@ -93,7 +93,7 @@ class TestSteps:
 
     def test_values_are_those_of_the_step(self, exported, phase):
         steps, counts = exported.steps(phase), exported.recording.mdp.action_counts
-        rows = saw(exported.recording, phase, steps)
+        rows = seen_values(exported.recording, phase, steps)
         if rows.shape[1] == len(counts):
             expected = np.concatenate([rows[:, i, :count] for i, count in enumerate(counts)], axis=1)
         else:
@@ -137,7 +137,7 @@ class TestSteps:
             expected = scene.points[steps["state"][back], : len(scene.movers)].swapaxes(0, 1)
             assert np.array_equal(np.array(strips[k], np.float32), expected)
 
-    def test_maps_are_of_the_step_they_name(self, exported, phase):
+    def test_maps_are_those_of_the_step_in_their_label(self, exported, phase):
         recording = exported.recording
         scene = scene_of(recording.mdp)
         if scene is None or scene.placements is None:
@@ -167,28 +167,28 @@ class TestSteps:
     def test_events_are_in_the_log(self, exported, phase):
         mdp, steps = exported.recording.mdp, exported.steps(phase)
         table = exported.table(f"/{phase}/events")
-        said = [text for (text,) in table["TextLog:text"]]
-        assert sum("begins:" in text for text in said) == (steps["t"] == 0).sum()
-        assert sum("time-out" in text for text in said) == (steps["truncated"] & ~steps["terminated"]).sum()
+        lines = [text for (text,) in table["TextLog:text"]]
+        assert sum("begins:" in text for text in lines) == (steps["t"] == 0).sum()
+        assert sum("time-out" in text for text in lines) == (steps["truncated"] & ~steps["terminated"]).sum()
         if "collision" in mdp.event_names:
             bit = mdp.event_names.index("collision")
             happened = events_of(mdp, steps) >> bit & 1
-            assert sum(text.startswith("collision") for text in said) == happened.sum()
+            assert sum(text.startswith("collision") for text in lines) == happened.sum()
         if phase == "eval":
             results = len(exported.recording.metrics("eval"))
-            assert sum(text.startswith("evaluation after") for text in said) == results
+            assert sum(text.startswith("evaluation after") for text in lines) == results
 
 
-def test_the_marks_say_what_went_wrong(exported):
+def test_the_labels_of_movers_show_illegal_actions(exported):
     mdp, steps = exported.recording.mdp, exported.steps("train")
     scene = scene_of(mdp)
     if scene is None or "collision" not in mdp.event_names:
         return
     labels, events = Labels(mdp, scene, exported.recording.agents), events_of(mdp, steps)
-    said = np.array(labels.texts)[labels.of_movers(scene.is_carrying[steps["state"]], events)]
+    shown = np.array(labels.texts)[labels.of_movers(scene.is_carrying[steps["state"]], events)]
     illegal = events >> mdp.event_names.index("taxi_2.illegal_pickup") & 1
-    assert [("illegal pickup" in label) for label in said[:, 1]] == illegal.astype(bool).tolist()
-    assert not any("illegal pickup" in label for label in said[illegal == 0, 1])
+    assert [("illegal pickup" in label) for label in shown[:, 1]] == illegal.astype(bool).tolist()
+    assert not any("illegal pickup" in label for label in shown[illegal == 0, 1])
 
 
 def test_every_metric_is_there(exported):
@@ -231,7 +231,7 @@ def test_means_between_reports_are_of_the_episodes_that_ended_there(exported):
         before = max(before, row["step"])
 
 
-def test_rerun_finds_the_file_sound(exported, tmp_path):
+def test_rerun_verifies_the_file(exported, tmp_path):
     path = tmp_path / "some.rrd"
     export([Source(exported.recording, "a run")], Request(episodes=((0, 2),), evaluations=(20,)), path)
     done = subprocess.run(
@@ -244,7 +244,7 @@ def test_rerun_finds_the_file_sound(exported, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_own_actions_make_up_the_joint_one(exported):
+def test_own_actions_combine_to_the_joint_action(exported):
     mdp = exported.recording.mdp
     assert np.array_equal(
         np.ravel_multi_index(tuple(own_actions(mdp).T), mdp.action_counts), np.arange(mdp.joint_actions)
@@ -284,7 +284,7 @@ def check_lines(path, views):
         assert len(set(colours)) == len(colours), entities
 
 
-def test_lines_show_values_that_occurred_each_in_its_own_colour(exported):
+def test_lines_show_recorded_values_each_in_its_own_colour(exported):
     check_lines(exported.path, [[f"/{path}" for path in paths] for _, paths in PLOTS])
 
 

@@ -70,7 +70,7 @@ def test_two_runs_are_side_by_side(pictured):
     assert all(not view.reports for view in views.values())
 
 
-def test_a_second_look_comes_from_the_cache(pictured):
+def test_a_second_export_comes_from_the_cache(pictured):
     run = pictured("lake")
     path, _ = cached_export([run], Request())
     made = path.stat().st_ino
@@ -79,7 +79,7 @@ def test_a_second_look_comes_from_the_cache(pictured):
     assert again.stat().st_ino == made
 
 
-def test_a_viewer_that_cannot_start_says_why(monkeypatch):
+def test_the_error_of_a_viewer_that_cannot_start(monkeypatch):
     monkeypatch.setattr(viewer, "viewer_program", lambda: "/bin/false")
     with (
         pytest.raises(RunnerError, match="does not start"),
@@ -88,7 +88,7 @@ def test_a_viewer_that_cannot_start_says_why(monkeypatch):
         pass
 
 
-def test_a_screenshot_is_kept_whole_or_its_place_is_told(monkeypatch, tmp_path):
+def test_a_screenshot_is_written_or_its_path_is_reported(monkeypatch, tmp_path):
     @contextlib.contextmanager
     def headless(path, step, size):
         yield SimpleNamespace(save_screenshot=lambda picture: Path(picture).write_bytes(b"drawn"))
@@ -114,7 +114,7 @@ def test_a_size_that_cannot_be_drawn_is_refused_before_anything_is_exported(pict
 
 
 @pytest.mark.parametrize(("names", "stages"), [(1, []), (2, ["comparing the runs"])])
-def test_what_view_is_doing_is_shown_on_a_terminal(pictured, monkeypatch, names, stages):
+def test_the_stages_of_view_are_shown_on_a_terminal(pictured, monkeypatch, names, stages):
     shown = []
 
     @contextlib.contextmanager
@@ -135,8 +135,8 @@ def test_the_web_viewer_ends_with_the_command(pictured):
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         try:
             address = process.stdout.readline().strip()
-            with urllib.request.urlopen(address, timeout=20) as answer:
-                assert b"re_viewer" in answer.read()
+            with urllib.request.urlopen(address, timeout=20) as response:
+                assert b"re_viewer" in response.read()
         finally:
             process.terminate()
         assert process.wait(30) == 128 + signal.SIGTERM
@@ -144,7 +144,7 @@ def test_the_web_viewer_ends_with_the_command(pictured):
         urllib.request.urlopen(address, timeout=20)
 
 
-def test_a_live_view_takes_one_episode_in_so_many(pictured, monkeypatch):
+def test_a_live_view_takes_one_episode_in_n(pictured, monkeypatch):
     run = pictured("rivals")
     with open_recording(run.recording) as recording:
         steps = np.concatenate(list(recording.blocks(schema.TRAIN_STEP)))
@@ -159,7 +159,7 @@ def test_a_live_view_takes_one_episode_in_so_many(pictured, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")  # the viewer is ended, and writes none
-def test_a_viewer_gets_what_a_live_view_is_shown(pictured, tmp_path, monkeypatch):
+def test_a_viewer_receives_the_steps_of_a_live_view(pictured, tmp_path, monkeypatch):
     monkeypatch.setattr(live_view, "END_SECONDS", 120.0)  # a busy machine
     run = pictured("rivals")
     with open_recording(run.recording) as recording:
@@ -180,13 +180,13 @@ def test_a_viewer_gets_what_a_live_view_is_shown(pictured, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("url", "said"),
+    ("url", "message"),
     [
         ("127.0.0.1:9876", "expected a viewer's address such as rerun+http://127.0.0.1:9876/proxy"),
         ("rerun+http://127.0.0.1:9/proxy", "nothing answers there"),
         ("rerun+http://127.0.0.1:port/proxy", "expected a viewer's address"),
     ],
 )
-def test_an_address_without_a_viewer_is_refused_before_the_run(url, said):
-    with pytest.raises(RunnerError, match=re.escape(said)):
+def test_an_address_without_a_viewer_is_refused_before_the_run(url, message):
+    with pytest.raises(RunnerError, match=re.escape(message)):
         viewer.check_address(url)

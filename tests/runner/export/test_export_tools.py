@@ -1,4 +1,4 @@
-"""What is exported, read back by the tool it is for, is what was recorded, exactly."""
+"""Every export, read back by the tool it is for, equals the recording exactly."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def assert_measures(run, metrics):
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "minari"])
 @pytest.mark.parametrize("ranges", ["9999:", "0:9999", "5:3"])
-def test_episodes_that_are_not_there_are_refused(export, taxis, form, ranges):
+def test_missing_episodes_are_refused(export, taxis, form, ranges):
     assert "found no training episodes" in export(form, taxis.recording, "--episodes", ranges, code=2).stderr
     assert not [path for path in Path().rglob("*") if path.is_file()]
 
@@ -143,7 +143,7 @@ def test_minari_reads_the_episodes(export, taxis, phase, monkeypatch):
     import minari
 
     monkeypatch.setattr("runner.export.minari._BATCH", 7)
-    told = export("minari", taxis.recording, "--phase", phase)
+    result = export("minari", taxis.recording, "--phase", phase)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(Path("exports/minari").absolute()))
     dataset = minari.load_dataset(f"taxis-{taxis.run_id}-v0")
     recorded = steps_of(taxis.recording, phase)
@@ -153,7 +153,7 @@ def test_minari_reads_the_episodes(export, taxis, phase, monkeypatch):
     assert dataset.total_episodes == len(ended)
     assert dataset.total_steps == len(recorded)
     assert (dataset.observation_space.n, dataset.action_space.n) == (mdp.states, mdp.joint_actions)
-    assert "specify" not in told.stderr
+    assert "specify" not in result.stderr
     assert dataset.spec.env_spec.id == "DualTaxi-v1"
     for episode, record in zip(dataset.iterate_episodes(), ended, strict=True):
         steps = recorded[recorded["episode"] == record["episode"]]
@@ -173,8 +173,8 @@ def test_minari_of_chosen_and_of_cut_off_episodes(export, taxis, killed, monkeyp
     assert minari.load_dataset(f"taxis-{taxis.run_id}-v0").total_steps == len(
         steps_of(taxis.recording, "train", 7, 8)
     )
-    told = export("minari", killed, "--force")
-    assert "interrupted" in told.stderr
+    result = export("minari", killed, "--force")
+    assert "interrupted" in result.stderr
     for episode in minari.load_dataset(f"taxis-{taxis.run_id}-v0").iterate_episodes():
         assert episode.terminations[-1] or episode.truncations[-1]
     assert "there are 60" in export("minari", taxis.recording, "--episodes", "60:", "--force", code=2).stderr
@@ -239,7 +239,7 @@ def read_run(client, run):
     }
 
 
-def test_mlflow_reads_the_run_once(export, taxis):
+def test_mlflow_has_the_run_once(export, taxis):
     export("mlflow", taxis.recording, "--with-recording")
     (found,) = read_mlflow()
     assert "already" in export("mlflow", taxis.recording).stderr
@@ -263,18 +263,18 @@ def test_mlflow_reads_the_run_once(export, taxis):
         name: sorted(points) for name, points in expected.items()
     }
     export("mlflow", taxis.recording, "--force")
-    (anew,) = read_mlflow()
-    assert anew["id"] != found["id"]
-    assert anew["files"] == ["run.json"]
+    (replaced,) = read_mlflow()
+    assert replaced["id"] != found["id"]
+    assert replaced["files"] == ["run.json"]
 
 
-def test_mlflow_takes_whatever_a_loop_calls_its_numbers(export, tmp_path):
+def test_mlflow_accepts_every_name_of_a_logged_number(export, tmp_path):
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "loops", config={"a b|c": 1}) as env:
         env.reset(seed=0)
         for value, name in enumerate(("mean |q|", "mean _q_", "a\nb", "../up", "/", "x" * 300)):
             env.log(name, np.array([value]))
-    said = export("mlflow", env.run.recording).stderr
-    assert "'train/logged/mean |q|' is called 'train/logged/mean _q_': MLflow takes no such name." in said
+    errors = export("mlflow", env.run.recording).stderr
+    assert "'train/logged/mean |q|' is called 'train/logged/mean _q_': MLflow takes no such name." in errors
     (found,) = read_mlflow()
     logged = {key.removeprefix("train/logged/"): points[0][2] for key, points in found["history"].items()}
     assert sorted(logged.values()) == [0, 1, 2, 3, 4, 5]
@@ -302,26 +302,26 @@ def test_mlflow_gets_lengths_and_returns_of_a_loops_episodes(export, tmp_path):
     assert [value for _, _, value in returns] == lengths
 
 
-def test_a_loop_without_steps_is_not_told_to_be_done_again(export, tmp_path):
+def test_the_error_for_a_loop_without_steps_does_not_suggest_rerecording(export, tmp_path):
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "loops") as env:
         env.reset(seed=0)
-    said = export("csv", env.run.recording, code=2).stderr
-    assert "found no steps to export" in said
-    assert "rerecord" not in said
+    errors = export("csv", env.run.recording, code=2).stderr
+    assert "found no steps to export" in errors
+    assert "rerecord" not in errors
 
 
-def test_a_store_that_cannot_be_used_is_told(export, taxis):
+def test_an_unusable_store_is_reported(export, taxis):
     assert "cannot" in export("mlflow", taxis.recording, "--tracking-uri", "nonsense://x", code=2).stderr
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "minari"])
-def test_a_run_without_steps_names_what_records_them(export, bare, form):
+def test_the_error_for_a_run_without_steps_names_the_command_that_records_them(export, bare, form):
     assert "rerecord" in export(form, bare.recording, code=2).stderr
     assert list(Path().iterdir()) in ([], [Path("exports")])
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "tensorboard"])
-def test_an_interrupted_run_gives_what_there_is(export, killed, form):
+def test_an_interrupted_run_is_exported_as_far_as_recorded(export, killed, form):
     assert "interrupted" in export(form, killed, "-o", "out").stderr
     if form != "tensorboard":
         steps = read_table(Path(f"out/steps.{form}")).to_pandas()
@@ -330,7 +330,7 @@ def test_an_interrupted_run_gives_what_there_is(export, killed, form):
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet", "tensorboard"])
-def test_a_folder_is_replaced_only_by_force_and_only_if_it_is_ours(export, taxis, form):
+def test_a_folder_is_replaced_only_by_force_and_only_if_an_export_wrote_it(export, taxis, form):
     export(form, taxis.recording, "-o", "out")
     before = sorted(Path("out").iterdir())
     assert "--force" in export(form, taxis.recording, "-o", "out", code=2).stderr
