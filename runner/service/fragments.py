@@ -223,9 +223,8 @@ def _without_folders(section: Section, recordings: Path) -> Section:
 def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
     """Return the charts of a sweep as HTML: its parameters, and learning curves of some of its trials."""
     from runner.export.plots.curves import footnote, panel_plots
-    from runner.sweep.charts import picture_plots
+    from runner.sweep.charts import learning, picture_of, picture_plots
     from runner.sweep.page import sweep_legend
-    from runner.sweep.plots import learning, picture_of
 
     results, shown, html = _results(name, recordings, digest), partials(), ""
     with contextlib.suppress(RunnerError):  # no trial is finished yet, as the ranking says

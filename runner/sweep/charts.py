@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import math
 import textwrap
 from collections.abc import Sequence
-from typing import Final
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
+from runner.analysis.series import read_series
+from runner.archive.places import at_hand
 from runner.drawing import palette
+from runner.errors import RunnerError
 from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour
 from runner.export.plots.curves import HEIGHT, WIDTH, Plot, panel_chart
-from runner.export.plots.metrics import Panel
-from runner.sweep.plots import Axis, Picture
+from runner.export.plots.metrics import Panel, panels_of
+from runner.recording.reader import open_recording
+from runner.runs.resolve import find_run
+from runner.sweep.model import Range
+from runner.sweep.results import Ranked, Results, spoken
 
 Values = NDArray[np.float64]
 
@@ -23,6 +33,122 @@ _TRIAL: Final = series_colour(0)
 _BEST: Final = series_colour(1)
 _LETTERS: Final = 175
 """Letters of a note that fit on a line of a sheet."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A parameter of a sweep, and the values that its trials have."""
+
+    path: str
+    choices: tuple[str, ...]
+    """The values of a list as text; empty for a range."""
+    log: bool
+    values: tuple[float, ...]
+    """The value of each trial, or the number of its choice."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Trials that have results, and their parameters."""
+
+    trials: tuple[Ranked, ...]
+    """The best first."""
+    axes: tuple[Axis, ...]
+    objective: str
+    lower_is_better: bool
+    log: bool
+    """Whether the objective is drawn on a logarithmic scale."""
+    left_out: int
+    """Number of trials without a value that can be drawn."""
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """The median of each trial."""
+        return tuple(float(trial.median or 0.0) for trial in self.trials)
+
+    @property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """The lowest and the highest seed of each trial."""
+        return tuple((float(trial.low or 0.0), float(trial.high or 0.0)) for trial in self.trials)
+
+    @property
+    def footnote(self) -> str:
+        """The meaning of dots and bars, and the trials that are not drawn."""
+        text = "A dot is a trial: the median over its seeds; the bar goes from its lowest to its highest."
+        if any(trial.state == "pruned" for trial in self.trials):
+            text += " A hollow one was pruned: it shows the value at that time."
+        if self.left_out:
+            text += f" {self.left_out} trials without a value are left out."
+        return text
+
+
+def picture_of(results: Results) -> Picture:
+    """Return the trials of a sweep that can be drawn.
+
+    Raises:
+        RunnerError: no trial has a result yet.
+    """
+    drawn = tuple(trial for trial in results.ranking if _is_drawable(trial))
+    if not drawn:
+        raise RunnerError(_nothing_to_draw(results))
+    parameters, objective = results.sweep.file.parameters, results.sweep.objective
+    values = [value for trial in drawn for value in (trial.low, trial.high) if value is not None]
+    at = f"first at {objective.level:g}, episodes" if objective.at == "first_over" else objective.at
+    return Picture(
+        trials=drawn,
+        axes=tuple(_axis(path, parameter, drawn) for path, parameter in parameters.items()),
+        objective=f"{objective.metric}, {at}",
+        lower_is_better=objective.direction == "minimize",
+        log=min(values) > 0 and max(values) > 30 * min(values),
+        left_out=len(results.ranking) - len(drawn),
+    )
+
+
+def learning(results: Results, recordings: Path) -> tuple[list[Group], list[Panel]]:
+    """Return the runs of the median and of the best trial, and their metrics over episodes.
+
+    Raises:
+        RunnerError: no trial is finished yet, or a run cannot be read.
+    """
+    finished = [trial for trial in results.ranking if trial.state == "finished"]
+    if not finished:
+        raise RunnerError(_nothing_to_draw(results))
+    groups = []
+    for name, trial in (("median", finished[len(finished) // 2]), ("best", finished[0])):
+        series = []
+        for run_id in trial.runs.values():
+            with open_recording(at_hand(find_run(run_id, recordings)).recording) as recording:
+                series.append(read_series(recording))
+        values = ", ".join(f"{path} {spoken(value)}" for path, value in trial.values.items())
+        groups.append(Group(f"{name}, trial {trial.number}: {values}", tuple(series)))
+    return groups, panels_of(groups)
+
+
+def panel_of(objective: str, panels: Sequence[Panel]) -> Panel:
+    """Return the panel of an objective's metric; the first one if it has no panel of its own."""
+    matching = [panel for panel in panels if objective.startswith(panel.metric)]
+    return max(matching, key=lambda panel: len(panel.metric)) if matching else panels[0]
+
+
+def _nothing_to_draw(results: Results) -> str:
+    finished = sum(trial.state == "finished" for trial in results.ranking)
+    reason = "it has no finished trial yet"
+    if finished:
+        reason = f"none of its {finished:,} finished trials reached {results.sweep.objective.description}"
+    return f"the sweep {results.sweep.name!r}: nothing to draw, as {reason}."
+
+
+def _is_drawable(trial: Ranked) -> bool:
+    values = (trial.median, trial.low, trial.high)
+    return all(value is not None and math.isfinite(value) and abs(value) < NEVER for value in values)
+
+
+def _axis(path: str, parameter: Range | list[Any], trials: Sequence[Ranked]) -> Axis:
+    if isinstance(parameter, Range):
+        return Axis(path, (), parameter.log, tuple(float(trial.values[path]) for trial in trials))
+    choices = [json.dumps(choice) for choice in parameter]
+    numbers = tuple(float(choices.index(json.dumps(trial.values[path]))) for trial in trials)
+    return Axis(path, tuple(map(spoken, parameter)), False, numbers)
 
 
 def sweep_sheet(title: str, picture: Picture, groups: Sequence[Group], panel: Panel) -> Canvas:
@@ -45,9 +171,9 @@ def sweep_sheet(title: str, picture: Picture, groups: Sequence[Group], panel: Pa
     rows = math.ceil(len(parameters) / columns)
     below = 32.0 + row_height * rows + parallel.height
     width = max(WIDTH * columns, parallel.width + WIDTH if columns == 3 else parallel.width)
-    beside = width >= parallel.width + WIDTH
-    curves_at = (parallel.width, below - HEIGHT - 20) if beside else (0.0, below)
-    end = below if beside else below + HEIGHT
+    side_by_side = width >= parallel.width + WIDTH
+    curves_at = (parallel.width, below - HEIGHT - 20) if side_by_side else (0.0, below)
+    end = below if side_by_side else below + HEIGHT
     sheet = Canvas(width, end + 16 + 11 * len(notes), title)
     sheet.text(10, 20, title, size=13, bold=True)
     for number, chart in enumerate(parameters):

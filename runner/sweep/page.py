@@ -12,8 +12,7 @@ from runner.analysis.groups import Group
 from runner.analysis.sections import Grid, Section
 from runner.export.plots.curves import Plot, footnote, panel_plots
 from runner.export.reports.rendering import LegendEntry, View, render
-from runner.sweep.charts import picture_plots
-from runner.sweep.plots import learning, picture_of
+from runner.sweep.charts import learning, picture_of, picture_plots
 from runner.sweep.results import Results, sections
 
 

@@ -81,8 +81,7 @@ def plot_command(run_names: tuple[str, ...], output: Path, force: bool, recordin
 
 def _plot_sweep(name: str, recordings: Path, output: Path, force: bool) -> None:
     from runner.export.plots.image import save
-    from runner.sweep.charts import sweep_sheet
-    from runner.sweep.plots import learning, panel_of, picture_of
+    from runner.sweep.charts import learning, panel_of, picture_of, sweep_sheet
     from runner.sweep.results import results_of
     from runner.sweep.state import read_sweep
 

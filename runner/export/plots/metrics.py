@@ -1,12 +1,11 @@
 """Every metric of runs over episodes: runs of one configuration together, as median and band.
 
-What is computed here is what `plots_figure` draws: a `Panel` a metric, in it a `Curve` a group of runs
-(and an agent).
+A `Panel` is a metric; it has a `Curve` for each group of runs (and agent), which `curves` draws.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,7 +50,7 @@ class Panel:
 
     @property
     def at_least_zero(self) -> bool:
-        """Whether no value is below zero, so that the axis can begin there."""
+        """Whether no value is below zero, so that the axis can start there."""
         return all(not (curve.low < 0).any() for curve in self.curves)
 
 
@@ -74,60 +73,45 @@ def panels_of(groups: Sequence[Group]) -> list[Panel]:
         raise RunnerError(
             f"found no metrics in {runs}: neither an evaluation nor a report of training was recorded."
         )
-    return [_panel(metric, tuple(curves[metric])) for metric in sorted(curves, key=_rank)]
+    return [Panel(metric, *title_of(metric), tuple(curves[metric])) for metric in sorted(curves, key=_rank)]
 
 
-# --- inside -------------------------------------------------------------------------------------------
-
-
-def _metrics(group: Group) -> Iterator[tuple[str, str]]:
-    """Yield the (metric, line) pairs of a group's runs, each once."""
-    seen = {}
-    for run in group.runs:
-        for _, readings in (*run.evaluation, *run.training):
-            for metric, lines in readings.items():
-                seen.update(dict.fromkeys((metric, line) for line in lines))
-    rewards = sorted((pair for pair in seen if pair[0] == SHARES), key=lambda pair: float(pair[1]))
-    yield from (pair for pair in seen if pair[0] != SHARES)
-    yield from rewards
+def _metrics(group: Group) -> list[tuple[str, str]]:
+    """Return the (metric, line) pairs of a group's runs, rewards last and by value."""
+    pairs = dict.fromkeys(
+        (metric, line)
+        for run in group.runs
+        for _, readings in (*run.evaluation, *run.training)
+        for metric, lines in readings.items()
+        for line in lines
+    )
+    return sorted(pairs, key=lambda pair: (pair[0] == SHARES, float(pair[1]) if pair[0] == SHARES else 0.0))
 
 
 def _curve(number: int, group: Group, metric: str, line: str) -> Curve | None:
     """Return the median and the band of a metric, over the runs that have come as far.
 
-    Runs report training after so many steps, so at different episodes: with several runs only the
-    reports at evaluations are taken, which are at the same episodes. Somebody's own loop evaluates when it
-    likes: between its points a run is interpolated, lest the line jump from one run to the other.
+    Runs report training every number of steps, so at different episodes: of several runs, only the reports at
+    evaluations are drawn, which are at the same episodes. Loops evaluate at any episode: between its points a
+    run is interpolated, so that the line does not jump from one run to another.
     """
     runs = [points_of(run, metric, line, aligned=len(group.runs) > 1) for run in group.runs]
-    episodes = sorted({episode for points in runs for episode in points})
-    if not episodes:
+    episodes = np.array(sorted({episode for points in runs for episode in points}), np.float64)
+    if not len(episodes):
         return None
-    values = np.array(
-        [
-            np.interp(episodes, list(points), list(points.values()), np.nan, np.nan)
-            for points in (dict(sorted(run.items())) for run in runs if run)
-        ]
-    )
-    return Curve(
-        number,
-        line,
-        np.array(episodes, np.float64),
-        np.nanmedian(values, axis=0),
-        np.nanmin(values, axis=0),
-        np.nanmax(values, axis=0),
-    )
-
-
-def _panel(metric: str, curves: tuple[Curve, ...]) -> Panel:
-    return Panel(metric, *title_of(metric), curves)
+    values = [
+        np.interp(episodes, sorted(points), [points[at] for at in sorted(points)], np.nan, np.nan)
+        for points in runs
+        if points
+    ]
+    median, low, high = (band(values, axis=0) for band in (np.nanmedian, np.nanmin, np.nanmax))
+    return Curve(number, line, episodes, median, low, high)
 
 
 def _rank(metric: str) -> tuple[int, int]:
-    """Return where a metric stands: evaluation, its events, training."""
-    order = list(METRIC_OF)
+    """Return the position of a metric: evaluation, its events, training, logged values."""
     if metric.startswith("event."):
         return 1, 0
     if metric.startswith(LOGGED):
         return 3, 0
-    return (2 if metric.startswith("training.") else 0), order.index(metric)
+    return (2 if metric.startswith("training.") else 0), list(METRIC_OF).index(metric)

@@ -190,7 +190,7 @@ def _pictures(divergence: Divergence, a: Recording, b: Recording) -> Iterator[St
 
 
 def _picture(recording: Recording, step: np.void, title: str, after: bool) -> StepPicture:
-    """Return the grid before or after a step, with the state or the step in words."""
+    """Return the grid before or after a step, with the state or the step as text."""
     mdp = recording.mdp
     state = int(step["next_state"] if after else step["state"])
     state_text = str(states_in_words(mdp)[state])

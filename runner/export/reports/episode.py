@@ -84,13 +84,13 @@ class Episode:
 
     @property
     def description(self) -> str:
-        """Length, end and return in words, and the number of steps if these are not all."""
+        """Length, end and return as text, and the number of steps if these are not all."""
         part = "" if self.steps == self.length else f" Shown are the first {self.steps:,} steps."
         return self.outcome + part
 
     @property
     def outcome(self) -> str:
-        """Length, end and return in words."""
+        """Length, end and return as text."""
         words = {"success": "ended in success", "terminated": "ended", "truncated": "ended by the step limit"}
         words["reset"] = "reset before its end"
         ended = words.get(self.ended, "cut off with the recording")
@@ -140,7 +140,7 @@ def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
 
 
 def deeds_in_words(mdp: Mdp) -> list[str]:
-    """Return every joint action in words, with its agents: `taxi 1 south, taxi 2 pickup`."""
+    """Return every joint action as text, with its agents: `taxi 1 south, taxi 2 pickup`."""
     words = [str(word) for word in actions_in_words(mdp)]
     if len(mdp.agents) < 2 or action_names(mdp) is None:
         return words

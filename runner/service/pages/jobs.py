@@ -38,7 +38,7 @@ class ShownJob:
     share: float | None
     """Share of the work that is done; None if it is unknown."""
     progress: str
-    """The same in words, as `job.js` writes it."""
+    """The same as text, as `job.js` writes it."""
 
 
 @dataclass(frozen=True)

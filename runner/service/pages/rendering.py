@@ -98,7 +98,7 @@ def _problem(message: str) -> Markup:
 
 
 def _age(moment: datetime | str) -> str:
-    """Return the time since a moment, in words."""
+    """Return the time since a moment as text."""
     then = datetime.fromisoformat(moment) if isinstance(moment, str) else moment
     return humanize.age((datetime.now(UTC) - then).total_seconds())
 

@@ -1,4 +1,4 @@
-"""What the tests of pictures share: runs of several worlds, each made once."""
+"""Shared by the tests of pictures: runs of several worlds, each recorded once."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WORLDS = {
 
 @pytest.fixture(scope="session")
 def pictured(tmp_path_factory):
-    """Return a function that gives the run of a world, made when first asked for."""
+    """Return a function that gives the run of a world, recorded on first use."""
     folder, made = tmp_path_factory.mktemp("pictured"), {}
 
     def run_of(world, **changes):

@@ -20,7 +20,7 @@ def gif(*words):
     return CliRunner().invoke(cli, ["export", "gif", *map(str, words)])
 
 
-def test_frames_show_each_state_and_tell_each_step(recording):
+def test_frames_show_each_state_and_describe_each_step(recording):
     mdp = recording.mdp
     episode = training_episode(recording, 3, 30)
     steps = recording.episode_steps("train", 3)[:30]
@@ -28,11 +28,11 @@ def test_frames_show_each_state_and_tell_each_step(recording):
     assert len(Film(recording, episode)) == len(captions) == len(steps) + 1
     totals = steps["rewards"].sum(axis=1).cumsum()
     for k in range(len(steps)):
-        told = " ".join(captions[k + 1])
-        assert f"step {k + 1} of" in told
-        assert f"sum {totals[k]:+g}" in told
+        caption = " ".join(captions[k + 1])
+        assert f"step {k + 1} of" in caption
+        assert f"sum {totals[k]:+g}" in caption
         if mdp.scene is None:
-            assert f"state {steps['next_state'][k]}" in told
+            assert f"state {steps['next_state'][k]}" in caption
 
 
 def test_frames_look_like_the_pictures_of_the_replay(recording):
@@ -105,11 +105,11 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_not_there_is_refused(pictured, tmp_path, case):
-    words, told = REFUSED[case]
+def test_missing_episodes_are_refused(pictured, tmp_path, case):
+    words, message = REFUSED[case]
     result = gif(pictured("lake").recording, *words, "-o", tmp_path / "film.gif")
     assert result.exit_code == 2
-    assert re.search(told, result.stderr.replace("\n", " "))
+    assert re.search(message, result.stderr.replace("\n", " "))
     assert not list(tmp_path.iterdir())
 
 
@@ -127,7 +127,7 @@ def test_a_run_without_evaluations_shows_its_last_training_episode(pictured, tmp
     assert "no whole evaluation" in result.stderr
 
 
-def test_a_file_is_replaced_only_when_asked(pictured, tmp_path):
+def test_a_file_is_replaced_by_force_only(pictured, tmp_path):
     path = tmp_path / "film.gif"
     path.write_text("mine")
     result = gif(pictured("lake").recording, "-o", path)

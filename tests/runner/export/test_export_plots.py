@@ -1,4 +1,4 @@
-"""Plots: what is in the panels is what the recordings say; files are real; mistakes are told."""
+"""Plots: the panels show the recordings, files are valid, and errors are clear."""
 
 from __future__ import annotations
 
@@ -54,15 +54,15 @@ def test_seeds_are_one_group_with_median_and_band(seeds):
     assert curve.high.tolist() == [max(each) for each in zip(*lengths, strict=True)]
 
 
-def again(run, folder, run_id):
+def recorded_again(run, folder, run_id):
     """Return the same content, recorded under another id."""
     (folder / run_id).mkdir(parents=True)
     with_id(run_id, run.recording, folder / run_id / "recording.mcap")
     return find_run(run_id, folder)
 
 
-def test_a_run_recorded_twice_counts_once_and_that_is_said(seeds, tmp_path):
-    copies = [again(seeds[0], tmp_path, run_id) for run_id in ("again111", "again222")]
+def test_a_run_recorded_twice_counts_once_with_a_message(seeds, tmp_path):
+    copies = [recorded_again(seeds[0], tmp_path, run_id) for run_id in ("again111", "again222")]
     (group,) = groups_of(series(*seeds, *copies))
     assert sorted(run.seed for run in group.runs) == [1, 2, 3]
     assert set(group.left_out) == {seeds[0].run_id, "again111"}
@@ -130,7 +130,7 @@ def test_the_command_writes_the_file_once(pictured, tmp_path, suffix, magic):
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
 
 
-def test_a_file_is_replaced_only_when_asked(pictured, tmp_path):
+def test_a_file_is_replaced_by_force_only(pictured, tmp_path):
     path = tmp_path / "plot.svg"
     path.write_text("mine")
     result = plot(pictured("corridor", log=None).recording, "-o", path)
@@ -170,7 +170,7 @@ def test_a_name_stands_for_all_its_runs(pictured, tmp_path):
     assert "of 3 runs" in plot(*words).stdout
 
 
-def test_mistakes_are_told(pictured, tmp_path):
+def test_errors_name_the_problem(pictured, tmp_path):
     assert "expected one of .png" in plot(pictured("lake").recording, "-o", tmp_path / "x.bmp").stderr
     assert "no run 'nobody'" in plot("nobody", "--recordings", tmp_path, "-o", tmp_path / "x.png").stderr
     silent = pictured("lake", evaluation=None, log=None)
@@ -191,7 +191,7 @@ def test_where_success_is_unknown_there_is_no_panel_of_it(pictured):
     assert "mean_length" in metrics
 
 
-def test_exact_measures_are_drawn_beside_the_optimum(tmp_path):
+def test_exact_measures_are_drawn_with_the_optimum(tmp_path):
     run = make_run(tmp_path, TAXIS, evaluation={"every": 20, "trials": 3, "exact": True})
     with open_recording(run.recording) as recording:
         panels = {panel.metric: panel for panel in panels_of(groups_of([read_series(recording)]))}

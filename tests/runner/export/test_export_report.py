@@ -180,8 +180,8 @@ def test_the_slider_is_moved_by_keys_and_shows_the_recorded_frames(opened, pictu
         k = int(slider.get_attribute("value"))
         assert k == min(wanted, len(steps)) or len(steps) < 12
         assert places_of(driver) == {i: transform(place) for i, place in enumerate(places[k])}
-        told = driver.find_element(By.CSS_SELECTOR, ".caption").text
-        assert words[states[k]] in told.replace("\n", " ")
+        text = driver.find_element(By.CSS_SELECTOR, ".caption").text
+        assert words[states[k]] in text.replace("\n", " ")
         assert slider.get_attribute("aria-valuetext") == f"step {k} of {len(steps)}"
         for mover in Drawing(mdp.scene).movers:
             trail = driver.find_element(By.CSS_SELECTOR, f'[data-trail="{mover}"]').get_attribute("points")
@@ -202,10 +202,10 @@ def test_without_a_scene_state_and_action_are_told(opened):
     driver = opened("corridor")
     slider = driver.find_element(By.CSS_SELECTOR, ".step")
     slider.send_keys(Keys.ARROW_RIGHT)
-    told = driver.find_element(By.CSS_SELECTOR, ".replay").text
-    assert "has no scene" in told
-    assert re.search(r"State\s+state \d", told)
-    assert re.search(r"Last action\s+action \d", told)
+    text = driver.find_element(By.CSS_SELECTOR, ".replay").text
+    assert "has no scene" in text
+    assert re.search(r"State\s+state \d", text)
+    assert re.search(r"Last action\s+action \d", text)
 
 
 @pytest.mark.parametrize("width", [360, 1280])

@@ -19,7 +19,7 @@ from runner.drawing.svg import Drawing, transform
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 
-ASKED = """\
+CONFIG = """\
 name: asked
 mode: cooperative
 episodes: {episodes}
@@ -61,7 +61,7 @@ def served(folder):
 
 @pytest.fixture
 def page(browser, served):
-    """Return a function that opens a page; afterwards nothing must have gone wrong."""
+    """Return a function that opens a page; afterwards there must be no error."""
     browser.get_log("browser")
 
     def open_page(address):
@@ -85,11 +85,11 @@ def text_of(browser, selector):
     return browser.find_element(By.CSS_SELECTOR, selector).text
 
 
-def test_a_mistake_is_told_at_its_line_then_a_job_is_submitted_and_watched_to_its_end(page, folder):
+def test_a_mistake_is_shown_at_its_line_then_a_job_is_submitted_and_watched(page, folder):
     browser = page("/submit")
     field = browser.find_element(By.ID, "text")
     field.clear()
-    field.send_keys(ASKED.format(episodes="-5"))
+    field.send_keys(CONFIG.format(episodes="-5"))
     wait(browser, lambda: "Line 3" in text_of(browser, "#problems"))
     assert "episodes: -5" in text_of(browser, "#problems pre")
     browser.find_element(By.CSS_SELECTOR, "#problems a").click()
@@ -98,7 +98,7 @@ def test_a_mistake_is_told_at_its_line_then_a_job_is_submitted_and_watched_to_it
     )
     assert selected == "episodes: -5"
     field.clear()
-    field.send_keys(ASKED.format(episodes=180))
+    field.send_keys(CONFIG.format(episodes=180))
     wait(browser, lambda: "1 run" in text_of(browser, "#valid"))
     browser.find_element(By.CSS_SELECTOR, "button[value=submit]").click()
     wait(browser, lambda: "/queue/" in browser.current_url)

@@ -17,11 +17,11 @@ from runner.runs.resolve import find_run
 from tests.runner.export.outline import Outline
 from tests.waiting import until
 
-SAYS_HTML = {"Accept": "text/html"}
+ACCEPT_HTML = {"Accept": "text/html"}
 
 
 def page_of(client, address, status=200):
-    answer = client.get(address, headers=SAYS_HTML)
+    answer = client.get(address, headers=ACCEPT_HTML)
     assert answer.status_code == status, (address, answer.text)
     assert answer.headers["content-type"].startswith("text/html")
     outline = Outline()
@@ -55,7 +55,7 @@ def test_the_caret_of_a_wrong_filter_stands_under_its_place_in_a_fixed_width(cli
     assert "<pre>  status:finishd\n         ^</pre>" in page
 
 
-def test_that_not_all_evaluations_are_shown_is_said(client, monkeypatch):
+def test_the_page_says_when_not_all_evaluations_are_shown(client, monkeypatch):
     assert "The last" not in page_of(client, "/runs/first/evaluations")
     monkeypatch.setattr("runner.service.pages.run.MAX_EVALUATIONS", 2)
     page = page_of(client, "/runs/first/evaluations")
@@ -63,7 +63,7 @@ def test_that_not_all_evaluations_are_shown_is_said(client, monkeypatch):
     assert re.findall(r'replay/eval/(\d+)/0"', page) == ["50", "60"]
 
 
-def test_the_keys_of_what_is_submitted_are_told(client):
+def test_the_form_describes_the_keys(client):
     config, sweep = page_of(client, "/submit"), page_of(client, "/submit?sweep=true")
     assert "<code>epsilon</code>" in config
     assert "<code>strategy</code>" not in config
@@ -89,12 +89,12 @@ def test_a_search_keeps_the_columns_and_their_order(client):
 
 
 @pytest.mark.parametrize("query", ["filter=status:", "sort=bogus", "columns=bogus"])
-def test_a_filter_that_is_none_is_told(client, query):
+def test_an_invalid_filter_is_explained(client, query):
     page = page_of(client, f"/runs?{query}", 400)
     assert 'role="alert"' in page
 
 
-def test_what_is_missing_is_told_as_a_page(client):
+def test_missing_pages_are_pages(client):
     assert "there is nothing at /nowhere" in page_of(client, "/nowhere", 404)
     assert client.get("/nowhere").json()["error"]["message"]
 
@@ -149,14 +149,14 @@ PAGES = (
 )
 
 
-def test_the_page_of_a_run_says_what_a_random_policy_achieves(client):
+def test_the_page_of_a_run_shows_what_a_random_policy_achieves(client):
     page = page_of(client, "/runs/first")
     assert re.search(
         r"A random policy succeeds in [\d.]+ % of episodes within the limit of 1,500 steps", page
     )
 
 
-def test_every_page_is_well_formed_and_says_nothing_inline(client):
+def test_every_page_is_well_formed_and_has_nothing_inline(client):
     for address in PAGES:
         page_of(client, address)
 
@@ -173,9 +173,9 @@ MISSING = [
 ]
 
 
-def test_what_is_not_there_is_told(client):
-    for address, status, told in MISSING:
-        assert told in page_of(client, address, status)
+def test_missing_pages_say_what_exists(client):
+    for address, status, message in MISSING:
+        assert message in page_of(client, address, status)
 
 
 def test_only_the_frame_of_the_viewer_may_compile(client):
@@ -199,8 +199,8 @@ def test_the_parts_of_an_episode_are_the_recorded_steps(client, recordings):
         assert part["before"] == (steps["rewards"][:first].sum(axis=0).tolist() if first else [])
         assert part["action"] == whole["action"][first : first + 101]
         assert part["values"][0]["taken"] == whole["values"][0]["taken"][first : first + 101]
-        told = [part["states"][i] for i in part["state"]][:-1]
-        assert told == words[steps["state"][first : first + 101]].tolist()
+        shown = [part["states"][i] for i in part["state"]][:-1]
+        assert shown == words[steps["state"][first : first + 101]].tolist()
 
 
 def test_labels_are_changed_by_a_form(client):
@@ -210,14 +210,14 @@ def test_labels_are_changed_by_a_form(client):
     assert "&lt;b&gt;bold&lt;/b&gt;\nand more" in page
     assert "filter=tag:keep" in page
     assert client.get("/api/v1/runs/renamed").json()["tags"] == ["good", "keep"]
-    answer = client.post("/runs/renamed/labels", data=fields | {"tags": "$$"}, headers=SAYS_HTML)
+    answer = client.post("/runs/renamed/labels", data=fields | {"tags": "$$"}, headers=ACCEPT_HTML)
     assert answer.status_code == 400
     assert "expected 1 to 64 letters" in answer.text
 
 
-def test_mistakes_are_told_at_their_lines(client):
+def test_mistakes_are_shown_at_their_lines(client):
     text = "name: mistaken\nepisodes: many\nepisode: 3\n"
-    answer = client.post("/submit", data={"text": text, "action": "submit"}, headers=SAYS_HTML)
+    answer = client.post("/submit", data={"text": text, "action": "submit"}, headers=ACCEPT_HTML)
     assert answer.status_code == 422
     assert 'data-line="2"' in answer.text
     assert "<pre>episodes: many</pre>" in answer.text
@@ -234,16 +234,16 @@ def test_a_form_of_another_site_is_refused(client):
 
 def test_a_job_is_shown_and_cancelled(client):
     text = "name: shown\nmode: cooperative\nepisodes: 1000000\n"
-    answer = client.post("/submit", data={"text": text}, headers=SAYS_HTML, follow_redirects=False)
+    answer = client.post("/submit", data={"text": text}, headers=ACCEPT_HTML, follow_redirects=False)
     assert answer.headers["location"] == "/queue/1"
     assert "episodes: 1000000" in page_of(client, "/queue/1")
     assert 'class="status' in page_of(client, "/queue")
     assert client.post("/queue/1/cancel", follow_redirects=False).status_code == 303
     assert "cancelled" in page_of(client, "/queue/1")
-    assert client.post("/queue/1/cancel", headers=SAYS_HTML).status_code == 409
+    assert client.post("/queue/1/cancel", headers=ACCEPT_HTML).status_code == 409
 
 
-def test_how_a_run_stands_is_told_while_it_runs_only(client, recordings):
+def test_the_status_of_a_run_is_updated_while_it_runs_only(client, recordings):
     assert client.get("/runs/first/status").status_code == 204
     file = find_run("first", recordings).folder / "run.json"
     facts = json.loads(file.read_text())
@@ -259,11 +259,11 @@ def test_an_error_that_is_no_text_is_no_fault(client, recordings, error):
     run = find_run("first", recordings)
     run.update(status="failed", summary={**run.summary, "error": error})
     page_of(client, "/runs/first")
-    told = client.get("/api/v1/runs/first")
-    assert (told.status_code, told.json()["error"]) == (200, None), "what does not fit is left out"
+    answer = client.get("/api/v1/runs/first")
+    assert (answer.status_code, answer.json()["error"]) == (200, None), "an invalid error is left out"
 
 
-def test_the_page_of_a_run_is_live_from_when_a_job_will_go_on_with_it(client, recordings, monkeypatch):
+def test_the_page_of_a_run_is_live_once_a_job_will_resume_it(client, recordings, monkeypatch):
     monkeypatch.setattr("runner.service.jobs.pool.RESERVE_BYTES", 1 << 62)  # so that no job is begun
     run = find_run("first", recordings).update(status="interrupted")
     assert "data-live" not in page_of(client, "/runs/first")
@@ -279,24 +279,24 @@ def test_the_page_of_a_run_is_live_from_when_a_job_will_go_on_with_it(client, re
     assert client.get("/runs/first/status?status=interrupted").status_code == 204
 
 
-def test_what_a_run_keeps_of_its_failure_does_not_say_where_the_folder_is(client, recordings):
+def test_the_error_of_a_run_hides_its_folder(client, recordings):
     run = find_run("first", recordings)
     error = f"{run.recording.absolute()}: cannot be written"
     run.update(status="failed", summary={**run.summary, "error": error})
     run.recording.write_bytes(b"no recording")
-    told = client.get("/api/v1/runs/first")
-    assert told.json()["error"] == f"{run.run_id}/recording.mcap: cannot be written"
-    assert told.json()["problems"]
+    answer = client.get("/api/v1/runs/first")
+    assert answer.json()["error"] == f"{run.run_id}/recording.mcap: cannot be written"
+    assert answer.json()["problems"]
     pages = [page_of(client, "/runs/first"), page_of(client, "/runs/first/config")]
-    assert told.json()["error"] in pages[0]
-    assert [text for text in (told.text, *pages) if str(recordings) in text] == []
+    assert answer.json()["error"] in pages[0]
+    assert [text for text in (answer.text, *pages) if str(recordings) in text] == []
 
 
 @pytest.mark.parametrize(
     "address", ["/runs/first/replay/train/3", "/compare/replay?run=first&run=second&at=3"]
 )
 def test_no_recording_is_read_by_the_event_loop(client, monkeypatch, address):
-    """A slow disk must keep nobody waiting but who asks for what is on it."""
+    """A slow disk delays only the requests that read from it."""
     read = reader.open_recording
     read_by_loop = []
 
@@ -315,7 +315,7 @@ def test_some_of_the_runs_are_counted_in_the_plural(client):
     assert "1 of 2 runs" in page_of(client, "/runs?filter=name:first")
 
 
-def test_the_page_of_a_finished_job_leads_to_its_run_and_asks_for_no_events(client):
+def test_the_page_of_a_finished_job_links_to_its_run_and_requests_no_events(client):
     number = client.post("/api/v1/jobs", content=json.dumps(ICY | {"seeds": [0]})).json()["number"]
     job = until(lambda job: job["state"] == "finished", lambda: client.get(f"/api/v1/jobs/{number}").json())
     page = page_of(client, f"/queue/{number}")

@@ -16,9 +16,8 @@ from runner.errors import RunnerError
 from runner.export.plots.chart import Markers
 from runner.runs.run import list_runs
 from runner.sweep import state
-from runner.sweep.charts import parameter_chart
+from runner.sweep.charts import learning, panel_of, parameter_chart, picture_of
 from runner.sweep.loading import from_values
-from runner.sweep.plots import learning, panel_of, picture_of
 from runner.sweep.results import fresh_seeds, results_of
 
 
@@ -41,21 +40,21 @@ def test_each_trial_stands_at_its_values(results, done):
     for place, choice, value, trial in zip(
         step_size.values, discount.values, picture.values, picture.trials, strict=True
     ):
-        told = by_number[trial.number]
-        assert place == told.values["step_size"]
-        assert discount.choices[int(choice)] == str(told.values["discount"])
-        assert value == told.value
+        trial_there = by_number[trial.number]
+        assert place == trial_there.values["step_size"]
+        assert discount.choices[int(choice)] == str(trial_there.values["discount"])
+        assert value == trial_there.value
     assert all(
         low <= value <= high for value, (low, high) in zip(picture.values, picture.ranges, strict=True)
     )
 
 
-def test_a_trial_that_was_given_up_is_hollow(results):
+def test_a_pruned_trial_is_hollow(results):
     def hollow(entries):
         picture = picture_of(replace(results, ranking=entries))
         marks = parameter_chart(picture, picture.axes[0]).marks
         dots = [mark for mark in marks if isinstance(mark, Markers) and not mark.fill]
-        return sum(len(mark.points) for mark in dots), "A hollow one was given up" in picture.footnote
+        return sum(len(mark.points) for mark in dots), "A hollow one was pruned" in picture.footnote
 
     *kept, last = results.ranking
     assert hollow(results.ranking) == (0, False)
@@ -74,8 +73,8 @@ def test_the_best_and_the_median_learn_as_their_runs_did(results, done):
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])
 def test_a_sweep_is_drawn_by_its_name(done, tmp_path, suffix):
     output = tmp_path / f"small.{suffix}"
-    told = typed("plot", "small", "-o", output, "--recordings", done[0])
-    assert "the sweep small, 6 trials" in told.stdout
+    result = typed("plot", "small", "-o", output, "--recordings", done[0])
+    assert "the sweep small, 6 trials" in result.stdout
     assert output.stat().st_size > 10_000
 
 
