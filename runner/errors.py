@@ -1,16 +1,16 @@
-"""The errors a user can meet, one family.
+"""The family of errors that users can correct.
 
 Each message says what was found, what was expected and what to do next; the command line prints it
 without a traceback and exits with `exit_code`.
 
     RunnerError
-    ├── ConfigError          a configuration cannot be used (file, line and key stand in the message)
+    ├── ConfigError          a configuration is not valid (the message has file, line and key)
     ├── EnvironmentNotUsable an environment is unknown, or has no transition table
-    ├── RecordingError       a recording is damaged, foreign, or of an unknown version
-    ├── Diverged             a recording differs from what its job gives
+    ├── RecordingError       a recording is damaged, of another program, or of an unknown version
+    ├── Diverged             a recording differs from what its job produces
     ├── RunNotFound          no run, or more than one, matches a name
     ├── StorageError         a file or folder cannot be written, or the disk is full
-    └── MissingExtra         an optional package is needed that is not installed
+    └── MissingExtra         an optional package is not installed
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 MAX_MESSAGE: Final = 10_000
-"""Characters of an error that are kept with a run."""
+"""Maximum characters of an error that are stored with a run."""
 
 
 class ExitCode(IntEnum):
@@ -47,8 +47,8 @@ class RunnerError(Exception):
     exit_code: int = ExitCode.USAGE
 
 
-class Located(NamedTuple):
-    """What is wrong with one value of a configuration; line and column from 1, 0 if it stands in no file."""
+class ConfigProblem(NamedTuple):
+    """A problem with one value of a configuration; line and column count from 1, or are 0 without a file."""
 
     path: str
     line: int
@@ -57,23 +57,23 @@ class Located(NamedTuple):
 
 
 class ConfigError(RunnerError):
-    """A configuration cannot be used; the message lists every problem, one a line."""
+    """A configuration is not valid; the message lists every problem, one per line."""
 
-    def __init__(self, message: str, problems: Sequence[Located] = ()) -> None:
+    def __init__(self, message: str, problems: Sequence[ConfigProblem] = ()) -> None:
         super().__init__(message)
         self.problems = tuple(problems)
 
 
 class EnvironmentNotUsable(RunnerError):
-    """An environment is not registered, cannot be made, or offers no transition table."""
+    """An environment is not registered, cannot be made, or has no transition table."""
 
 
 class RecordingError(RunnerError):
-    """A recording cannot be read: damaged, not one of ours, or of an unknown version."""
+    """A recording cannot be read: it is damaged, of another program, or of an unknown version."""
 
 
 class Diverged(RunnerError):
-    """A recording differs from what its job gives; the first difference stands in the attributes."""
+    """A recording differs from what its job produces; the attributes hold the first difference."""
 
     exit_code = ExitCode.DIFFERENT
 
@@ -88,11 +88,8 @@ class Diverged(RunnerError):
     ) -> None:
         self.topic, self.field, self.found, self.expected = topic, field, found, expected
         self.episode, self.step = episode, step
-        place = "".join(
-            f", {name} {number}"
-            for name, number in (("episode", episode), ("step", step))
-            if number is not None
-        )
+        places = (("episode", episode), ("step", step))
+        place = "".join(f", {name} {number}" for name, number in places if number is not None)
         super().__init__(f"{topic}{place}: {field}: found {found}, expected {expected}")
 
 
@@ -107,7 +104,7 @@ class StorageError(RunnerError):
 
 
 class MissingExtra(RunnerError):
-    """A package is needed that is not installed; the message says how to install it."""
+    """An optional package is not installed; the message says how to install it."""
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -116,7 +113,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     return f" Did you mean {close[0]!r}?" if close else ""
 
 
-def kept_message(error: BaseException | str) -> str:
-    """Return what is kept with a run of what ended it; of a message that goes on for ever its beginning."""
+def truncated_message(error: BaseException | str) -> str:
+    """Return the message of an error that is stored with a run, truncated if it is very long."""
     text = str(error)
     return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE - 1]}…"

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import click
 
-from runner.errors import ConfigError, ExitCode, Located, RunnerError, StorageError, nearest
+from runner.errors import ConfigError, ConfigProblem, ExitCode, RunnerError, StorageError, nearest
 from runner.util.version import __version__
 
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
@@ -136,7 +136,7 @@ def exit_code_of(error: RunnerError) -> int:
     return error.exit_code
 
 
-def error_as_json(message: str, exit_code: int, problems: Sequence[Located] = (), **more: str) -> str:
+def error_as_json(message: str, exit_code: int, problems: Sequence[ConfigProblem] = (), **more: str) -> str:
     """Return an error as a line of JSON, in the form of the service's API, with further keys."""
     located = [problem._asdict() for problem in problems]
     return json.dumps({"error": {"message": message, "exit_code": exit_code, **more, "problems": located}})

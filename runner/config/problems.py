@@ -11,7 +11,7 @@ from pydantic_core import ErrorDetails
 from runner.config.document import Document, Place, Problem
 from runner.config.schema import Schema, choices_of, expected, keys_of, schema_at
 from runner.config.values import REFUSED, Path
-from runner.errors import ConfigError, Located, nearest
+from runner.errors import ConfigError, ConfigProblem, nearest
 
 _LONGEST = 60
 _MOST = 200
@@ -72,7 +72,7 @@ def refuse(problems: Sequence[Problem], document: Document) -> ConfigError:
     if len(placed) > _MOST:
         lines.append(f"... and {len(placed) - _MOST} more")
     located = (
-        Located(_dotted(problem.path), *(place[1:] if place else (0, 0)), problem.message)
+        ConfigProblem(_dotted(problem.path), *(place[1:] if place else (0, 0)), problem.message)
         for place, problem in placed[:_MOST]
     )
     return ConfigError("\n".join(lines), tuple(located))

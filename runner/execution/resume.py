@@ -22,7 +22,7 @@ from runner.config.job import Job
 from runner.config.sections import RunTable
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
-from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, kept_message
+from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, truncated_message
 from runner.execution.initial_tables import configured_tables, recorded_tables, resolve_job
 from runner.execution.session import (
     Report,
@@ -146,7 +146,7 @@ def _mark_failed(run: Run, error: BaseException) -> None:
     with contextlib.suppress(RunnerError):
         now = run_at(run.folder)
         if now.file.status == "running":
-            now.update(status="failed", summary={"error": kept_message(error)})
+            now.update(status="failed", summary={"error": truncated_message(error)})
 
 
 def _place(run: Run, described: bool) -> tuple[Path, Contents]:

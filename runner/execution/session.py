@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from runner.config.job import Job
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
-from runner.errors import Diverged, RunnerError, StorageError, kept_message
+from runner.errors import Diverged, RunnerError, StorageError, truncated_message
 from runner.execution.initial_tables import configured_tables, resolve_job
 from runner.learning.learner import Learner
 from runner.planning import Yardstick
@@ -122,9 +122,9 @@ def execute(session: Session, file: RecordingFile, run: Run, started: float) -> 
         session.recorder.abandon()
         status = "interrupted" if isinstance(error, KeyboardInterrupt | Diverged) else "failed"
         with contextlib.suppress(StorageError):  # a full disk may still have space for the index
-            write_result(file, status, {"error": kept_message(error)})
+            write_result(file, status, {"error": truncated_message(error)})
         with contextlib.suppress(StorageError):
-            run.update(status=status, summary={"error": kept_message(error), "bytes": file.size})
+            run.update(status=status, summary={"error": truncated_message(error), "bytes": file.size})
         _add_advice(run, error)
         raise
     summary |= {"seconds": round(time.monotonic() - started, 3), "bytes": file.size}
@@ -138,7 +138,7 @@ def _failing(run: Run) -> Iterator[None]:
         yield
     except RunnerError as error:
         with contextlib.suppress(StorageError):
-            run.update(status="failed", summary={"error": kept_message(error)})
+            run.update(status="failed", summary={"error": truncated_message(error)})
         _add_advice(run, error)
         raise
 

@@ -16,7 +16,7 @@ from blake3 import blake3
 
 from runner.client.outbox import Follower, connect, is_server, outbox_folder
 from runner.config.job import NOT_CONTENT
-from runner.errors import ConfigError, RunnerError, StorageError, kept_message
+from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Described
 from runner.loops.messages import Messages
 from runner.loops.options import Options
@@ -232,7 +232,7 @@ class Loop(Generic[R]):
             except BaseException as failure:
                 self._recorder.abandon()
                 with contextlib.suppress(StorageError):
-                    write_result(self._file, "failed", {"error": kept_message(failure)})
+                    write_result(self._file, "failed", {"error": truncated_message(failure)})
                 self._mark_failed(failure)
                 if self._follower:
                     self._follower.stop()
@@ -248,7 +248,7 @@ class Loop(Generic[R]):
 
     def _mark_failed(self, error: BaseException) -> None:
         with contextlib.suppress(StorageError):
-            self.run = self.run.update(status="failed", summary={"error": kept_message(error)})
+            self.run = self.run.update(status="failed", summary={"error": truncated_message(error)})
 
     def _finish(self, status: str, error: str) -> dict[str, Any]:
         self._commit()
@@ -258,7 +258,7 @@ class Loop(Generic[R]):
         if self.described.mdp is not None:
             result["rewards_off_table"] = sum(rows.off_table for rows in self._rows.values())
         if error:
-            result["error"] = kept_message(error)
+            result["error"] = truncated_message(error)
         write_result(self._file, status, result)
         seconds = round(time.monotonic() - self._started, 3)
         return result | {"seconds": seconds, "bytes": self._file.size}
