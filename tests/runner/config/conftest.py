@@ -1,4 +1,4 @@
-"""What the tests of configuration share."""
+"""Fixtures of the tests of configurations."""
 
 import pytest
 
@@ -7,8 +7,8 @@ from runner.errors import ConfigError
 
 
 @pytest.fixture
-def told(tmp_path):
-    """Return the lines of the error for a file `x.yaml` of a text, without its folder."""
+def errors_of(tmp_path):
+    """Return a function: the lines of the error for a file `x.yaml` with a text, without its folder."""
 
     def lines(text, overrides=()):
         path = tmp_path / "x.yaml"

@@ -1,4 +1,4 @@
-"""Which algorithm learns, and what only some of them have, is said by one key and its section."""
+"""The algorithm, and the section of its own parameters."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ TWO = {"episodes": 1, "tables": "per_agent", "rewards": "team"}
 
 
 @pytest.mark.parametrize("algorithm", get_args(Algorithm))
-def test_every_algorithm_is_known_and_survives_the_round_trip(algorithm):
+def test_every_algorithm_has_a_number_and_survives_a_round_trip(algorithm):
     config = from_mapping(TWO | {"algorithm": algorithm})
     assert from_mapping(config.to_mapping()) == config
     assert algorithm in NUMBERS
 
 
-def test_a_section_is_there_for_its_algorithm_alone():
+def test_a_section_is_present_only_with_its_algorithm():
     assert from_mapping(TWO | {"algorithm": "hysteretic_q_learning"}).to_mapping()["hysteretic"] == {
         "decrease": 0.01
     }
@@ -53,11 +53,11 @@ def test_a_section_is_there_for_its_algorithm_alone():
         ),
     ],
 )
-def test_what_does_not_fit_is_told_with_its_place(told, text, line):
-    (found,) = told("episodes: 1\n" + text)
+def test_contradictions_are_reported_with_their_place(errors_of, text, line):
+    (found,) = errors_of("episodes: 1\n" + text)
     assert found.startswith(line), found
 
 
-def test_the_near_name_is_told(told):
-    assert told("episodes: 1\nalgorithm: sarssa")[0].endswith("Did you mean 'sarsa'?")
-    assert told("episodes: 1\nalgorithm: wolf_phc\nwolf_phc: {loose: 0.3}")[0].endswith("'lose'?")
+def test_the_nearest_name_is_suggested(errors_of):
+    assert errors_of("episodes: 1\nalgorithm: sarssa")[0].endswith("Did you mean 'sarsa'?")
+    assert errors_of("episodes: 1\nalgorithm: wolf_phc\nwolf_phc: {loose: 0.3}")[0].endswith("'lose'?")

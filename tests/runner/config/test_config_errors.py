@@ -1,4 +1,4 @@
-"""What a user is told: every problem on a line of its own, with its place, key, and what was expected."""
+"""Errors: one line for each problem, with place, key, and what was expected."""
 
 import pytest
 from hypothesis import given
@@ -179,8 +179,8 @@ from runner.errors import ConfigError
         ('"a: b\\n": 1', "2:1: 'a: b\\n': unknown key."),
     ],
 )
-def test_one_problem_is_one_line_that_says_where_what_and_how(told, text, line):
-    lines = told(f"episodes: 1\n{text}\n")
+def test_each_problem_has_one_line_with_place_and_expectation(errors_of, text, line):
+    lines = errors_of(f"episodes: 1\n{text}\n")
     assert len(lines) == 1
     assert lines[0].startswith(f"x.yaml:{line}")
     assert lines[0] == f"x.yaml:{line}" or line.endswith("unknown key.")
@@ -189,14 +189,14 @@ def test_one_problem_is_one_line_that_says_where_what_and_how(told, text, line):
 @pytest.mark.parametrize(
     "value", ["'12'", "12.0", "true", "-3", "null", "[1]", "{a: 1}", "10000000000000", "1_000"]
 )
-def test_episodes_are_counted_in_whole_numbers(told, value):
-    (line,) = told(f"episodes: {value}")
+def test_episodes_must_be_a_whole_number(errors_of, value):
+    (line,) = errors_of(f"episodes: {value}")
     assert line.startswith("x.yaml:1:1: episodes: found ")
     assert line.endswith(", expected a whole number from 0 to 10^12")
 
 
-def test_every_problem_is_listed_in_the_order_of_the_file(told):
-    lines = told(
+def test_every_problem_is_listed_in_the_order_of_the_file(errors_of):
+    lines = errors_of(
         "# a comment\nepsilon: 2\n\nseed: x\nmode: competitive\ntables: joint\n"
         "log:\n  window: 0\nunheard_of: 1\n",
     )
@@ -218,8 +218,8 @@ def test_every_problem_is_listed_in_the_order_of_the_file(told):
     ]
 
 
-def test_a_misspelt_key_is_not_missed_as_well(told):
-    assert told("episode: 5") == ["x.yaml:1:1: episode: unknown key. Did you mean 'episodes'?"]
+def test_a_misspelt_key_is_not_reported_as_missing_too(errors_of):
+    assert errors_of("episode: 5") == ["x.yaml:1:1: episode: unknown key. Did you mean 'episodes'?"]
 
 
 @pytest.mark.parametrize(
@@ -252,22 +252,22 @@ def test_a_misspelt_key_is_not_missed_as_well(told):
         ("a." * 60 + "b=1", "expected a key of at most 50 parts"),
     ],
 )
-def test_overrides_are_places_too(told, override, line):
-    assert any(found.endswith(line) for found in told("episodes: 1\nepsilon: 0.5", [override]))
+def test_errors_name_the_override(errors_of, override, line):
+    assert any(found.endswith(line) for found in errors_of("episodes: 1\nepsilon: 0.5", [override]))
 
 
-def test_a_file_and_an_override_that_disagree(told):
-    assert told("episodes: 1\nmode: cooperative", ["tables=per_agent"]) == [
+def test_an_override_that_contradicts_the_file_is_refused(errors_of):
+    assert errors_of("episodes: 1\nmode: cooperative", ["tables=per_agent"]) == [
         "--set tables=per_agent: tables: found 'per_agent', but mode: cooperative means tables: joint "
         "and rewards: team. Remove `mode`, or this key"
     ]
-    assert len(told("episodes: 1", ["seed=1", "seeds=[2]"])) == 1
-    assert told("episodes: 1\nseed: 1\nseed: 2", ["seed=3"]) == [
+    assert len(errors_of("episodes: 1", ["seed=1", "seeds=[2]"])) == 1
+    assert errors_of("episodes: 1\nseed: 1\nseed: 2", ["seed=3"]) == [
         "x.yaml:3:1: seed: given twice; first in line 2"
     ]
 
 
-def test_python_values_are_held_to_the_same():
+def test_python_values_are_checked_like_files():
     for values, line in [
         ({}, "episodes: missing, expected a whole number from 0 to 10^12"),
         ({"episodes": 1, 2: 3}, "2: unknown key, which is not even text"),
@@ -356,7 +356,7 @@ ANYTHING = st.recursive(
 
 
 def lines_of(call):
-    """Return the lines of the error that `call` ends with, none if it does not."""
+    """Return the lines of the error that `call` raises; empty without one."""
     try:
         call()
     except ConfigError as error:
@@ -365,7 +365,7 @@ def lines_of(call):
 
 
 @given(st.dictionaries(WORDS | st.text(max_size=3), ANYTHING, max_size=8))
-def test_whatever_is_given_the_answer_is_a_config_or_readable_lines(values):
+def test_any_mapping_gives_a_config_or_readable_errors(values):
     for line in lines_of(lambda: from_mapping(values)):
         assert line.isprintable()
         assert len(line) < 400
@@ -374,26 +374,26 @@ def test_whatever_is_given_the_answer_is_a_config_or_readable_lines(values):
 
 
 @given(st.text(max_size=40) | st.text("[]{}:,-&*!|> \n\t#'\"%@ab1", max_size=40), st.booleans())
-def test_whatever_text_is_given_the_answer_is_a_config_or_readable_lines(tmp_path_factory, text, as_override):
+def test_any_text_gives_a_config_or_readable_errors(tmp_path_factory, text, as_override):
     path = tmp_path_factory.mktemp("texts") / "x.yaml"
     path.write_bytes(b"episodes: 1\n" if as_override else text.encode(errors="surrogatepass"))
     overrides = [f"epsilon={text}"] if as_override else []
     assert all(line.isprintable() for line in lines_of(lambda: load(path, overrides)))
 
 
-def test_a_flood_of_problems_is_counted_instead_of_listed(told):
-    lines = told("episodes: 1\nseeds: [" + "x, " * 1000 + "]")
+def test_the_list_of_problems_is_bounded(errors_of):
+    lines = errors_of("episodes: 1\nseeds: [" + "x, " * 1000 + "]")
     assert len(lines) == 201
     assert lines[-1] == "... and 800 more"
 
 
 @pytest.mark.parametrize("value", ["foo", "-1", "1.5", "[1]", "true", "{a: 1}"])
-def test_trials_start_at_random_in_each_or_in_one_state(told, value):
-    (line,) = told(f"episodes: 1\nevaluation: {{every: 1, trials: 1, start: {value}}}")
+def test_an_invalid_start_of_trials_is_refused(errors_of, value):
+    (line,) = errors_of(f"episodes: 1\nevaluation: {{every: 1, trials: 1, start: {value}}}")
     assert line.endswith("expected 'random', 'each', or a state's number from 0")
 
 
-def test_a_wrong_value_is_told_though_a_default_depends_on_it(told):
-    assert told("episodes: 1\nrecording: {compression: brotli}") == [
+def test_a_wrong_value_on_which_a_default_depends_is_reported(errors_of):
+    assert errors_of("episodes: 1\nrecording: {compression: brotli}") == [
         "x.yaml:2:13: recording.compression: found 'brotli', expected 'zstd', 'lz4' or 'none'"
     ]

@@ -1,4 +1,4 @@
-"""What a file, Python values and overrides come to."""
+"""Configurations from files, Python values and overrides."""
 
 import copy
 import pickle
@@ -31,7 +31,7 @@ def write(tmp_path):
     return write_file
 
 
-def test_one_line_is_a_whole_experiment(write):
+def test_a_file_needs_only_episodes(write):
     config = load(write("episodes: 12\n"))
     assert (config.name, config.episodes, config.seeds) == ("first", 12, (0,))
     assert (config.mode, config.tables, config.rewards) == ("cooperative", "joint", "team")
@@ -136,7 +136,7 @@ def test_initial_q():
     assert initial_q({"run": "quick-1", "step": 0}) == RunTable(run="quick-1", step=0)
 
 
-def test_numbers_are_what_they_look_like(write):
+def test_numbers_are_parsed_as_in_yaml_1_2(write):
     assert load(write("episodes: 1\nepsilon: 1e-3")).epsilon == 0.001
     assert load(write("episodes: 1\nstep_size: 1E-2")).step_size == 0.01
     assert load(write("episodes: 1\ninitial_q: -.5")).initial_q == -0.5
@@ -166,7 +166,7 @@ def test_null_turns_evaluation_and_log_off():
     assert config.log is None
 
 
-def test_a_level_goes_with_zstd_only():
+def test_only_zstd_has_a_level():
     assert from_mapping({"episodes": 1, "recording": {"level": -7}}).recording.level == -7
     assert from_mapping({"episodes": 1, "recording": {"compression": "lz4"}}).recording.level is None
 
@@ -251,7 +251,7 @@ def test_overrides_leave_the_given_mapping_alone():
     assert given == before
 
 
-def test_an_override_can_mend_the_file(write):
+def test_an_override_can_correct_the_file(write):
     assert load(write("epsilon: 3\nepisodes: x\n"), ["epsilon=0.3", "episodes=1"]).epsilon == 0.3
 
 
@@ -261,7 +261,7 @@ def test_a_resolved_experiment_takes_overrides_too():
     assert (config.seeds, config.tables) == ((5,), "per_agent")
 
 
-def test_the_object_guards_itself_when_made_by_hand():
+def test_the_constructor_checks_its_arguments():
     with pytest.raises(ValidationError):
         ExperimentConfig(name="a", episodes=1, tables="joint", rewards="individual", seeds=(0,))
     with pytest.raises(ConfigError):
@@ -291,7 +291,7 @@ def test_a_resolved_configuration_keeps_its_exploration(write):
     assert joint["exploration"] == "shared"
 
 
-def test_another_algorithm_takes_the_section_of_the_one_in_the_file_away(write):
+def test_overriding_the_algorithm_removes_the_section_of_the_old_one(write):
     file = write(
         "episodes: 1\nmode: competitive\nalgorithm: hysteretic_q_learning\nhysteretic: {decrease: 0.05}"
     )

@@ -1,4 +1,4 @@
-"""A config that was written down is read back as the same config, and is what the JSON Schema allows."""
+"""Round trips of configurations through mappings and YAML, and their agreement with the JSON Schema."""
 
 import json
 
@@ -138,7 +138,7 @@ EXPERIMENTS = st.builds(lambda rest, learners, seeds: {**rest, **learners, **see
 
 
 @given(EXPERIMENTS)
-def test_a_mapping_is_taken_back_to_an_equal_config(values):
+def test_a_config_survives_a_round_trip_as_mapping(values):
     config = from_mapping(values)
     plain = config.to_mapping()
     assert json.loads(json.dumps(plain)) == plain
@@ -147,7 +147,7 @@ def test_a_mapping_is_taken_back_to_an_equal_config(values):
 
 
 @given(EXPERIMENTS)
-def test_yaml_is_taken_back_to_an_equal_config(tmp_path_factory, values):
+def test_a_config_survives_a_round_trip_as_yaml(tmp_path_factory, values):
     config = from_mapping(values)
     path = tmp_path_factory.mktemp("written") / "x.yaml"
     path.write_text(config.to_yaml(), encoding="utf-8", newline="")
@@ -155,7 +155,7 @@ def test_yaml_is_taken_back_to_an_equal_config(tmp_path_factory, values):
 
 
 @given(EXPERIMENTS)
-def test_what_is_accepted_is_what_the_schema_allows(values):
+def test_loading_accepts_what_the_schema_allows(values):
     validator = Draft202012Validator(json_schema())
     validator.validate(values)
     validator.validate(from_mapping(values).to_mapping())

@@ -1,4 +1,4 @@
-"""The JSON Schema that editors use, and the files that are shipped with it."""
+"""The JSON Schema for editors, and the shipped files."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ def test_the_shipped_schema_is_the_current_one():
     assert json.loads((CONFIGS / "schema.json").read_text(encoding="utf-8")) == json_schema()
 
 
-def test_the_schema_says_what_it_is():
+def test_the_schema_has_title_dialect_and_required_keys():
     schema = json_schema()
     assert schema["$schema"] == "https://json-schema.org/draft/2020-12/schema"
     assert schema["title"] == "Experiment"
@@ -28,12 +28,12 @@ def test_the_schema_says_what_it_is():
     assert set(KEYS) == set(ExperimentFile.model_fields) >= set(ExperimentConfig.model_fields)
 
 
-def test_the_schema_is_the_callers_to_change():
+def test_the_returned_schema_may_be_changed():
     json_schema()["properties"].clear()
     assert json_schema()["properties"]
 
 
-def test_every_key_is_explained():
+def test_every_key_has_a_description():
     schema = json_schema()
     for model in (schema, *schema["$defs"].values()):
         assert model["description"]
@@ -42,7 +42,7 @@ def test_every_key_is_explained():
             assert value.get("description"), key
 
 
-def test_the_experiments_that_are_promised_are_there():
+def test_the_documented_experiments_are_shipped():
     assert {path.stem for path in SHIPPED} == {
         *(
             "tutorial_cooperative",
@@ -57,7 +57,7 @@ def test_the_experiments_that_are_promised_are_there():
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_a_shipped_experiment_loads_and_says_what_it_is(path):
+def test_a_shipped_experiment_loads_and_has_a_description(path):
     first, second, *_ = path.read_text(encoding="utf-8").splitlines()
     assert first == "# yaml-language-server: $schema=schema.json"
     assert second.startswith("# ")

@@ -1,4 +1,4 @@
-"""Shipped experiments are found by name, wherever one is."""
+"""Shipped experiments are found by name in any folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from runner.sweep.loading import load_sweep
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
-    """An empty folder to type in."""
+    """An empty working directory."""
     monkeypatch.chdir(tmp_path)
 
 
@@ -33,7 +33,7 @@ def test_a_shipped_experiment_is_loaded_by_its_name():
     assert run.name == "quick"
 
 
-def test_a_file_of_that_name_comes_first(tmp_path):
+def test_a_file_has_priority_over_a_shipped_name(tmp_path):
     Path("quick").write_text("episodes: 7\n")
     assert load("quick").episodes == 7
     assert config_path("configs/quick") == Path("configs/quick")
@@ -48,13 +48,13 @@ def test_a_file_of_that_name_comes_first(tmp_path):
         ("nothing", "`dualtaxi config ls`"),
     ],
 )
-def test_a_name_that_is_none_is_answered_with_the_nearest(name, said):
+def test_an_unknown_name_is_refused_with_the_nearest(name, said):
     with pytest.raises(ConfigError, match=r"no such file") as raised:
         load(name)
     assert said in str(raised.value)
 
 
-def test_every_shipped_experiment_is_listed_with_what_it_is_about():
+def test_every_shipped_experiment_is_listed_with_its_description():
     names = {file.stem for file in shipped_folder().glob("**/*.yaml")}
     assert set(shipped()) == names
     text = type_in("config", "ls").stdout
@@ -63,7 +63,7 @@ def test_every_shipped_experiment_is_listed_with_what_it_is_about():
         assert each.name in text
 
 
-def test_a_copy_is_the_experiment_and_replaces_nothing():
+def test_a_copy_loads_equal_and_replaces_no_file():
     type_in("config", "copy", "quick", "-o", "mine.yaml")
     assert load("mine.yaml").episodes == load("quick").episodes
     assert SCHEMA_FILE not in Path("mine.yaml").read_text()
@@ -71,7 +71,7 @@ def test_a_copy_is_the_experiment_and_replaces_nothing():
     assert "Did you mean 'quick'" in type_in("config", "copy", "quik", code=2).stderr
 
 
-def test_a_folder_to_start_in_is_made_and_nothing_in_it_replaced(tmp_path):
+def test_a_start_folder_is_created_and_no_file_replaced(tmp_path):
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs" / "quick.yaml").write_text("episodes: 7\n")
     type_in("init")
@@ -82,14 +82,14 @@ def test_a_folder_to_start_in_is_made_and_nothing_in_it_replaced(tmp_path):
     assert "left as they are" in type_in("init").stderr
 
 
-def test_a_sweep_and_an_experiment_name_the_command_of_the_other(tmp_path):
+def test_a_sweep_loaded_as_experiment_names_the_right_command(tmp_path):
     Path("many.yaml").write_text("base: {episodes: 5}\nstrategy: grid\nparameters: {discount: [0.5]}\n")
     Path("one.yaml").write_text("episodes: 5\n")
     assert "`dualtaxi sweep run many.yaml`" in type_in("run", "many.yaml", code=2).stderr
     assert "`dualtaxi run`" in type_in("sweep", "run", "one.yaml", code=2).stderr
 
 
-def test_mistakes_of_a_sweep_and_of_its_base_are_found_together():
+def test_errors_of_a_sweep_and_of_its_base_are_reported_together():
     Path("bad.yaml").write_text(
         "base: {episodes: -1, epsilon: 7}\nstrategy: gird\nparameters: {discount: []}\nsides: 3\n"
     )

@@ -1,4 +1,4 @@
-"""Texts and files that are no configuration at all: each is refused quickly and in one line."""
+"""Texts and files that are not configurations: each is refused quickly and in one line."""
 
 import pytest
 
@@ -29,25 +29,25 @@ from runner.errors import ConfigError
         ("a: " + "x" * (1 << 20), "x.yaml: larger than 1 MiB, expected a configuration of a few kilobytes"),
     ],
 )
-def test_a_text_that_is_no_configuration(told, text, line):
-    (found,) = told(text)
+def test_text_that_is_not_a_configuration_is_refused(errors_of, text, line):
+    (found,) = errors_of(text)
     assert found.endswith(line)
 
 
-def test_aliases_do_not_explode(told):
+def test_expanded_aliases_are_bounded(errors_of):
     levels = "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, 10))
-    (line,) = told(f"a0: &a0 [1, 1]\n{levels}")
+    (line,) = errors_of(f"a0: &a0 [1, 1]\n{levels}")
     assert line.endswith("cannot be read as YAML: aliases make it too large: more than 100000 values")
 
 
-def test_a_number_too_long_to_be_one(told):
-    (line,) = told("episodes: " + "9" * 10_000)
+def test_a_number_of_too_many_digits_is_refused(errors_of):
+    (line,) = errors_of("episodes: " + "9" * 10_000)
     assert line.startswith("x.yaml:1:1: episodes: found 9999")
     assert line.endswith("which is no whole number of a usable size")
     assert len(line) < 200
 
 
-def test_a_file_that_is_not_there(tmp_path):
+def test_a_missing_file_is_reported(tmp_path):
     (tmp_path / "quick.yaml").write_text("episodes: 1")
     with pytest.raises(ConfigError, match=r"quik\.yaml: no such file\. Did you mean 'quick\.yaml'\?"):
         load(tmp_path / "quik.yaml")
@@ -63,7 +63,7 @@ def test_a_file_that_is_not_there(tmp_path):
         load("\0")
 
 
-def test_a_file_whose_name_is_no_name(tmp_path):
+def test_a_file_name_that_is_not_a_valid_name_is_refused(tmp_path):
     path = tmp_path / "my file.yaml"
     path.write_text("episodes: 1")
     with pytest.raises(

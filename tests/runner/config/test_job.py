@@ -1,4 +1,4 @@
-"""A job is what determines a run's content: equal jobs, equal identities, whatever they are called."""
+"""The identity of a job: equal for equal content, whatever the name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BASE = {"episodes": 100, "epsilon": {"schedule": "linear", "start": 1.0, "end": 
 
 SAME = {
     "name": {"name": "another"},
-    "other seeds beside it": {"seeds": [3, 4]},
+    "other seeds": {"seeds": [3, 4]},
     "packing": {"recording": {"compression": "lz4", "index": "chunk", "chunk_steps": 512}},
     "no steps recorded": {"recording": {"steps": "none"}},
     "defaults spelled out": {"mode": "cooperative", "discount": 0.95, "exploration": "shared"},
@@ -46,12 +46,12 @@ def job(seed: int = 3, **values) -> Job:
 
 
 @pytest.mark.parametrize("values", SAME.values(), ids=SAME)
-def test_what_does_not_change_the_content_is_no_part_of_the_identity(values):
+def test_the_identity_ignores_keys_that_do_not_change_the_content(values):
     assert job(**values).identity == job().identity
 
 
 @pytest.mark.parametrize("values", OTHER.values(), ids=OTHER)
-def test_whatever_changes_the_content_changes_the_identity(values):
+def test_keys_that_change_the_content_change_the_identity(values):
     assert job(**values).identity != job().identity
 
 
@@ -67,18 +67,18 @@ def test_a_section_of_one_algorithm_counts_by_its_values(key):
     assert job(**bare, **{key: other}).identity != job(**bare).identity
 
 
-def test_every_key_of_a_configuration_is_in_one_of_the_lists():
+def test_every_key_is_covered_by_a_test_of_identity():
     tried = {key for values in (*SAME.values(), *OTHER.values()) for key in values} - {"mode"}
     assert tried | set(OF_ONE_ALGORITHM) == set(ExperimentConfig.model_fields)
 
 
-def test_content_is_json_and_survives_a_file():
+def test_the_content_of_a_job_is_json():
     content = job().content()
     assert json.loads(json.dumps(content)) == content
     assert content["seed"] == 3
     assert content["epsilon"]["over"] == 50
 
 
-def test_an_experiment_is_one_job_a_seed_in_order():
+def test_an_experiment_has_one_job_per_seed_in_order():
     config = from_mapping(BASE | {"seeds": {"first": 5, "count": 3}})
     assert [(each.seed, each.config) for each in jobs_of(config)] == [(5, config), (6, config), (7, config)]

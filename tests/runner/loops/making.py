@@ -1,4 +1,4 @@
-"""Loops and environments that the wrapper's tests share."""
+"""Loops and environments for the tests of the wrappers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ KWARGS = {"FrozenLake-v1": {"is_slippery": True}}
 
 
 class Rooms(gymnasium.Env[Any, Any]):
-    """Values of every kind of space; a goal at random, an info that comes and goes."""
+    """Values of every kind of space, a random goal, and an info of changing fields."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium has it
     render_mode = "rgb_array"
@@ -74,7 +74,7 @@ NAMES = (
 
 
 def play(env: gymnasium.Env[Any, Any], steps: int, seed: int = 5) -> Iterator[tuple[Any, ...]]:
-    """Play at random; yield ("reset", seed, observation) and ("step", action, ...) as they come."""
+    """Play at random; yield ("reset", seed, observation) and ("step", action, ...)."""
     actions = env.action_space
     actions.seed(seed)
     yield "reset", seed, env.reset(seed=seed)[0]
@@ -89,14 +89,14 @@ def play(env: gymnasium.Env[Any, Any], steps: int, seed: int = 5) -> Iterator[tu
 
 
 def recorded(folder: Path, name: str, steps: int, **options: Any) -> tuple[Path, list[tuple[Any, ...]]]:
-    """Return the recording of a loop, and what the loop saw."""
+    """Return the recording of a loop, and the values that the loop got."""
     with runner.record(make(name), folder, **options) as env:
         seen = list(play(env, steps))
     return env.run.recording, seen
 
 
 class Leaving:
-    """Three agents of which one leaves at each step; made as PettingZoo asks for."""
+    """Three agents, of which one leaves at each step, as PettingZoo requires."""
 
     metadata = {"name": "leaving_v0"}  # noqa: RUF012 - as PettingZoo has it
     possible_agents = ("a", "b", "c")

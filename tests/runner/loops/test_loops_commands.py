@@ -1,4 +1,4 @@
-"""What is recorded from a loop is listed, plotted, compared, checked and exported like every other run."""
+"""Commands on recorded loops: listing, plots, comparison, verification, exports."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from tests.runner.loops.making import Rooms, make, play
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
-    """Return a recordings folder with loops of each kind, and one like another but for its seed."""
-    made = tmp_path_factory.mktemp("loops-told")
+    """Return a recordings folder with loops of each kind, and two that differ only in the seed."""
+    made = tmp_path_factory.mktemp("loops-commands")
     for name, env_id, seed in (
         ("lake", "FrozenLake-v1", 0),
         ("again", "FrozenLake-v1", 0),
@@ -51,18 +51,18 @@ def folder(tmp_path_factory):
 
 
 def dualtaxi(folder: Path, *words: str) -> Any:
-    """Run a command; nothing it says is a traceback."""
+    """Run a command, whose output must not have a traceback."""
     done = CliRunner().invoke(cli, [*words, "--recordings", str(folder)])
     assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
     return done
 
 
-def test_ls_and_show_tell_of_loops(folder):
+def test_ls_and_show_describe_loops(folder):
     listed = json.loads(dualtaxi(folder, "ls", "--json").stdout)["runs"]
     assert {run["name"] for run in listed} == {"lake", "again", "other", "pole", "rooms"}
-    told = json.loads(dualtaxi(folder, "show", "pole", "--json").stdout)
-    assert (told["train_steps"], told["eval_steps"]) == (400, 60)
-    assert told["config"]["made_by"] == "runner.record"
+    reply = json.loads(dualtaxi(folder, "show", "pole", "--json").stdout)
+    assert (reply["train_steps"], reply["eval_steps"]) == (400, 60)
+    assert reply["config"]["made_by"] == "runner.record"
     assert dualtaxi(folder, "show", "rooms").exit_code == 0
 
 
@@ -96,7 +96,7 @@ def test_ls_and_show_have_the_returns_of_a_loop_and_what_it_logged(folder, name)
 
 
 @pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
-def test_what_a_loop_says_of_itself_at_its_end_is_what_its_recording_holds(folder, name):
+def test_the_summary_of_a_loop_equals_that_of_its_recording(folder, name):
     run = runner.find_run(name, folder)
     with open_recording(run.recording) as recording:
         counted = loop_summary(recording)
@@ -106,7 +106,7 @@ def test_what_a_loop_says_of_itself_at_its_end_is_what_its_recording_holds(folde
         assert loop_summary(recording)["logged"] == counted["logged"]
 
 
-def test_a_report_does_not_say_that_a_loop_learns(folder, tmp_path):
+def test_a_report_of_a_loop_has_no_learning_section(folder, tmp_path):
     dualtaxi(folder, "report", "lake", "-o", str(tmp_path / "report.html"))
     page = (tmp_path / "report.html").read_text()
     assert "by trial and error" not in page
@@ -154,7 +154,7 @@ def test_plot_and_report_draw_loops(folder, name, tmp_path):
     assert "No evaluation was recorded" not in page
 
 
-def test_diff_says_where_loops_part(folder):
+def test_diff_names_the_step_at_which_loops_diverge(folder):
     same = dualtaxi(folder, "diff", "lake", "again")
     assert same.exit_code == 0
     assert "the same, to the last byte" in same.stdout
@@ -180,8 +180,8 @@ def test_loops_that_have_their_seed_among_their_settings_are_one_group(tmp_path)
             args = {"seed": seed, "lr": rate}
             with runner.record(make("CartPole-v1"), tmp_path, name="pole", seed=seed, config=args) as env:
                 list(play(env, 50, seed))
-    told = json.loads(dualtaxi(tmp_path, "compare", "pole", "--json").stdout)
-    assert {label: len(ids) for label, ids in told["groups"].items()} == {
+    reply = json.loads(dualtaxi(tmp_path, "compare", "pole", "--json").stdout)
+    assert {label: len(ids) for label, ids in reply["groups"].items()} == {
         "pole, config.lr=0.1": 2,
         "pole, config.lr=0.2": 2,
     }
@@ -189,23 +189,23 @@ def test_loops_that_have_their_seed_among_their_settings_are_one_group(tmp_path)
     assert (tmp_path / "plot.svg").read_text().count("2 runs: ") == 2
 
 
-def told_of_two(folder: Path, tested: int = 0, logged: float = 0.0) -> str:
-    """Record the loops `one` and `two`, of which two was tested and logged so; return their diff."""
+def diff_of_two(folder: Path, tested: int = 0, logged: float = 0.0) -> str:
+    """Record the loops `one` and `two`, which may differ in evaluation and logs; return their diff."""
     for name, seed, value in (("one", 0, 0.0), ("two", tested, logged)):
         with runner.record(make("CartPole-v1"), folder, name=name) as env:
             list(play(env, 50, 0))
             with env.phase("eval"):
                 list(play(env, 50, seed))
             env.log("loss", value)
-    told = dualtaxi(folder, "diff", "one", "two")
-    assert told.exit_code == 1
-    return str(told.stdout)
+    reply = dualtaxi(folder, "diff", "one", "two")
+    assert reply.exit_code == 1
+    return str(reply.stdout)
 
 
-def test_diff_says_where_evaluations_of_loops_part(tmp_path):
-    told = told_of_two(tmp_path, tested=1)
-    assert "Training took the same steps, evaluation did not." in told
-    assert "They diverge in the reset before evaluation step 0" in told
+def test_diff_names_the_step_at_which_evaluations_of_loops_diverge(tmp_path):
+    reply = diff_of_two(tmp_path, tested=1)
+    assert "Training took the same steps, evaluation did not." in reply
+    assert "They diverge in the reset before evaluation step 0" in reply
     diverged = json.loads(dualtaxi(tmp_path, "diff", "one", "two", "--json").stdout)
     assert (diverged["divergence"], diverged["evaluation_divergence"]["step"]) == (None, 0)
     page = tmp_path / "diff.html"
@@ -213,13 +213,13 @@ def test_diff_says_where_evaluations_of_loops_part(tmp_path):
     assert "They diverge in the reset before evaluation step 0" in page.read_text()
 
 
-def test_diff_says_what_differs_between_loops_of_the_same_steps(tmp_path):
-    told = told_of_two(tmp_path, logged=1.0)
-    assert "all steps are the same; what differs is in /scalar." in told
+def test_diff_names_the_topics_that_differ_between_loops_of_equal_steps(tmp_path):
+    reply = diff_of_two(tmp_path, logged=1.0)
+    assert "all steps are the same; what differs is in /scalar." in reply
 
 
 class Pictures(gymnasium.Env[Any, Any]):
-    """Observes many numbers, of which one is what it was made with."""
+    """Observes many numbers, of which one is an argument."""
 
     observation_space = gymnasium.spaces.Dict({"picture": gymnasium.spaces.Box(0, 255, (9, 9), np.uint8)})
     action_space = gymnasium.spaces.Discrete(2)
@@ -237,7 +237,7 @@ class Pictures(gymnasium.Env[Any, Any]):
 
 
 class Starts(gymnasium.Env[Any, Any]):
-    """Begins one of its episodes where it is told, and otherwise is always the same."""
+    """Starts one of its episodes at a given value, and is constant otherwise."""
 
     observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
     action_space = gymnasium.spaces.Discrete(2)
@@ -254,7 +254,7 @@ class Starts(gymnasium.Env[Any, Any]):
         return np.ones(2, np.float32), 0.0, self.t == 3, False, {}
 
 
-def test_diff_names_the_reset_in_which_loops_part(tmp_path):
+def test_diff_names_the_reset_in_which_loops_diverge(tmp_path):
     for start, actions in ((0.25, 0), (0.75, 0), (0.5, 1)):
         with runner.record(Starts(start), tmp_path, name=f"at{start:g}") as env:
             for episode in range(4):
@@ -262,16 +262,16 @@ def test_diff_names_the_reset_in_which_loops_part(tmp_path):
                 for _ in range(3):
                     env.step(actions if episode == 2 else 0)
     for other in ("0.75", "0.5"):  # the actions of the last differ too, but after the reset
-        told = dualtaxi(tmp_path, "diff", "at0.25", f"at{other}").stdout
+        reply = dualtaxi(tmp_path, "diff", "at0.25", f"at{other}").stdout
         assert (
-            "They diverge in the reset before training step 6, of episode 2: observation is [0.25, " in told
+            "They diverge in the reset before training step 6, of episode 2: observation is [0.25, " in reply
         )
-        assert f" in A, [{other}, " in told
+        assert f" in A, [{other}, " in reply
     diverged = json.loads(dualtaxi(tmp_path, "diff", "at0.25", "at0.5", "--json").stdout)["divergence"]
     assert (diverged["step"], diverged["episode"], diverged["field"]) == (6, 2, "reset.observation")
 
 
-def test_diff_of_pictures_tells_the_number_that_differs(tmp_path):
+def test_diff_names_the_frame_that_differs(tmp_path):
     for number in (7, 8):
         with runner.record(Pictures(number), tmp_path, name=f"of{number}") as env:
             env.reset()
@@ -282,12 +282,12 @@ def test_diff_of_pictures_tells_the_number_that_differs(tmp_path):
 
 @pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
 def test_verify_checks_what_can_be_checked(folder, name):
-    told = dualtaxi(folder, "verify", name)
-    assert told.exit_code == 0
-    assert "which alone can repeat it" in told.output
+    reply = dualtaxi(folder, "verify", name)
+    assert reply.exit_code == 0
+    assert "which alone can repeat it" in reply.output
 
 
-def test_verify_finds_a_digest_that_is_not_its_messages(folder, tmp_path):
+def test_verify_finds_a_digest_that_does_not_match_the_messages(folder, tmp_path):
     from runner.execution.verify import verify
     from runner.recording.rewriting import rewrite
 
@@ -313,7 +313,7 @@ def test_verify_finds_a_digest_that_is_not_its_messages(folder, tmp_path):
     ],
     ids=" ".join,
 )
-def test_what_a_loop_has_not_is_refused_in_a_sentence(folder, words):
+def test_commands_that_need_a_job_refuse_a_loop(folder, words):
     done = dualtaxi(folder, *words)
     assert done.exit_code == 2
     assert "loop" in done.output
@@ -358,13 +358,13 @@ def test_a_loop_is_exported_and_imported_with_the_same_content(folder, tmp_path)
 
 
 @pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
-def test_a_loop_is_archived_looked_at_and_restored(folder, name, tmp_path, monkeypatch):
+def test_a_loop_is_archived_shown_and_restored(folder, name, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     there = Path(shutil.copytree(folder, tmp_path / "loops"))
     digest = runner.find_run(name, there).summary["content_digest"]
-    told = json.loads(dualtaxi(there, "archive", name, "--remove", "--json").stdout)
-    assert told["content_digest"] == digest
-    assert told["removed"]
+    reply = json.loads(dualtaxi(there, "archive", name, "--remove", "--json").stdout)
+    assert reply["content_digest"] == digest
+    assert reply["removed"]
     assert dualtaxi(there, "plot", name, "-o", str(tmp_path / "plot.svg")).exit_code == 0
     original = runner.find_run(name, folder).recording
     assert dualtaxi(there, "diff", name, str(original)).exit_code == 0
@@ -395,7 +395,7 @@ def test_a_loops_steps_are_exported_as_tables(folder, form, name, tmp_path):
         assert steps["next_observation_mission"].fillna("").tolist() == missions
 
 
-def test_csv_says_what_it_leaves_out(tmp_path):
+def test_csv_lists_the_omitted_columns(tmp_path):
     class Camera(Rooms):
         def __init__(self):
             super().__init__()
@@ -408,7 +408,7 @@ def test_csv_says_what_it_leaves_out(tmp_path):
     assert "Left out, as CSV cannot hold their bytes: next_observation, observation" in done.output
 
 
-def test_a_killed_loop_is_told_mended_and_compared(folder, tmp_path):
+def test_a_killed_loop_is_listed_repaired_and_compared(folder, tmp_path):
     whole = runner.find_run("pole", folder)
     cut = tmp_path / "k" / "recording.mcap"
     cut.parent.mkdir()
@@ -432,7 +432,7 @@ def test_an_interrupted_loop_is_not_resumed(tmp_path):
     assert env.run.recording.read_bytes() == before
 
 
-def test_a_loop_that_took_no_step_is_told_nothing_that_it_cannot_do(tmp_path):
+def test_a_loop_without_steps_gets_no_impossible_hints(tmp_path):
     with runner.record(make("FrozenLake-v1"), tmp_path, name="none") as env:
         env.reset(seed=0)
         env._loop.close("failed")
@@ -476,7 +476,7 @@ def test_rerun_gets_a_loop_of_a_single_step_and_episode(tmp_path):
 
 @pytest.mark.parametrize("value", [float("inf"), float("-inf"), float("nan"), 1e308])
 def test_values_that_are_not_finite_are_left_out_of_curves_and_counted(value, tmp_path):
-    """One infinite reward used to end `plot` and `report` in a traceback."""
+    """An infinite reward must not end `plot` and `report` in a traceback."""
     env = gymnasium.wrappers.TransformReward(make("FrozenLake-v1"), lambda reward: value or reward)
     with runner.record(env, tmp_path, name="bad") as recorded:
         list(play(recorded, 40, 0))
@@ -514,11 +514,11 @@ def test_a_new_name_is_in_every_picture_report_and_export(folder, tmp_path):
         assert dualtaxi(tmp_path / "runs", *words[:-1], str(made)).exit_code == 0
         assert "mountain" in made.read_text()
         assert "lake, seed" not in made.read_text()
-    told = json.loads(dualtaxi(tmp_path / "runs", "diff", "mountain", "other", "--json").stdout)
-    assert (told["a"]["name"], told["b"]["name"]) == ("mountain", "other")
+    reply = json.loads(dualtaxi(tmp_path / "runs", "diff", "mountain", "other", "--json").stdout)
+    assert (reply["a"]["name"], reply["b"]["name"]) == ("mountain", "other")
 
 
-def test_a_loop_that_runs_is_told_as_running(tmp_path):
+def test_a_running_loop_is_listed_as_running(tmp_path):
     with runner.record(make("CartPole-v1"), tmp_path / "runs", name="now") as env:
         list(play(env, 300, 0))
         env.commit() if hasattr(env, "commit") else None

@@ -1,4 +1,4 @@
-"""How a loop ends that is not closed: forked children, uncaught exceptions."""
+"""Loops that are not closed: forked children, uncaught exceptions."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ main()
         ("pass", "interrupted", None),
     ],
 )
-def test_an_uncaught_exception_without_with_is_the_run_s_error(tmp_path, end, status, text):
+def test_an_uncaught_exception_is_the_error_of_the_run(tmp_path, end, status, text):
     script = textwrap.dedent(UNCAUGHT.format(end=end))
     subprocess.run(
         [sys.executable, "-c", script, str(tmp_path)], timeout=60, check=False, capture_output=True

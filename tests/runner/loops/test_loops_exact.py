@@ -1,4 +1,4 @@
-"""Values are recorded exactly, or the loop is warned or stopped; an info that cannot be recorded is named."""
+"""Exactness of recorded values: what is rounded gives a warning, what does not fit is refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.runner.loops.making import make
 
 
 class Sensor(gymnasium.Env[Any, Any]):
-    """An environment whose observations and infos the test sets."""
+    """An environment with given observations and infos."""
 
     observation_space: spaces.Space[Any] = spaces.Box(-1, 1, (2,), np.float32)
     action_space = spaces.Discrete(2)
@@ -41,7 +41,7 @@ def steps_of(run: Any) -> Any:
         return np.concatenate(list(recording.blocks(recording.topic("/train/step"))))
 
 
-def test_an_observation_that_is_rounded_late_is_warned_of_once(tmp_path):
+def test_a_rounded_observation_gives_one_warning(tmp_path):
     env = Sensor(np.zeros(2, np.float32))
     with runner.record(env, tmp_path) as rec:
         rec.reset()
@@ -106,7 +106,7 @@ def test_float64_actions_of_a_vector_are_recorded_exactly(tmp_path):
     check_integrity(rec.run.recording)
 
 
-def test_a_recording_that_took_no_step_is_whole(tmp_path):
+def test_a_recording_without_steps_is_complete(tmp_path):
     with runner.record(gymnasium.make("Pendulum-v1"), tmp_path) as rec:
         rec.reset(seed=1)
     check_integrity(rec.run.recording)
@@ -143,7 +143,7 @@ def endless() -> Any:
     ],
     ids=["text", "array", "cyclic", "integer"],
 )
-def test_an_info_that_cannot_be_recorded_is_named_and_the_rest_is_kept(tmp_path, value, reason):
+def test_an_info_that_cannot_be_recorded_is_replaced_by_the_reason(tmp_path, value, reason):
     env = Sensor(np.zeros(2, np.float32))
     env.info = {"large": value, "small": 1}
     with runner.record(env, tmp_path, info=["*"]) as rec:
@@ -158,7 +158,7 @@ def test_an_info_that_cannot_be_recorded_is_named_and_the_rest_is_kept(tmp_path,
     assert reason in infos(rec.run)[0]["large"]
 
 
-def test_reset_is_given_only_what_the_loop_gives(tmp_path):
+def test_reset_gets_only_the_arguments_of_the_loop(tmp_path):
     class Old(Sensor):
         def reset(self, seed=None):  # type: ignore[no-untyped-def,override]
             return np.zeros(2, np.float32), {}

@@ -1,4 +1,4 @@
-"""The files of loops: read by others' readers, mended when damaged, refused when they are made up."""
+"""Files of loops: read by other readers, repaired if damaged, refused if forged."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ KINDS = {"FrozenLake-v1": "step", "CartPole-v1": "transition", "Rooms": "transit
 
 @pytest.fixture(scope="session", params=KINDS)
 def whole(request, tmp_path_factory):
-    """Return the name of an environment and a recording of a loop over it that has every topic."""
+    """Return the name of an environment and a recording of it with every topic."""
     folder = tmp_path_factory.mktemp("files")
     env = make(request.param)
     options = {"frames_every": 50} if request.param.startswith("Rooms") else {}
@@ -61,13 +61,13 @@ def test_the_official_reader_reads_every_message(whole):
         assert set(counts) <= {topic.name for topic in schema.KINDS["transition"]}
 
 
-def test_rerun_finds_nothing_wrong(whole):
+def test_rerun_verifies_the_recording(whole):
     program = Path(rerun_cli.__file__).parent / "rerun"
     done = subprocess.run([program, "mcap", "check", whole[1]], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
-def test_a_hole_is_told_and_the_rest_is_kept(whole, tmp_path):
+def test_a_damaged_chunk_is_reported_and_the_rest_is_read(whole, tmp_path):
     name, path = whole
     damaged = tmp_path / "recording.mcap"
     data = bytearray(path.read_bytes())
@@ -99,7 +99,7 @@ def pole(tmp_path_factory):
 
 
 def altered(path: Path, tmp_path: Path, **said: str) -> Path:
-    """Return a copy whose run says something else of itself."""
+    """Return a copy with other metadata of the run."""
     made = tmp_path / "made-up.mcap"
 
     def change(name: str, entries: dict[str, str]) -> dict[str, str]:
@@ -110,7 +110,7 @@ def altered(path: Path, tmp_path: Path, **said: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("said", "told"),
+    ("said", "message"),
     [
         ({"kind": "other"}, "kind"),
         ({"kind": "job"}, "not written by dualtaxi"),
@@ -144,9 +144,9 @@ def altered(path: Path, tmp_path: Path, **said: str) -> Path:
     ],
     ids=lambda value: value if isinstance(value, str) else "-",
 )
-def test_what_a_file_makes_up_is_refused(pole, tmp_path, said, told):
+def test_false_metadata_is_refused(pole, tmp_path, said, message):
     with (
-        pytest.raises(RecordingError, match=told),
+        pytest.raises(RecordingError, match=message),
         open_recording(altered(pole, tmp_path, **said)) as recording,
     ):
         for _ in recording.transitions("train"):

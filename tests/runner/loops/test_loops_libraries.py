@@ -1,4 +1,4 @@
-"""Environments, names, settings and values in the shapes that other libraries give them."""
+"""Environments, names, settings and values of other libraries."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.runner.loops.making import Leaving, make
 
 
 class Pool(gymnasium.Env[Any, Any]):
-    """Two environments in the shape of EnvPool's: an Env and a VectorEnv, with a specification of its own."""
+    """Two environments like EnvPool's: an Env and a VectorEnv, with its own specification."""
 
     num_envs = 2
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as EnvPool has it
@@ -44,7 +44,7 @@ class Pool(gymnasium.Env[Any, Any]):
 
 
 class Listed(VectorEnv[Any, Any, Any]):
-    """Two environments in the shape of SuperSuit's: unstated resets, spaces of one, infos in a list."""
+    """Two environments like SuperSuit's: resets not stated, spaces of one environment, infos in a list."""
 
     def __init__(self) -> None:
         self.num_envs, self.t = 2, 0
@@ -105,7 +105,7 @@ def test_an_async_vector_environment_is_recorded_by_its_own_id(tmp_path):
     assert rec.run.facts["config"]["env"]["id"] == "FrozenLake-v1"
 
 
-def test_what_make_vec_adds_is_no_setting_of_the_environment(tmp_path):
+def test_arguments_of_make_vec_are_not_settings_of_the_environment(tmp_path):
     envs = gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="vector_entry_point")
     with runner.record_vector(envs, tmp_path) as rec:
         rec.reset(seed=1)
@@ -113,7 +113,7 @@ def test_what_make_vec_adds_is_no_setting_of_the_environment(tmp_path):
 
 
 class Mission(spaces.Space[str]):
-    """A space of texts in the shape of MiniGrid's."""
+    """A space of texts like MiniGrid's."""
 
     def __init__(self) -> None:
         super().__init__(dtype=str)
@@ -166,7 +166,7 @@ def test_a_graph_is_recorded_as_json(tmp_path):
     assert json.loads(reset["observation"]).keys() == {"nodes", "edges", "edge_links"}
 
 
-def test_a_game_in_turns_is_refused_at_once(tmp_path):
+def test_a_game_in_turns_is_refused(tmp_path):
     class Turns(Leaving):
         def agent_iter(self) -> None: ...
 
@@ -179,7 +179,7 @@ def test_a_game_in_turns_is_refused_at_once(tmp_path):
 
 @dataclass
 class Args:
-    """Settings as a script has them."""
+    """The settings of a script."""
 
     lr: float = 0.5
     folder: Path = Path("there")
@@ -187,7 +187,7 @@ class Args:
 
 
 class Conf(Mapping[str, Any]):
-    """A mapping that is no dictionary, as OmegaConf's are."""
+    """A mapping that is not a dictionary, like OmegaConf's."""
 
     def __getitem__(self, key: str) -> Any:
         return {"lr": 0.5, "folder": "there", "inner": {"sizes": [8, 8]}}[key]
@@ -202,19 +202,19 @@ class Conf(Mapping[str, Any]):
 @pytest.mark.parametrize(
     "settings", [Args(), Namespace(**vars(Args())), SimpleNamespace(**vars(Args())), Conf()], ids=type
 )
-def test_settings_come_in_any_shape(tmp_path, settings):
+def test_settings_may_be_of_any_type_with_fields(tmp_path, settings):
     runner.record(make("CartPole-v1"), tmp_path, config=settings, name="any").close()
     found = runner.find_run("any", tmp_path).facts["config"]["config"]
     assert found == {"lr": 0.5, "folder": "there", "inner": {"sizes": [8, 8]}}
 
 
-def test_settings_that_are_none_are_refused(tmp_path):
+def test_settings_without_fields_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="config: found int, expected a mapping, a dataclass"):
         runner.record(make("CartPole-v1"), tmp_path, config=3)
 
 
 @pytest.mark.parametrize("name", ["ALE/Pong-v5__ppo__1", "a+b"])
-def test_names_of_other_libraries_are_names_of_runs(tmp_path, name):
+def test_names_of_other_libraries_are_accepted(tmp_path, name):
     runner.record(make("CartPole-v1"), tmp_path, name=name).close()
     assert runner.find_run(name, tmp_path).name == name
     shown = CliRunner().invoke(cli, ["show", name, "--recordings", str(tmp_path)])
@@ -237,7 +237,7 @@ def test_a_loop_without_a_seed_is_listed_without_one(tmp_path):
 
 
 class Tensor:
-    """A tensor that needs a gradient, in the shape of PyTorch's."""
+    """A tensor with a gradient, like PyTorch's."""
 
     def __init__(self, values: Any, dtype: str = "torch.float32", needs_gradient: bool = True) -> None:
         self._values, self.dtype, self._needs = np.asarray(values, np.float32), dtype, needs_gradient

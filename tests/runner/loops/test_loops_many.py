@@ -1,4 +1,4 @@
-"""Vector environments, each way of resetting by itself; games of several agents."""
+"""Vector environments in each autoreset mode; games of several agents."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def alike(left: Any, right: Any) -> bool:
 
 @pytest.mark.parametrize("mode", AutoresetMode)
 @pytest.mark.parametrize("name", NAMES)
-def test_a_vector_loop_is_recorded_and_undisturbed(tmp_path, name, mode):
+def test_recording_changes_nothing_for_a_vector_loop(tmp_path, name, mode):
     with runner.record_vector(vector(name, mode), tmp_path, chunk_steps=256) as envs:
         seen = drive(envs, 300)
     assert all(map(alike, seen, drive(vector(name, mode), 300)))
@@ -61,7 +61,7 @@ def test_a_vector_loop_is_recorded_and_undisturbed(tmp_path, name, mode):
 
 
 def check_episode(recording: Recording, number: int, episode: Any) -> None:
-    """The steps of an episode are those of one environment, whole, and add up."""
+    """The steps of an episode belong to one environment, are complete, and add up."""
     own = recording.episode_steps("train", number)
     assert own["t"].tolist() == list(range(int(episode["length"])))
     assert own["rewards"].sum() == pytest.approx(float(episode["returns"][0]))
@@ -71,7 +71,7 @@ def check_episode(recording: Recording, number: int, episode: Any) -> None:
 
 
 def check_follows(steps: Any, resets: Any) -> None:
-    """Each environment's first observation is its reset's; of states, each step goes on from the last."""
+    """Each environment's first observation is that of its reset; each step starts in the last state."""
     if "state" not in steps.dtype.names:
         return
     first = {(int(r["environment"]), int(r["episode"])): int(r["observation"]) for r in resets}
@@ -85,8 +85,8 @@ def check_follows(steps: Any, resets: Any) -> None:
 
 
 @pytest.mark.parametrize("mode", AutoresetMode)
-def test_the_last_observation_of_an_episode_is_its_own(tmp_path, mode):
-    """CartPole ends where the pole or the cart is too far off, not where it begins anew."""
+def test_final_observations_belong_to_their_episode(tmp_path, mode):
+    """CartPole ends where the pole or the cart is too far off, not where the next episode starts."""
     with runner.record_vector(vector("CartPole-v1", mode), tmp_path) as envs:
         drive(envs, 300)
     with open_recording(envs.run.recording) as recording:
@@ -105,7 +105,7 @@ def test_what_a_vector_cannot_record_is_refused(tmp_path):
         runner.record_vector(envs, tmp_path)
 
 
-def test_a_parallel_game_is_recorded_and_undisturbed(tmp_path):
+def test_recording_changes_nothing_for_a_parallel_game(tmp_path):
     with runner.record_parallel(DualTaxiParallelEnv(max_steps=40), tmp_path) as game:
         seen = parallel(game, 4)
     alone = parallel(DualTaxiParallelEnv(max_steps=40), 4)
@@ -129,7 +129,7 @@ def test_a_parallel_game_is_recorded_and_undisturbed(tmp_path):
     assert [int(one["seed"]) for one in first] == [0, 1, 2, 3]
 
 
-def test_agents_that_leave_are_told(tmp_path):
+def test_agents_that_leave_are_recorded(tmp_path):
     with runner.record_parallel(Leaving(), tmp_path, info=["left"]) as game:
         parallel(game, 2)
     with open_recording(game.run.recording) as recording:
@@ -153,7 +153,7 @@ def test_agents_without_names_are_refused_before_there_is_a_run(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_loop_is_recorded_though_its_folder_was_removed(tmp_path, monkeypatch):
+def test_a_loop_is_recorded_after_its_working_directory_was_removed(tmp_path, monkeypatch):
     gone = tmp_path / "gone"
     gone.mkdir()
     monkeypatch.chdir(gone)
@@ -165,7 +165,7 @@ def test_a_loop_is_recorded_though_its_folder_was_removed(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
 
 
-def test_a_vector_of_one_is_as_the_environment_alone(tmp_path):
+def test_a_vector_of_one_equals_the_environment_alone(tmp_path):
     with runner.record(make("FrozenLake-v1"), tmp_path) as env:
         list(play(env, 200))
     mode = AutoresetMode.SAME_STEP
@@ -219,7 +219,7 @@ def test_an_export_to_rerun_says_that_texts_are_not_drawn(tmp_path):
 
 
 class Tide(gymnasium.Env[Any, Any]):
-    """Episodes, rewards and observations that follow from the seed of the first reset by whole numbers."""
+    """Episodes, rewards and observations computed from the seed of the first reset in whole numbers."""
 
     def __init__(self, is_discrete: bool) -> None:
         self.observation_space: Any = spaces.Box(-9, 9, (2,), np.float32)
@@ -279,17 +279,17 @@ TIDES = {
     (False, AutoresetMode.SAME_STEP): "3f0fc9f5ea657a96a7502bb9e238cc9826734cffa16289009f7a3f190b1a4cf8",
     (False, AutoresetMode.DISABLED): "14ddde05557dd75f9bd67ab2d0960a51e84bb87d354e4b4f147821f7d5a4c852",
 }
-"""Content digests by whether spaces are discrete, and how environments reset themselves."""
+"""Content digests by kind of spaces and autoreset mode."""
 
 
 @pytest.mark.parametrize(("is_discrete", "mode"), TIDES)
-def test_a_vector_loop_has_the_content_that_it_always_had(tmp_path, is_discrete, mode):
+def test_the_content_of_a_vector_loop_is_unchanged(tmp_path, is_discrete, mode):
     run = tide(tmp_path, is_discrete, mode)
     assert run.summary["content_digest"] == TIDES[is_discrete, mode]
     check_integrity(run.recording)
 
 
-def test_values_logged_between_steps_are_placed_among_them(tmp_path):
+def test_logged_values_have_the_place_of_their_step(tmp_path):
     envs = SyncVectorEnv([lambda: Tide(True)] * N)
     ended, expected = 0, []
     with runner.record_vector(envs, tmp_path) as rec:

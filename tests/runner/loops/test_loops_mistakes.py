@@ -1,4 +1,4 @@
-"""Mistakes with the wrappers: a sentence that says what was found, and no run that is left behind."""
+"""Mistakes with the wrappers: a clear error, and no run left behind."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Named(Rooms):
 
 
 @pytest.mark.parametrize(
-    ("begin", "told"),
+    ("begin", "message"),
     [
         (lambda there: runner.record("CartPole-v1", there), "found str, expected a Gymnasium environment"),
         (lambda there: runner.record(poles(), there), "record_vector is for vector environments"),
@@ -65,14 +65,14 @@ class Named(Rooms):
         (lambda there: runner.record(Named(), there), r"found a part called 'a\\nb'"),
     ],
 )
-def test_what_cannot_be_recorded_is_said_and_leaves_no_run(begin, told, tmp_path):
-    with pytest.raises(RunnerError, match=told):
+def test_a_refused_environment_leaves_no_run(begin, message, tmp_path):
+    with pytest.raises(RunnerError, match=message):
         begin(tmp_path / "loops")
     assert not (tmp_path / "loops").exists()
 
 
 @pytest.mark.parametrize(("part", "left"), [("_append", []), ("add_metadata", ["failed"])])
-def test_a_recording_that_cannot_be_begun_leaves_no_run_that_seems_to_run(part, left, tmp_path, monkeypatch):
+def test_a_recording_that_cannot_start_leaves_no_running_run(part, left, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -83,7 +83,7 @@ def test_a_recording_that_cannot_be_begun_leaves_no_run_that_seems_to_run(part, 
 
 
 @pytest.mark.parametrize(
-    ("do", "told"),
+    ("do", "message"),
     [
         (lambda rec: rec.log("a", "\ud800"), "valid Unicode"),
         (lambda rec: rec.log("\ud800", 1), "valid Unicode"),
@@ -92,10 +92,10 @@ def test_a_recording_that_cannot_be_begun_leaves_no_run_that_seems_to_run(part, 
         (lambda rec: rec.snapshot("\ud800", [1.0]), "expected an array of numbers and a name"),
     ],
 )
-def test_what_cannot_be_logged_is_said_and_the_loop_goes_on(do, told, tmp_path):
+def test_a_refused_log_does_not_stop_the_loop(do, message, tmp_path):
     with runner.record(pole(), tmp_path) as rec:
         rec.reset(seed=1)
-        with pytest.raises(RunnerError, match=told):
+        with pytest.raises(RunnerError, match=message):
             do(rec)
         rec.step(0)
         rec.log("seed", np.float32(0.5))
@@ -103,7 +103,7 @@ def test_what_cannot_be_logged_is_said_and_the_loop_goes_on(do, told, tmp_path):
 
 
 class Paid(gymnasium.Env[Any, Any]):
-    """Rewards, observations and actions as people's own environments have them."""
+    """Rewards, observations and actions of unusual types, as in users' environments."""
 
     observation_space = spaces.Box(0, 255, (2,), np.uint8)
     action_space = spaces.Box(-1, 1, (2,), np.float32)
@@ -129,22 +129,22 @@ def test_a_reward_may_stand_in_an_array_of_one(reward, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("env", "told"),
+    ("env", "message"),
     [
         (lambda: Paid(None), "found the reward None, expected a number"),
         (lambda: Paid(np.ones(2)), "found the reward"),
         (lambda: Paid(1.0, [300, 1]), "found an observation that is not of"),
     ],
 )
-def test_what_an_environment_gives_wrongly_is_said(env, told, tmp_path):
+def test_invalid_results_of_an_environment_are_refused(env, message, tmp_path):
     rec = runner.record(env(), tmp_path)
     rec.reset()
-    with pytest.raises(RunnerError, match=told):
+    with pytest.raises(RunnerError, match=message):
         rec.step(np.zeros(2, np.float32))
     rec.close()
 
 
-def test_an_action_that_is_rounded_later_is_warned_of_once(tmp_path):
+def test_a_rounded_action_gives_one_warning(tmp_path):
     env = Paid(1.0)
     with runner.record(env, tmp_path) as rec:
         rec.reset()
@@ -163,7 +163,7 @@ def test_a_seed_of_numpy_is_a_number(tmp_path):
 
 
 def test_a_forked_process_leaves_the_recording_alone(tmp_path):
-    """What a child closes, or lets go, is its parent's."""
+    """A child that closes the environment leaves the parent's recording open."""
     with runner.record(pole(), tmp_path) as rec:
         rec.reset(seed=1)
         rec.step(0)
@@ -178,7 +178,7 @@ def test_a_forked_process_leaves_the_recording_alone(tmp_path):
         assert len(list(recording.transitions("train"))) == 2
 
 
-def test_a_second_environment_that_renders_nothing_is_refused_before_the_loop_goes_on(tmp_path):
+def test_a_second_environment_without_pictures_is_refused(tmp_path):
     blind = Rooms()
     blind.render_mode = None
     with (
@@ -191,7 +191,7 @@ def test_a_second_environment_that_renders_nothing_is_refused_before_the_loop_go
 @pytest.mark.parametrize(
     "picture", [None, np.ones((4, 4, 3)), np.zeros((4, 4), np.uint8)], ids=["nothing", "floats", "flat"]
 )
-def test_what_render_returns_is_a_picture_or_refused(tmp_path, monkeypatch, picture):
+def test_a_frame_that_is_not_a_picture_is_refused(tmp_path, monkeypatch, picture):
     monkeypatch.setattr(Rooms, "render", lambda _: picture)
     with (
         runner.record(Rooms(), tmp_path, frames_every=4) as rec,
@@ -201,7 +201,7 @@ def test_what_render_returns_is_a_picture_or_refused(tmp_path, monkeypatch, pict
 
 
 @pytest.mark.parametrize("value", [1.5, np.float32(1.5), np.array(1.5), np.array([[1.5]])], ids=repr)
-def test_a_lone_number_is_logged_however_it_comes(tmp_path, value):
+def test_a_single_number_of_any_type_is_logged(tmp_path, value):
     with runner.record(pole(), tmp_path) as rec:
         rec.log("loss", value)
     with open_recording(rec.run.recording) as recording:
@@ -210,7 +210,7 @@ def test_a_lone_number_is_logged_however_it_comes(tmp_path, value):
 
 
 @pytest.mark.parametrize("kind", ["itself", "surrogate"])
-def test_settings_that_json_cannot_hold_are_refused_before_there_is_a_run(tmp_path, kind):
+def test_settings_that_json_cannot_hold_leave_no_run(tmp_path, kind):
     settings: dict[str, Any] = {"text": "\ud800"} if kind == "surrogate" else {}
     if kind == "itself":
         settings["itself"] = settings
@@ -230,7 +230,7 @@ def test_settings_that_json_cannot_hold_are_refused_before_there_is_a_run(tmp_pa
     ],
     ids=str,
 )
-def test_packing_has_the_bounds_that_a_configuration_has(packing, tmp_path):
+def test_packing_has_the_bounds_of_a_configuration(packing, tmp_path):
     def outcome(work):
         try:
             return work()
@@ -257,7 +257,7 @@ def test_packing_has_the_bounds_that_a_configuration_has(packing, tmp_path):
         (runner.record_parallel, game),
     ],
 )
-def test_a_phase_is_not_begun_without_a_reset(tmp_path, record, make_env):
+def test_a_phase_needs_a_reset(tmp_path, record, make_env):
     with record(make_env(), tmp_path) as rec:
         if record is runner.record_parallel:
             action = {agent: rec.action_space(agent).sample() for agent in rec.possible_agents}

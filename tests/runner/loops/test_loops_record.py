@@ -1,4 +1,4 @@
-"""Any loop over a Gymnasium environment: undisturbed, and recorded to the last value."""
+"""Recording a loop over a Gymnasium environment: it is not changed, and recorded completely."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STEPS = 700
 
 
 def same(left: Any, right: Any) -> bool:
-    """Return whether two values of a space are the same."""
+    """Return whether two values of a space are equal."""
     if isinstance(left, dict):
         return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
     if isinstance(left, tuple):
@@ -38,24 +38,24 @@ def same(left: Any, right: Any) -> bool:
 
 @pytest.fixture(scope="session", params=NAMES)
 def loop(request, tmp_path_factory):
-    """Return (environment, recording, what the loop saw)."""
+    """Return the environment, its recording, and the values that the loop got."""
     name = request.param
     return name, *recorded(tmp_path_factory.mktemp("loops"), name, STEPS, chunk_steps=256)
 
 
-def test_a_loop_sees_what_it_sees_without_the_recording(loop):
+def test_recording_changes_nothing_for_the_loop(loop):
     name, _, seen = loop
     alone = list(play(make(name), STEPS))
     assert len(seen) == len(alone)
     assert all(same(left, right) for left, right in zip(seen, alone, strict=True))
 
 
-def test_every_byte_of_the_recording_is_what_it_should_be(loop):
+def test_the_bytes_of_the_recording_are_those_of_protobuf(loop):
     check_integrity(loop[1])
 
 
 def flat(value: Any) -> list[Any]:
-    """Return the leaves of a value, of the loop's or of the recording's."""
+    """Return the leaves of a value of the loop or of the recording."""
     if isinstance(value, dict):
         return [leaf for part in value.values() for leaf in flat(part)]
     if isinstance(value, np.void):
@@ -70,7 +70,7 @@ def agree(found: Any, expected: Any) -> bool:
     return len(left) == len(right) and all(map(np.array_equal, left, right))
 
 
-def test_steps_hold_what_the_loop_saw(loop):
+def test_steps_have_the_values_of_the_loop(loop):
     _, path, seen = loop
     steps = [entry for entry in seen if entry[0] == "step"]
     with open_recording(path) as recording:
@@ -84,7 +84,7 @@ def test_steps_hold_what_the_loop_saw(loop):
         assert bool(one["truncated"]) == truncated
 
 
-def test_resets_hold_seed_and_observation(loop):
+def test_resets_have_seed_and_observation(loop):
     _, path, seen = loop
     resets = [entry for entry in seen if entry[0] == "reset"]
     with open_recording(path) as recording:
@@ -123,13 +123,13 @@ def test_steps_and_episodes_are_numbered_as_they_come(loop):
     assert all(int(one["step"]) == episodes.index(int(one["episode"])) for one in first[:-1])
 
 
-def test_times_go_on_with_the_steps(loop):
+def test_times_follow_the_steps(loop):
     with open_recording(loop[1]) as recording:
         times = [int(one["log_time"]) for one in recording.transitions("train")]
     assert times == [schema.STEP_NANOSECONDS * (k + 1) for k in range(STEPS)]
 
 
-def test_a_tabular_environment_is_carried_along_and_its_events_are_counted(tmp_path):
+def test_a_tabular_environment_is_attached_and_its_events_are_counted(tmp_path):
     path, seen = recorded(tmp_path, "CliffWalking-v1", 400)
     falls = sum(entry[3] == -100 for entry in seen if entry[0] == "step")
     with open_recording(path) as recording:
@@ -189,10 +189,10 @@ def test_phases_have_steps_and_episodes_of_their_own(tmp_path):
 
 def test_a_second_environment_is_recorded_into_the_same_run(tmp_path):
     with runner.record(make("FrozenLake-v1"), tmp_path) as env:
-        beside = runner.record(make("FrozenLake-v1"), into=env, phase="eval")
-        for _ in zip(play(env, 40), play(beside, 40), strict=False):
+        other = runner.record(make("FrozenLake-v1"), into=env, phase="eval")
+        for _ in zip(play(env, 40), play(other, 40), strict=False):
             pass
-        beside.close()
+        other.close()
         list(play(env, 40))  # the recording is the first environment's to close
     with open_recording(env.run.recording) as recording:
         assert recording.count(schema.EVAL_STEP) > 20
@@ -201,7 +201,7 @@ def test_a_second_environment_is_recorded_into_the_same_run(tmp_path):
         runner.record(make("Taxi-v4"), into=env, phase="eval")
 
 
-def test_chosen_fields_of_info_are_kept_where_they_come(tmp_path):
+def test_chosen_fields_of_info_are_recorded_where_they_occur(tmp_path):
     options = {"level": 3}
     with runner.record(Rooms(), tmp_path, info=["luck", "first", "never"]) as env:
         env.reset(seed=1, options=options)
@@ -214,7 +214,7 @@ def test_chosen_fields_of_info_are_kept_where_they_come(tmp_path):
     assert said[1:] == [(step, False, {"info": {"luck": 0.5}}) for step in (0, 2, 4)]
 
 
-def test_an_episode_that_is_reset_halfway_is_an_episode(tmp_path):
+def test_a_reset_ends_an_episode_in_progress(tmp_path):
     with runner.record(make("CartPole-v1"), tmp_path) as env:
         for length in (3, 5):
             env.reset()
@@ -229,7 +229,7 @@ def test_an_episode_that_is_reset_halfway_is_an_episode(tmp_path):
         assert [int(one["episode"]) for one in recording.resets("train")] == [0, 1, 2, 2]
 
 
-def test_an_error_in_the_loop_leaves_a_whole_recording_that_says_so(tmp_path):
+def test_an_error_in_the_loop_is_in_the_complete_recording(tmp_path):
     def broken() -> None:
         with runner.record(make("CartPole-v1"), tmp_path) as env:
             env.reset(seed=0)
@@ -245,7 +245,7 @@ def test_an_error_in_the_loop_leaves_a_whole_recording_that_says_so(tmp_path):
 
 
 @pytest.mark.parametrize(("code", "status"), [(None, "interrupted"), (0, "interrupted"), (3, "failed")])
-def test_a_loop_that_leaves_its_process_failed_only_if_it_says_so(tmp_path, code, status):
+def test_a_loop_that_exits_failed_only_with_an_error_code(tmp_path, code, status):
     def leave() -> None:
         with runner.record(make("CartPole-v1"), tmp_path) as env:
             env.reset(seed=0)
@@ -279,7 +279,7 @@ env.step(0)
         ("env.close()", "finished"),
     ],
 )
-def test_a_killed_loop_leaves_what_it_did(tmp_path, end, status):
+def test_a_killed_loop_leaves_its_steps(tmp_path, end, status):
     script = textwrap.dedent(KILLED.format(end=end))
     subprocess.run([sys.executable, "-c", script, str(tmp_path)], timeout=60, check=False)
     (run,) = list_runs(tmp_path)
@@ -298,7 +298,7 @@ def test_a_killed_loop_leaves_what_it_did(tmp_path, end, status):
     check_integrity(run.recording)
 
 
-def test_what_cannot_be_recorded_is_refused_with_what_can(tmp_path):
+def test_invalid_calls_are_refused_with_valid_ones(tmp_path):
     class Odd(Rooms):
         def __init__(self) -> None:
             super().__init__()
@@ -315,7 +315,7 @@ def test_what_cannot_be_recorded_is_refused_with_what_can(tmp_path):
     assert list_runs(tmp_path) == []
 
 
-def test_values_outside_of_their_space_are_told(tmp_path):
+def test_values_outside_of_their_space_are_refused(tmp_path):
     class Liar(gymnasium.Env[Any, Any]):
         observation_space = gymnasium.spaces.Box(0, 1, (3,), np.float32)
         action_space = gymnasium.spaces.Discrete(2)
@@ -372,7 +372,7 @@ def test_frames_are_exact_and_carry_their_moment(tmp_path):
         assert np.array_equal(np.asarray(Image.open(BytesIO(one["data"]))), pixels)
 
 
-def test_a_run_says_what_it_was_recorded_from(tmp_path):
+def test_a_run_names_its_origin(tmp_path):
     env = make("FrozenLake-v1")
     with runner.record(env, tmp_path, name="mine", seed=4, config={"lr": 0.1, "net": [8, 8]}) as rec:
         list(play(rec, 5))
@@ -393,7 +393,7 @@ def test_a_run_says_what_it_was_recorded_from(tmp_path):
         }
 
 
-def test_two_loops_alike_have_the_same_digest(tmp_path):
+def test_equal_loops_have_equal_digests(tmp_path):
     runs = []
     for chunk_steps in (256, 1024):
         with runner.record(make("CartPole-v1"), tmp_path, chunk_steps=chunk_steps) as env:

@@ -1,4 +1,4 @@
-"""A small sweep that is done, and a file of it."""
+"""A small finished sweep, and its file."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def sweep():
 
 @pytest.fixture(scope="session")
 def done(sweep, tmp_path_factory):
-    """The small sweep, done: folder, trials, standing."""
+    """The small sweep, finished: folder, trials, status."""
     folder = tmp_path_factory.mktemp("swept")
     return folder, *swept(folder, sweep)
 
 
 @pytest.fixture
 def file(tmp_path):
-    """Return what writes a sweep's file."""
+    """Return a function that writes a sweep file."""
 
     def write(**changes):
         path = tmp_path / "small.yaml"

@@ -1,4 +1,4 @@
-"""A small sweep, and workers that need no process of their own."""
+"""A small sweep, and workers that run in this process."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BASE = {
 
 
 def described(**changes):
-    """Return a sweep as a file says it, with changes."""
+    """Return the contents of a sweep file, with changes."""
     return {
         "name": "small",
         "base": BASE,
@@ -32,7 +32,7 @@ def described(**changes):
 
 
 class Here:
-    """Does each task at once; stops by itself after so many, or as if its worker had died."""
+    """Does each task at once; stops after `most` tasks, and behaves as if workers had died at `dying`."""
 
     def __init__(self, most=10**9, dying=()):
         self.done, self.most, self.dying, self.answers, self.given = 0, most, set(dying), [], []
@@ -56,13 +56,13 @@ class Here:
 
 
 def swept(folder: Path, sweep, workers=None, **options):
-    """Do a sweep and return its trials and standing."""
+    """Run a sweep and return its trials and status."""
     state.begin(sweep, folder, resume=True, accept_changes=False)
     return run_sweep(sweep, folder, workers or Here(), **options)
 
 
 def digests(trials):
-    """Return what is compared of trials: values, and the digest of every run."""
+    """Return the values, states and run digests of trials, for comparison."""
     return [
         (t.values, t.state, t.value, {seed: t.results[seed].digest for seed in sorted(t.results)})
         for t in trials.done

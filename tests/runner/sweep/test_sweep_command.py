@@ -1,4 +1,4 @@
-"""`dualtaxi sweep` as it is typed."""
+"""The command `dualtaxi sweep`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def type_in(tmp_path):
     return typed
 
 
-def test_a_dry_run_says_what_would_run_and_runs_nothing(type_in, file, tmp_path):
+def test_a_dry_run_prints_the_plan_and_runs_nothing(type_in, file, tmp_path):
     said = json.loads(type_in("run", str(file()), "--dry-run", "--json").stdout)
     assert (said["trials"], said["runs"]) == (6, 12)
     assert said["bytes"] == 12 * said["bytes_a_run"] > 0
@@ -32,24 +32,24 @@ def test_a_dry_run_says_what_would_run_and_runs_nothing(type_in, file, tmp_path)
     assert "0.1 to 1" in type_in("run", str(file()), "--dry-run").stdout
 
 
-def test_a_sweep_is_run_shown_and_its_best_is_a_configuration(type_in, file, tmp_path):
+def test_a_sweep_runs_and_its_best_configuration_loads(type_in, file, tmp_path):
     path = str(file())
-    told = json.loads(type_in("run", path, "--workers", "1", "--json").stdout)
-    assert (told["done"], told["failed"], told["stopped"]) == (12, 0, None)
+    reply = json.loads(type_in("run", path, "--workers", "1", "--json").stdout)
+    assert (reply["done"], reply["failed"], reply["stopped"]) == (12, 0, None)
     assert "--resume continues it" in type_in("run", path, code=2).output
-    assert json.loads(type_in("run", path, "--resume", "--json").stdout)["best"] == told["best"]
+    assert json.loads(type_in("run", path, "--resume", "--json").stdout)["best"] == reply["best"]
     shown = json.loads(type_in("show", "small", "--json").stdout)
-    assert shown["best"] == told["best"]["trial"] == shown["ranking"][0]["number"]
+    assert shown["best"] == reply["best"]["trial"] == shown["ranking"][0]["number"]
     assert len(shown["ranking"]) == 6
     assert "median" in type_in("show", "small").stdout
     best = tmp_path / "best.yaml"
     type_in("show", "small", "--best", str(best))
-    assert load(best).step_size == told["best"]["values"]["step_size"]
+    assert load(best).step_size == reply["best"]["values"]["step_size"]
     assert load(best).seeds == tuple(range(2, 12))  # the search saw 0 and 1
     assert json.loads(type_in("ls", "--json").stdout) == {"sweeps": ["small"]}
 
 
-def test_a_limit_stops_it_and_a_raised_one_goes_on(type_in, file, tmp_path):
+def test_a_limit_stops_a_sweep_and_a_raised_limit_resumes_it(type_in, file, tmp_path):
     stopped = type_in("run", str(file(limits={"runs": 3})), "--workers", "1", code=1)
     assert "limits.runs: 3 runs were started. --resume continues from there." in stopped.output
     assert len(list_runs(tmp_path / "runs")) == 3
@@ -57,7 +57,7 @@ def test_a_limit_stops_it_and_a_raised_one_goes_on(type_in, file, tmp_path):
     assert len(list_runs(tmp_path / "runs")) == 12
 
 
-def test_a_limit_lets_the_runs_that_are_there_be_ended(type_in, file, tmp_path):
+def test_existing_runs_are_finished_despite_a_limit(type_in, file, tmp_path):
     type_in("run", str(file(limits={"runs": 3})), "--workers", "1", code=1)
     first = list_runs(tmp_path / "runs")[-1]
     first.recording.unlink()
@@ -67,7 +67,7 @@ def test_a_limit_lets_the_runs_that_are_there_be_ended(type_in, file, tmp_path):
     assert {run.status for run in list_runs(tmp_path / "runs")} == {"finished"}
 
 
-def test_a_disk_that_is_too_small_is_told_before_anything_runs(type_in, file, monkeypatch, tmp_path):
+def test_a_full_disk_is_reported_before_anything_runs(type_in, file, monkeypatch, tmp_path):
     with monkeypatch.context() as small:
         small.setattr(plan, "free_bytes", lambda _: 1000)
         said = type_in("run", str(file()), code=1).output
@@ -77,7 +77,7 @@ def test_a_disk_that_is_too_small_is_told_before_anything_runs(type_in, file, mo
     type_in("run", str(file()), "--workers", "1")  # it has not begun, so nothing is to be resumed
 
 
-def test_a_level_that_is_never_reached_is_never(type_in, file, tmp_path):
+def test_a_level_that_is_never_reached_is_printed_as_never(type_in, file, tmp_path):
     objective = {"metric": "success_percent", "at": "first_over", "level": 101, "direction": "minimize"}
     path = str(file(strategy="random", trials=1, seeds=[0], objective=objective))
     assert "never in trial 0" in type_in("run", path, "--workers", "1").stdout
@@ -89,18 +89,18 @@ def test_a_level_that_is_never_reached_is_never(type_in, file, tmp_path):
     assert "none of its 1 finished trials came to success_percent, first at 101" in plotted.output
 
 
-def test_an_unknown_sweep_is_told_with_the_nearest(type_in, file):
+def test_an_unknown_sweep_is_refused_with_the_nearest_name(type_in, file):
     assert "`dualtaxi sweep run FILE` starts one" in type_in("show", "smal", code=2).output
     type_in("run", str(file(limits={"runs": 1})), "--workers", "1", code=1)
     assert "Did you mean 'small'?" in type_in("show", "smal", code=2).output
 
 
-def test_a_misspelt_command_is_no_file(type_in):
+def test_a_misspelt_command_is_not_taken_for_a_file(type_in):
     assert "Did you mean 'show'?" in type_in("shwo", "small", code=2).output
     assert "nothing.yaml: no such file" in type_in("run", "nothing.yaml", code=2).output
 
 
-def test_what_ray_says_does_not_mix_with_the_results(type_in, file, monkeypatch):
+def test_output_of_ray_goes_to_stderr(type_in, file, monkeypatch):
     class Talking(Here):
         def __enter__(self):
             print("(raylet) A worker died")
@@ -110,17 +110,17 @@ def test_what_ray_says_does_not_mix_with_the_results(type_in, file, monkeypatch)
             pass
 
     monkeypatch.setattr(cluster, "RayWorkers", lambda *_: Talking())
-    told = type_in("run", str(file()), "--ray", "--json")
-    assert json.loads(told.stdout)["done"] == 12
-    assert "(raylet) A worker died" in told.stderr
+    reply = type_in("run", str(file()), "--ray", "--json")
+    assert json.loads(reply.stdout)["done"] == 12
+    assert "(raylet) A worker died" in reply.stderr
 
 
-def test_without_ray_it_is_told(type_in, file, monkeypatch):
+def test_a_missing_ray_is_reported(type_in, file, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     assert "[ray]" in type_in("run", str(file()), "--ray", code=2).output
     assert json.loads(type_in("ls", "--json").stdout) == {"sweeps": []}
 
 
 def test_where_there_are_no_sweeps_stdout_is_empty(type_in):
-    told = type_in("ls")
-    assert (told.stdout, told.stderr) == ("", "No sweeps yet. `dualtaxi sweep run FILE` starts one.\n")
+    reply = type_in("ls")
+    assert (reply.stdout, reply.stderr) == ("", "No sweeps yet. `dualtaxi sweep run FILE` starts one.\n")

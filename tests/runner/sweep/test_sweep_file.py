@@ -1,4 +1,4 @@
-"""A sweep file: what it means, and how its mistakes are told."""
+"""Sweep files and their errors."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ def refused(file, **changes):
     return str(caught.value)
 
 
-def test_a_sweep_is_its_own_plain_values_again(sweep):
+def test_a_sweep_survives_a_round_trip_as_plain_values(sweep):
     assert from_values(sweep.to_mapping()) == sweep
     assert sweep.base.recording.steps == "none"
     assert sweep.seeds == (0, 1)
 
 
-def test_a_base_is_found_from_the_file(tmp_path, file):
+def test_a_base_is_found_relative_to_the_file(tmp_path, file):
     from runner.config.document import write_yaml
 
     (tmp_path / "base.yaml").write_text(write_yaml(BASE))
     assert load_sweep(file(base="base.yaml")) == load_sweep(file())
 
 
-def test_an_unknown_parameter_is_told_with_its_place_and_the_nearest_name(file):
-    told = refused(file, parameters={"step_sise": [0.1], "discount": [0.9]})
-    assert "small.yaml:" in told
-    assert "step_sise: unknown key. Did you mean 'step_size'?" in told
+def test_an_unknown_parameter_is_reported_with_place_and_nearest_name(file):
+    reply = refused(file, parameters={"step_sise": [0.1], "discount": [0.9]})
+    assert "small.yaml:" in reply
+    assert "step_sise: unknown key. Did you mean 'step_size'?" in reply
 
 
 @pytest.mark.parametrize(
@@ -85,15 +85,15 @@ def test_an_unknown_parameter_is_told_with_its_place_and_the_nearest_name(file):
         ({"parameters": {"env.kwargs.is_slipery": [True]}}, "is_slipery"),
     ],
 )
-def test_a_mistake_is_told(file, changes, expected):
+def test_an_invalid_sweep_is_refused(file, changes, expected):
     assert expected.replace('."step_size"', ".step_size") in refused(file, **changes)
 
 
-def test_an_environments_reward_that_it_does_not_have_is_told_with_its_place(file):
+def test_an_unknown_reward_of_the_environment_is_reported_with_its_place(file):
     base = BASE | {"env": {"id": "dualtaxi:DualTaxi-v1"}}
-    told = refused(file, base=base, parameters={"env.kwargs.rewards.pick_up": [1, 2]})
-    assert "small.yaml:" in told
-    assert "did you mean 'pickup'" in told
+    reply = refused(file, base=base, parameters={"env.kwargs.rewards.pick_up": [1, 2]})
+    assert "small.yaml:" in reply
+    assert "did you mean 'pickup'" in reply
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
@@ -103,11 +103,11 @@ def test_a_shipped_sweep_can_be_run(path):
     assert plan.bytes > 10**6
 
 
-def test_what_is_shipped_is_found():
+def test_a_shipped_sweep_is_found_by_name():
     assert {"algorithms", "hyperparameters", "modes", "rewards"} <= {path.stem for path in SHIPPED}
 
 
-def test_an_objective_that_is_never_recorded_is_refused_with_what_there_is():
+def test_an_objective_that_is_never_recorded_is_refused_with_those_that_are():
     for metric, expected in (
         ("success_procent", "Did you mean 'success_percent'?"),
         ("exact.value", "evaluation: {exact: true}"),
@@ -117,7 +117,7 @@ def test_an_objective_that_is_never_recorded_is_refused_with_what_there_is():
         assert expected in str(caught.value)
 
 
-def test_defaults_that_follow_from_a_parameter_follow_in_each_trial(file):
+def test_defaults_that_depend_on_a_parameter_are_set_in_each_trial(file):
     base = BASE | {"env": {}}
     modes = {"mode": ["cooperative", "competitive"]}
     searched = load_sweep(file(strategy="grid", trials=None, base=base, parameters=modes))
@@ -126,7 +126,7 @@ def test_defaults_that_follow_from_a_parameter_follow_in_each_trial(file):
     assert from_values(searched.to_mapping()) == searched
 
 
-def test_an_exploration_that_the_base_names_holds_in_every_trial(file):
+def test_the_exploration_of_the_base_is_kept_in_every_trial(file):
     named = load_sweep(
         file(
             strategy="grid",
@@ -174,5 +174,5 @@ def test_parameters_of_one_algorithm_count_only_in_its_trials(file):
 
 
 def test_a_parameter_of_another_algorithm_than_the_base_names_is_refused(file):
-    told = refused(file, parameters={"hysteretic.decrease": [0.1, 0.2]})
-    assert "goes with algorithm: hysteretic_q_learning" in told
+    reply = refused(file, parameters={"hysteretic.decrease": [0.1, 0.2]})
+    assert "goes with algorithm: hysteretic_q_learning" in reply

@@ -1,4 +1,4 @@
-"""What mattered: the variance taken apart as it can be by hand, and found again from trials."""
+"""Importance: shares of variance that can be computed by hand, and their estimates from trials."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_variance_of_a_sum_is_that_of_its_terms():
     assert shares[0, 1] == pytest.approx(0.0)
 
 
-def test_of_an_exclusive_or_nothing_is_due_to_one_alone():
+def test_an_exclusive_or_has_no_main_effects():
     shares = shares_of_variance(np.array([[0.0, 1.0], [1.0, 0.0]]))
     assert shares == {(0,): 0.0, (1,): 0.0, (0, 1): 1.0}
     thrice = np.array([[[i ^ j ^ k for k in (0, 1)] for j in (0, 1)] for i in (0, 1)], float)
@@ -54,14 +54,14 @@ def test_main_effects_and_interactions_are_found_from_trials():
         assert 0 <= effect.low <= effect.share <= effect.high <= 1
 
 
-def test_of_too_few_trials_or_equal_ones_nothing_is_said():
+def test_too_few_or_equal_trials_have_no_effects():
     grid = [{"x": a, "y": b} for a, b in itertools.product((0, 1), repeat=2)]
     parameters = {"x": [0, 1], "y": [0, 1]}
     assert effects_of(parameters, grid[:3], [1.0, 2.0, 3.0]) == []
     assert effects_of(parameters, grid, [1.0] * 4) == []
 
 
-def test_a_whole_grid_is_taken_apart_exactly():
+def test_the_variance_of_a_whole_grid_is_decomposed_exactly():
     seed_values = [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.0, 0.9, 1.0], [0.0, 0.1, 0.0]]
     effects = {
         effect.parameters: effect for effect in effects_of_grid({"x": [0, 1], "y": [0, 1]}, seed_values)
@@ -71,7 +71,7 @@ def test_a_whole_grid_is_taken_apart_exactly():
     assert effects["x", "y"].low <= 1.0
 
 
-def test_a_forest_predicts_as_that_of_scikit_learn_does():
+def test_a_forest_equals_that_of_scikit_learn():
     from sklearn.ensemble import RandomForestRegressor
 
     rng = np.random.default_rng(3)

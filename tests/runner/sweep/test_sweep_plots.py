@@ -32,7 +32,7 @@ def typed(*words):
     return result
 
 
-def test_each_trial_stands_at_its_values(results, done):
+def test_each_trial_is_drawn_at_its_values(results, done):
     picture = picture_of(results)
     by_number = {trial.number: trial for trial in done[1].done}
     assert picture.trials[0].number == done[1].best().number
@@ -61,7 +61,7 @@ def test_a_pruned_trial_is_hollow(results):
     assert hollow([*kept, replace(last, state="pruned")]) == (1, True)
 
 
-def test_the_best_and_the_median_learn_as_their_runs_did(results, done):
+def test_the_learning_curves_are_those_of_the_runs(results, done):
     groups, panels = learning(results, done[0])
     best = next(group for group in groups if group.label.startswith("best"))
     assert {run.run_id for run in best.runs} == set(results.ranking[0].runs.values())
@@ -78,7 +78,7 @@ def test_a_sweep_is_drawn_by_its_name(done, tmp_path, suffix):
     assert output.stat().st_size > 10_000
 
 
-def test_the_page_of_a_sweep_stands_alone(done, results, tmp_path):
+def test_the_page_of_a_sweep_is_self_contained(done, results, tmp_path):
     output = tmp_path / "small.html"
     typed("report", "small", "-o", output, "--recordings", done[0])
     page = output.read_text()
@@ -90,7 +90,7 @@ def test_the_page_of_a_sweep_stands_alone(done, results, tmp_path):
     assert len(ids) == len(set(ids))
 
 
-def test_fresh_seeds_are_not_those_searched_even_at_the_end_of_their_range():
+def test_fresh_seeds_are_unused_also_at_the_end_of_their_range():
     assert fresh_seeds([5, 0, 7]) == list(range(8, 18))
     assert fresh_seeds([2**64 - 1, 1]) == [0, *range(2, 11)]
 
@@ -111,14 +111,14 @@ def test_the_best_configuration_is_that_of_the_best_trial_with_steps_and_fresh_s
     )
 
 
-def test_nothing_finished_is_nothing_to_draw(tmp_path):
+def test_a_sweep_without_finished_trials_cannot_be_drawn(tmp_path):
     sweep = from_values(described())
     state.begin(sweep, tmp_path, resume=False, accept_changes=False)
     with pytest.raises(RunnerError, match="no finished trial yet"):
         picture_of(results_of(sweep, tmp_path))
 
 
-def test_values_tried_again_are_shown_once(tmp_path):
+def test_duplicate_values_are_shown_once(tmp_path):
     sweep = from_values(described(strategy="random", trials=8, parameters={"discount": [0.5, 0.9]}))
     swept(tmp_path, sweep)
     results = results_of(sweep, tmp_path)
@@ -126,7 +126,7 @@ def test_values_tried_again_are_shown_once(tmp_path):
     assert sum(1 + len(entry.duplicates) for entry in results.ranking) == 8
 
 
-def test_a_level_never_reached_is_left_out_of_the_picture(tmp_path):
+def test_a_level_never_reached_is_not_drawn(tmp_path):
     objective = {
         "metric": "training.percent_filled",
         "at": "first_over",
@@ -140,7 +140,7 @@ def test_a_level_never_reached_is_left_out_of_the_picture(tmp_path):
         picture_of(results_of(sweep, tmp_path))
 
 
-def test_a_sweep_whose_runs_are_archived_is_still_all_there(tmp_path, monkeypatch):
+def test_a_sweep_of_archived_runs_is_complete(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     sweep, folder = from_values(described(strategy="random", trials=2, seeds=[0])), tmp_path / "runs"
     before, _ = swept(folder, sweep)

@@ -1,4 +1,4 @@
-"""A sweep on Ray: what it gives, and what a killed worker or a cluster that is not there do to it."""
+"""A sweep on Ray: its results, a killed worker, and an unreachable cluster."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, about its future
 
 
 def workers_of_ray():
-    """Return the processes in which a sweep's tasks are done; idle ones of Ray's are called otherwise."""
+    """Return the processes of a sweep's tasks; idle processes of Ray have other names."""
     return [p for p in psutil.Process().children(recursive=True) if "RayActor" in " ".join(p.cmdline())]
 
 
-def test_ray_gives_what_local_workers_give_also_when_one_is_killed(tmp_path):
+def test_ray_gives_the_results_of_local_workers_also_when_one_is_killed(tmp_path):
     base = described()["base"] | {"episodes": 60_000, "evaluation": {"every": 20_000, "trials": 5}}
     sweep = from_values(described(strategy="random", trials=3, seeds=[0, 1], base=base))
     killed = []
 
-    def kill_one(standing):
-        if not killed and standing.done >= 1 and standing.running == 2:
+    def kill_one(status):
+        if not killed and status.done >= 1 and status.running == 2:
             killed.append(workers_of_ray()[0].pid)
             os.kill(killed[0], signal.SIGKILL)
 
     with RayWorkers(2, None, 6) as workers:
-        trials, standing = swept(tmp_path / "ray", sweep, workers, report=kill_one)
+        trials, status = swept(tmp_path / "ray", sweep, workers, report=kill_one)
         impossible = Task("", 0, {}, "small", (), None, sweep.objective, run_id="none")  # a TypeError
         workers.give(impossible)
         assert workers.collect(60) == [(impossible, None)]
     assert killed
-    assert (standing.done, standing.failed) == (6, 0)
+    assert (status.done, status.failed) == (6, 0)
     assert len(list_runs(tmp_path / "ray")) == 6
     here, _ = swept(tmp_path / "here", sweep)
     assert digests(trials) == digests(here)
 
 
-def test_a_cluster_that_is_not_there_is_told():
+def test_an_unreachable_cluster_is_reported():
     with pytest.raises(RunnerError, match=r"no cluster at 127\.0\.0\.1:9"):
         RayWorkers(1, "127.0.0.1:9", 1)

@@ -1,4 +1,4 @@
-"""What is tried, what a run is worth, and when it is given up."""
+"""Suggested values, the value of a run, and pruning."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def searched(**changes):
     return Search(SweepFile.model_validate(described(**changes)))
 
 
-def test_a_grid_is_all_points_in_order():
+def test_a_grid_has_all_points_in_order():
     parameters = {"episodes": {"low": 1, "high": 6, "step": 2}, "discount": [0.5, 0.9]}
     search = searched(strategy="grid", trials=None, parameters=parameters)
     assert search.trials == 6
@@ -33,7 +33,7 @@ def test_a_grid_is_all_points_in_order():
     ]
 
 
-def test_a_range_goes_up_to_its_last_step_in_numbers_as_one_writes_them():
+def test_a_range_ends_at_its_last_step_in_decimal_arithmetic():
     parameters = {
         "discount": {"low": 0.7, "high": 0.9, "step": 0.1},
         "epsilon": {"low": 0, "high": 0.3, "step": 0.1},
@@ -52,7 +52,7 @@ def test_choices_may_be_of_any_kind():
 
 
 @pytest.mark.parametrize("strategy", ["random", "tpe", "genetic"])
-def test_the_same_told_gives_the_same_suggestions(strategy):
+def test_equal_results_give_equal_suggestions(strategy):
     def suggestions():
         search, asked = searched(strategy=strategy, trials=40, batch=5), []
         for _ in range(8):
@@ -67,7 +67,7 @@ def test_the_same_told_gives_the_same_suggestions(strategy):
     assert len({str(values) for values in first}) > 20
 
 
-def test_a_search_finds_what_is_better():
+def test_a_search_improves():
     search, tried = searched(trials=60), []
     for number in range(60):
         (values,) = search.ask(1)
@@ -87,21 +87,21 @@ def test_a_search_finds_what_is_better():
         ({"at": "first_over", "level": 90.0, "direction": "minimize"}, 1e100),
     ],
 )
-def test_what_a_run_is_worth(objective, expected):
+def test_the_value_of_a_run_at_each_moment(objective, expected):
     assert value_of(Objective(**objective), CURVE) == expected
 
 
-def test_a_run_without_readings_is_worth_nothing_known():
+def test_a_run_without_readings_has_no_value():
     assert math.isnan(value_of(Objective(), {}))
 
 
-def test_a_run_may_be_worse_than_the_share_that_is_said():
+def test_bounds_follow_the_percentile():
     curves = [{100: float(reading)} for reading in range(11)]
     assert pruning_bounds(Objective(), curves, 80.0) == {100: 2.0}
     assert pruning_bounds(Objective(direction="minimize"), curves, 80.0) == {100: 8.0}
 
 
-def test_a_run_is_hopeless_when_its_best_is_worse_than_most():
+def test_a_run_is_pruned_when_its_best_is_worse_than_most():
     up = Objective()
     limit = pruning_bounds(up, [CURVE, {0: 0.0, 100: 20.0, 200: 20.0}, {0: 0.0, 100: 60.0, 200: 10.0}], 50.0)
     assert limit == {0: 0.0, 100: 40.0, 200: 60.0, 300: 80.0}
@@ -114,7 +114,7 @@ def test_a_run_is_hopeless_when_its_best_is_worse_than_most():
 
 
 def test_exact_measures_belong_to_their_own_evaluation(done, monkeypatch):
-    """One that was lost in a repair leaves the others where they are."""
+    """A measure that was lost in a repair does not shift the others."""
     folder, *_ = done
     recording_path = next(folder.glob("*/recording.mcap"))
     measures = [
@@ -128,7 +128,7 @@ def test_exact_measures_belong_to_their_own_evaluation(done, monkeypatch):
         assert curve_of(recording, "exact.success_percent") == {20: 10.0, 40: 20.0, 60: 30.0}
 
 
-def test_tpe_tries_no_values_twice_while_there_are_others():
+def test_tpe_repeats_no_values_while_there_are_others():
     def tried(**changes):
         parameters = {"step_size": [0.1, 0.2, 0.3, 0.4], "discount": [0.5, 0.7, 0.9]}
         search = Search(from_values(described(trials=12, batch=4, parameters=parameters, **changes)).file)
@@ -144,7 +144,7 @@ def test_tpe_tries_no_values_twice_while_there_are_others():
     assert tried() == tried()
 
 
-def test_a_sweep_that_was_begun_before_goes_on_as_it_began(tmp_path):
+def test_an_old_sweep_without_repeats_may_repeat_values(tmp_path):
     sweep = from_values(described())
     state.begin(sweep, tmp_path, resume=False, accept_changes=False)
     stored = names.folder_of(sweep.name, tmp_path) / names.FILE

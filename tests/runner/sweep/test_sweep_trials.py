@@ -1,4 +1,4 @@
-"""A sweep gives the same whoever does it, however often it is cut off."""
+"""A sweep gives the same results with any workers and after any interruption."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from runner.sweep.running import run_sweep
 from runner.sweep.task import Task, move_whole
 
 
-def test_each_run_is_an_ordinary_one_tagged_with_the_sweep(done):
-    folder, trials, standing = done
-    assert (standing.done, standing.failed, standing.stopped) == (12, 0, "")
+def test_each_run_is_tagged_with_the_sweep(done):
+    folder, trials, status = done
+    assert (status.done, status.failed, status.stopped) == (12, 0, "")
     for trial in trials.done:
         for seed, result in trial.results.items():
             run = find_run(result.run_id, folder)
@@ -42,7 +42,7 @@ def test_each_run_is_an_ordinary_one_tagged_with_the_sweep(done):
             assert run.tags == ("sweep=small", f"trial={trial.number}")
 
 
-def test_a_run_is_what_it_would_be_alone_and_can_be_recorded_again(done, tmp_path):
+def test_a_run_equals_one_outside_of_the_sweep_and_can_be_rerecorded(done, tmp_path):
     folder, trials, _ = done
     trial = trials.done[3]
     config = from_mapping(trial.config, ["recording.steps=all"])
@@ -59,22 +59,20 @@ def test_the_number_of_workers_changes_nothing(count, done, sweep, tmp_path):
     assert digests(trials) == digests(done[1])
 
 
-def test_a_sweep_that_was_cut_off_twice_goes_on_as_if_it_never_had_been(done, sweep, tmp_path):
+def test_a_sweep_interrupted_twice_ends_like_an_undisturbed_one(done, sweep, tmp_path):
     first = Here(most=3)
-    _, standing = swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
-    assert standing.stopped == "interrupted"
+    _, status = swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
+    assert status.stopped == "interrupted"
     second = Here(most=4)
     swept(tmp_path, sweep, second, stop=lambda: second.done > 4)
     third = Here()
-    trials, standing = swept(tmp_path, sweep, third)
+    trials, status = swept(tmp_path, sweep, third)
     assert digests(trials) == digests(done[1])
     assert third.done == 12 - 3 - 4
     assert len(list_runs(tmp_path)) == 12
 
 
-def test_a_sweep_whose_unfinished_run_was_begun_by_other_code_is_refused_before_it_takes_another_course(
-    done, sweep, tmp_path, monkeypatch
-):
+def test_resuming_a_run_of_other_code_is_refused(done, sweep, tmp_path, monkeypatch):
     first = Here(most=3)
     swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
     before = len(list_runs(tmp_path))
@@ -89,14 +87,14 @@ def test_a_sweep_whose_unfinished_run_was_begun_by_other_code_is_refused_before_
     assert len(list_runs(tmp_path)) == 12
 
 
-def test_runs_recorded_elsewhere_are_moved_whole_and_gone_on_with(done, sweep, tmp_path):
+def test_runs_recorded_elsewhere_are_moved_and_resumed(done, sweep, tmp_path):
     class Elsewhere(Here):
         def give(self, task):
             super().give(replace(task, elsewhere=True))
 
     first = Elsewhere(most=3)
-    _, standing = swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
-    assert standing.stopped
+    _, status = swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
+    assert status.stopped
     begun = {run.run_id for run in list_runs(tmp_path)}
     assert {run.status for run in list_runs(tmp_path)} == {"finished", "interrupted"}
     trials, _ = swept(tmp_path, sweep, Elsewhere())
@@ -106,40 +104,40 @@ def test_runs_recorded_elsewhere_are_moved_whole_and_gone_on_with(done, sweep, t
     assert [path.name for path in tmp_path.glob(".*")] == [".sweeps"]
 
 
-def test_a_finished_sweep_is_not_done_again(done, sweep):
+def test_a_finished_sweep_runs_nothing(done, sweep):
     folder, trials, _ = done
     nobody = Here()
-    again, standing = swept(folder, sweep, nobody)
-    assert (nobody.done, standing.done) == (0, 12)
+    again, status = swept(folder, sweep, nobody)
+    assert (nobody.done, status.done) == (0, 12)
     assert digests(again) == digests(trials)
 
 
-def test_a_worker_that_dies_is_tried_once_more(done, sweep, tmp_path):
-    trials, standing = swept(tmp_path, sweep, Here(dying={2, 5}))
-    assert standing.failed == 0
+def test_the_task_of_a_dead_worker_is_retried(done, sweep, tmp_path):
+    trials, status = swept(tmp_path, sweep, Here(dying={2, 5}))
+    assert status.failed == 0
     assert digests(trials) == digests(done[1])
 
 
-def test_a_worker_that_dies_twice_is_told_and_the_sweep_goes_on(tmp_path):
+def test_a_task_whose_worker_dies_twice_fails_and_the_sweep_continues(tmp_path):
     sweep = from_values(described(strategy="random", seeds=[0]))
-    trials, standing = swept(tmp_path, sweep, Here(dying={1, 2}))
-    assert (standing.done, standing.failed) == (5, 1)
+    trials, status = swept(tmp_path, sweep, Here(dying={1, 2}))
+    assert (status.done, status.failed) == (5, 1)
     assert [trial.state for trial in trials.done] == ["failed", *["finished"] * 5]
     assert trials.done[0].errors == ["seed 0: its worker died twice"]
-    again, standing = swept(tmp_path, sweep)
-    assert (standing.begun, digests(again)) == (0, digests(trials))
+    again, status = swept(tmp_path, sweep)
+    assert (status.begun, digests(again)) == (0, digests(trials))
     assert len(results_of(sweep, tmp_path).ranking) == 6
     state.forget_failures("small", tmp_path)
-    _, standing = swept(tmp_path, sweep)
-    assert (standing.done, standing.failed, standing.begun) == (6, 0, 1)
+    _, status = swept(tmp_path, sweep)
+    assert (status.done, status.failed, status.begun) == (6, 0, 1)
 
 
-def test_a_killed_process_is_replaced_and_its_run_gone_on_with(tmp_path):
+def test_a_killed_process_is_replaced_and_its_run_resumed(tmp_path):
     base = described()["base"] | {"episodes": 400_000, "evaluation": {"every": 100_000, "trials": 5}}
     sweep = from_values(described(strategy="random", trials=2, seeds=[0], base=base))
     killed = []
 
-    def kill_one(standing):
+    def kill_one(status):
         workers = [p for p in multiprocessing.active_children() if p.name == "sweep-worker"]
         if not killed and any(run.recording.exists() for run in list_runs(tmp_path)):
             time.sleep(0.1)
@@ -147,15 +145,15 @@ def test_a_killed_process_is_replaced_and_its_run_gone_on_with(tmp_path):
             os.kill(workers[0].pid, signal.SIGKILL)
 
     with LocalWorkers(1) as workers:
-        trials, standing = swept(tmp_path, sweep, workers, report=kill_one)
+        trials, status = swept(tmp_path, sweep, workers, report=kill_one)
     assert killed
-    assert (standing.done, standing.failed) == (2, 0)
+    assert (status.done, status.failed) == (2, 0)
     assert len(list_runs(tmp_path)) == 2
     fresh, _ = swept(tmp_path / "fresh", sweep)
     assert digests(trials) == digests(fresh)
 
 
-def test_a_process_that_is_gone_before_its_task_comes_is_replaced(done, monkeypatch):
+def test_a_process_that_dies_before_its_task_is_replaced(done, monkeypatch):
     real, gone = local._Worker.ask, []
 
     def ask(worker, task):
@@ -178,7 +176,7 @@ def test_a_process_that_is_gone_before_its_task_comes_is_replaced(done, monkeypa
 
 
 @pytest.mark.parametrize("failing", [(".fresh",), (".fresh", ".old")])
-def test_a_run_that_cannot_be_moved_leaves_the_one_that_was_there(done, monkeypatch, tmp_path, failing):
+def test_a_run_that_cannot_be_moved_leaves_the_old_copy(done, monkeypatch, tmp_path, failing):
     run = list_runs(done[0])[0].folder
     shutil.copytree(run, tmp_path / run.name)
     real = Path.rename
@@ -196,15 +194,15 @@ def test_a_run_that_cannot_be_moved_leaves_the_one_that_was_there(done, monkeypa
     assert (left / "recording.mcap").read_bytes() == (run / "recording.mcap").read_bytes()
 
 
-def test_hopeless_runs_are_given_up_and_stay_so(tmp_path):
+def test_pruned_runs_stay_pruned(tmp_path):
     objective = {"metric": "training.percent_filled", "at": "last"}
     pruning = {"after": 20, "trials": 2, "percentile": 20}
     parameters = {"epsilon": [0.0, 1.0], "step_size": {"low": 0.1, "high": 1.0}}
     changes = {"trials": 12, "pruning": pruning, "objective": objective, "parameters": parameters}
     sweep = from_values(described(strategy="random", seeds=[0], **changes))
-    trials, standing = swept(tmp_path / "a", sweep)
+    trials, status = swept(tmp_path / "a", sweep)
     given_up = [trial for trial in trials.done if trial.state == "pruned"]
-    assert 0 < standing.pruned == len(given_up) < 12
+    assert 0 < status.pruned == len(given_up) < 12
     run = find_run(given_up[0].results[0].run_id, tmp_path / "a")
     assert run.status == "interrupted"
     assert "pruned" in read_labels(run.folder).tags
@@ -215,16 +213,16 @@ def test_hopeless_runs_are_given_up_and_stay_so(tmp_path):
     assert {entry.state for entry in ranking(sweep, trials.done)[-len(given_up) :]} == {"pruned"}
 
 
-def test_two_trials_that_want_one_job_share_its_run(tmp_path):
+def test_two_trials_of_one_job_share_its_run(tmp_path):
     sweep = from_values(described(strategy="random", trials=8, parameters={"discount": [0.5, 0.9]}))
     workers = Here()
-    _, standing = swept(tmp_path, sweep, workers)
+    _, status = swept(tmp_path, sweep, workers)
     assert workers.done == 4
-    assert standing.done == 16
-    assert standing.bytes == sum(run.recording.stat().st_size for run in list_runs(tmp_path))
+    assert status.done == 16
+    assert status.bytes == sum(run.recording.stat().st_size for run in list_runs(tmp_path))
 
 
-def test_values_that_do_not_go_together_are_left_out(tmp_path):
+def test_contradictory_values_are_excluded(tmp_path):
     base = described()["base"] | {"env": {"id": "dualtaxi:DualTaxi-v1"}, "mode": "competitive", "episodes": 2}
     parameters = {
         "mode": ["competitive", "cooperative"],
@@ -233,15 +231,15 @@ def test_values_that_do_not_go_together_are_left_out(tmp_path):
     sweep = from_values(
         described(strategy="grid", trials=None, seeds=[0], base=base, parameters=parameters, objective={})
     )
-    trials, standing = swept(tmp_path, sweep)
+    trials, status = swept(tmp_path, sweep)
     assert [trial.state for trial in trials.done] == ["finished", "finished", "finished", "excluded"]
     assert "found tables: joint" in trials.done[3].errors[0]
-    assert (standing.runs, standing.done, standing.failed, standing.excluded) == (3, 3, 0, 1)
+    assert (status.runs, status.done, status.failed, status.excluded) == (3, 3, 0, 1)
     assert plan_of(sweep).excluded == 1
     assert "found tables: joint" in str(sections(results_of(sweep, tmp_path)))
 
 
-def test_a_changed_sweep_is_refused_with_what_changed(sweep, tmp_path):
+def test_a_changed_sweep_is_refused_with_its_changes(sweep, tmp_path):
     state.begin(sweep, tmp_path, resume=False, accept_changes=False)
     changed = from_values(described(trials=9, seeds=[0, 2], limits={"runs": 3}))
     with pytest.raises(RunnerError, match="trials: 6, now 9") as caught:
@@ -252,7 +250,7 @@ def test_a_changed_sweep_is_refused_with_what_changed(sweep, tmp_path):
     assert state.read_sweep("small", tmp_path) == changed
 
 
-def test_two_of_one_name_and_two_at_once_are_refused(sweep, tmp_path):
+def test_a_second_sweep_of_a_name_and_a_second_process_are_refused(sweep, tmp_path):
     state.begin(sweep, tmp_path, resume=False, accept_changes=False)
     with pytest.raises(RunnerError, match="--resume continues it"):
         state.begin(sweep, tmp_path, resume=False, accept_changes=False)
