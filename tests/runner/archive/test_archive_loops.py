@@ -1,8 +1,9 @@
-"""Somebody's own loops in an archive: all that they recorded comes back, and columns tell it."""
+"""Archives of users' own loops: everything is restored, and columns have all values."""
 
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import gymnasium
@@ -14,7 +15,8 @@ from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
 
 import runner
-from runner.archive import layout
+from runner.archive import layout, places
+from runner.archive.manifest import Manifest, entries_of, read_manifest
 from runner.archive.restoring import check, restore
 from runner.errors import RecordingError
 from runner.execution.verify import verify
@@ -262,3 +264,29 @@ def test_memory_does_not_grow_with_the_size_of_values(tmp_path):
     about = pq.ParquetFile(folder / layout.STEPS).metadata
     assert about.num_row_groups > 1
     check(folder)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the memory limit is the system's")
+def test_a_value_that_unpacks_to_more_than_the_memory_limit_is_refused(tmp_path, monkeypatch):
+    """300 MB of zeros in one value, which take a few kilobytes in the file."""
+    recording = with_everything(make("FrozenLake-v1"), tmp_path)
+    folder = archived(recording, tmp_path / "archive")
+    tables = pq.read_table(folder / layout.ARRAYS)
+    data = pa.array([b"\0" * (300 << 20), *tables["data"].to_pylist()[1:]], pa.binary())
+    place = tables.schema.get_field_index("data")
+    bomb = tables.set_column(place, "data", data)
+    pq.write_table(
+        bomb, folder / layout.ARRAYS, compression="zstd", use_dictionary=False, write_statistics=False
+    )
+    assert (folder / layout.ARRAYS).stat().st_size < 1 << 20
+    manifest = read_manifest((folder / layout.MANIFEST).read_bytes(), "")
+    forged = Manifest(manifest.run, manifest.topics, entries_of(folder))
+    (folder / layout.MANIFEST).write_bytes(forged.to_json())
+    monkeypatch.setattr(places, "MEMORY_BYTES", 256 << 20)
+    with pytest.raises(RecordingError, match=r"needs more than 0\.25 GiB of memory"):
+        places.restore_to(folder, tmp_path / "back.mcap", manifest.digest, lambda _: None)
+    assert not (tmp_path / "back.mcap").exists()
+    steps = []
+    unharmed = archived(recording, tmp_path / "unharmed")
+    places.restore_to(unharmed, tmp_path / "back.mcap", manifest.digest, steps.append)
+    assert steps[-1] == 120

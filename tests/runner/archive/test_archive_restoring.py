@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from runner.archive import layout, places
-from runner.archive.manifest import Entry, Manifest, entries_of, read_manifest
+from runner.archive import layout
+from runner.archive.manifest import Entry, Manifest, entries_of
 from runner.archive.reading import Archive
 from runner.archive.restoring import check, restore
 from runner.archive.runs import archive_run
@@ -226,30 +226,6 @@ def test_rows_without_end_are_refused_before_they_are_read(archive, tmp_path):
     sealed(folder, with_as_many)
     with pytest.raises(RecordingError, match="made to exhaust the disk"):
         check(folder)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="the memory limit is the system's")
-def test_a_value_that_unpacks_to_more_than_the_memory_limit_is_refused(archive, tmp_path, monkeypatch):
-    """400 MB of zeros in one value, which take a few kilobytes in the file."""
-    tables = pq.read_table(archive / layout.Q_TABLES)
-    data = [b"\0" * (400 << 20)] + [None] * (len(tables) - 1)
-    folder = forged(
-        archive,
-        tmp_path / "bomb",
-        layout.Q_TABLES,
-        with_column(tables, "data", pa.array(data, pa.binary())),
-        compression="zstd",
-        use_dictionary=False,
-    )
-    assert (folder / layout.Q_TABLES).stat().st_size < 1 << 20
-    monkeypatch.setattr(places, "MEMORY_BYTES", 384 << 20)
-    digest = read_manifest((folder / layout.MANIFEST).read_bytes(), "").digest
-    with pytest.raises(RecordingError, match=r"needs more than 0\.375 GiB of memory"):
-        places.restore_to(folder, tmp_path / "back.mcap", digest, lambda _: None)
-    assert not (tmp_path / "back.mcap").exists()
-    steps = []
-    places.restore_to(archive, tmp_path / "back.mcap", digest, steps.append)
-    assert steps[-1] == len(pq.read_table(archive / layout.STEPS, columns=["step"]))
 
 
 @pytest.mark.parametrize("name", ["../outside", "/etc/passwd", "a\\b", "c:d", "."])

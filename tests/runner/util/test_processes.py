@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
 
 import pytest
 
 from runner.errors import RecordingError
-from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, TimedOut
+from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, TimedOut, report_progress
 
 MEMORY = 256 << 20
 
 
 def refuse(path):
     raise RecordingError(f"{path} is damaged.")
+
+
+def count(number):
+    for k in range(number):
+        report_progress(k)
+    return number
 
 
 @pytest.fixture
@@ -40,3 +48,21 @@ def test_a_call_that_exceeds_a_limit_or_ends_the_process_is_an_error_of_its_own(
 ):
     with pytest.raises(error):
         child.call(function, 5, argument)
+
+
+def test_progress_reaches_the_caller():
+    seen = []
+    with ChildProcess(MEMORY, on_progress=seen.append) as child:
+        assert child.call(count, 60, 3) == 3
+    assert seen == [0, 1, 2]
+
+
+def test_a_script_need_not_guard_its_statements(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from runner.util.processes import ChildProcess\n"
+        "with ChildProcess(1 << 28) as child:\n"
+        "    print(child.call(sum, 60, [1, 2]))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.stdout, done.stderr) == ("3\n", "")
