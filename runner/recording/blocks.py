@@ -1,9 +1,9 @@
 """Message records as NumPy arrays.
 
-The messages that come by the million (`Step`, `Episode`) use fixed-width fields only and write each of
-them, zeros too, so that a message has one size in a channel: a run of whole MCAP message records is then
-a NumPy array of one dtype, the same in the kernel's output, in the file's chunks and in the reader's
-hands, and a standard protobuf parser still reads each message.
+The most frequent messages (`Step`, `Episode`) use fixed-width fields only and write each of them, zeros too,
+so that all messages of a channel have one size: consecutive MCAP message records are then a NumPy array of
+one dtype, which the kernel fills, the file stores and the reader returns, and a standard protobuf parser
+still reads each message.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _FIXED: Final[dict[int, tuple[str, int]]] = {
 }
 """Kind of a field of fixed width -> its dtype, and protobuf's wire type."""
 _DELIMITED: Final = 2
-"""The wire type of what has its length before it: bytes, and packed fields."""
+"""The wire type of fields that their length precedes: bytes, and packed fields."""
 
 Sizes = tuple[int | np.dtype[Any], ...]
-"""What is not fixed by the format: the elements of each repeated field, the dtype of each bytes field."""
+"""The sizes that depend on the run: elements of each repeated field, the dtype of each bytes field."""
 
 HEADER: Final = [
     ("opcode", "u1"),
@@ -44,7 +44,7 @@ HEADER: Final = [
 
 HEADER_BYTES: Final = np.dtype(HEADER).itemsize
 RECORD_HEAD: Final = struct.Struct("<BQ")
-"""What any MCAP record begins with: opcode, and the length of its body."""
+"""The head of any MCAP record: opcode, and the length of its body."""
 MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 """`HEADER` for one message: opcode, length, channel, sequence, log time, publish time."""
 
@@ -126,7 +126,7 @@ def block_counts(
     action: np.dtype[Any] | None = None,
     observation: np.dtype[Any] | None = None,
 ) -> Sizes:
-    """Return what `record_dtype` must know of a topic in a run.
+    """Return the sizes of a topic in a run, as `record_dtype` takes them.
 
     Args:
         topic: one of `ALL_BLOCK_TOPICS`.

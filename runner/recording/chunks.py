@@ -1,7 +1,7 @@
 """A chunk of one topic: whole message records in, the bytes of an MCAP chunk and its index out, and back.
 
-Encoding is pure and releases the interpreter lock where it counts (checksum, compression), so that
-several threads can do it beside the one that learns.
+Encoding has no side effects and releases the interpreter lock for checksum and compression, so that several
+threads can encode while another one learns.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from runner.util.packing import MAX_CHUNK_STEPS, Packing
 MAX_CHUNK_BYTES: Final = 64 << 20
 """The largest chunk that is read, packed or unpacked; the recorder's are below 16 MiB."""
 _PLAIN_BYTES: Final = 4 << 20
-"""Chunks of up to this size are unpacked without a look at their first message."""
+"""Chunks of up to this size are unpacked without checking their first message."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, size unpacked, its CRC, and the length of the name of the compression."""
 _NAME_BYTES: Final = 4
@@ -34,7 +34,7 @@ _NAME_BYTES: Final = 4
 
 @dataclass(frozen=True)
 class Chunk:
-    """An encoded chunk: its MCAP records, and what the summary says of them."""
+    """An encoded chunk: its MCAP records, and its entry in the summary."""
 
     record: bytes
     index: bytes
@@ -104,8 +104,8 @@ def _compress(records: bytes | memoryview, packing: Packing) -> bytes:
 def _zstd_parameters(level: int) -> zstandard.ZstdCompressionParameters:
     """Return the level's parameters; for the quick ones with tables that suit fixed-width records.
 
-    What matches is nearly always the record before: a table of 2**12 entries finds it, stays in the
-    first-level cache, and is not cleared in vain for each chunk. Matches of 4 bytes are worth having.
+    The match is nearly always the record before: a table of 2**12 entries finds it, stays in the first-level
+    cache, and costs little to clear for each chunk. Matches of 4 bytes are worth having.
     """
     if level in (3, 4):
         return zstandard.ZstdCompressionParameters.from_level(level, hash_log=12, chain_log=12, min_match=4)
@@ -114,7 +114,7 @@ def _zstd_parameters(level: int) -> zstandard.ZstdCompressionParameters:
 
 @dataclass(frozen=True)
 class ChunkHead:
-    """What a chunk's record says before its data."""
+    """The fields of a chunk record before its data."""
 
     start_time: int
     end_time: int
@@ -126,7 +126,7 @@ class ChunkHead:
 
 
 def chunk_head(body: bytes | memoryview, length: int, where: str) -> ChunkHead:
-    """Return what a chunk says of itself.
+    """Return the head of a chunk record.
 
     Args:
         body: the body of the record, or its first 60 bytes.
@@ -154,7 +154,7 @@ def chunk_head(body: bytes | memoryview, length: int, where: str) -> ChunkHead:
 
 
 def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes]:
-    """Return what a chunk says of itself and its message records, after comparing their checksum.
+    """Return the head of a chunk and its message records, after comparing their checksum.
 
     Raises:
         RecordingError: it is damaged, or larger than any chunk of ours.
@@ -170,10 +170,10 @@ def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes
 
 
 def _refuse_many(body: memoryview, head: ChunkHead, where: str) -> None:
-    """Refuse a chunk that would hold more messages than any of ours, by its first message alone.
+    """Refuse a chunk that holds more messages than any of ours, judged by its first message alone.
 
     A few kilobytes can unpack to the largest chunk there is; thousands of them would keep a reader busy for
-    minutes before their messages were seen to make no sense.
+    minutes before their messages were found to make no sense.
 
     Raises:
         RecordingError: it is one, or holds no message.
@@ -188,7 +188,7 @@ def _refuse_many(body: memoryview, head: ChunkHead, where: str) -> None:
 
 
 def first_channel(body: bytes | memoryview, where: str) -> int:
-    """Return the channel of a chunk's first message, unpacking no more than that.
+    """Return the channel of a chunk's first message; only that is unpacked.
 
     Raises:
         RecordingError: it is damaged, or holds no message.
@@ -218,7 +218,7 @@ def decompress(data: bytes | memoryview, compression: str, size: int, where: str
 
 
 def _unpack(data: bytes | memoryview, compression: str, size: int, where: str) -> tuple[bytes, bool]:
-    """Return the first `size` bytes, and whether there are more; fewer if there are not so many."""
+    """Return the first `size` bytes, or all if there are fewer, and whether there are more."""
     try:
         if compression == "zstd":
             return _unpack_zstd(data, size)

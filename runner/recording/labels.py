@@ -1,9 +1,9 @@
-"""What people say of a run: another name, tags, a note.
+"""The labels that users give a run: another name, tags, a note.
 
     recordings/k3v9m2xq/labels.json      {"name": "patient", "tags": ["keep"], "note": "the one of figure 3"}
 
-It stands beside `run.json`, which its owner rewrites while it trains, so that the two never meet. It is
-replaced whole, under a lock.
+They are in a file of their own, because the owner of a run rewrites `run.json` while it trains. The file is
+replaced atomically, under a lock.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from runner.util.values import is_utf8
 LABELS_FILE: Final = "labels.json"
 LOCK_FILE: Final = "labels.lock"
 KEEP: Final = "keep"
-"""The tag of a run that is not to be removed."""
+"""The tag of a run that must not be removed."""
 MAX_LABELS_BYTES: Final = 1 << 20
 MAX_NOTE: Final = 10_000
 MAX_TAGS: Final = 100
@@ -33,26 +33,25 @@ TAG_EXPECTED: Final = "1 to 64 letters, digits or any of _ . - = + / @, the firs
 
 @dataclass(frozen=True)
 class Labels:
-    """What people say of a run."""
+    """The labels of a run."""
 
     name: str = ""
-    """What it is called now; empty if as in the beginning."""
+    """The current name; empty if it is the first one."""
     tags: tuple[str, ...] = ()
-    """In alphabetical order, each once."""
+    """In alphabetical order, without duplicates."""
     note: str = ""
 
 
 def read_labels(folder: Path) -> Labels:
-    """Return what is said of the run in a folder; what cannot be understood counts as not said."""
+    """Return the labels of the run in a folder; invalid ones are ignored."""
     try:
-        found = read_object(folder / LABELS_FILE, MAX_LABELS_BYTES)
+        return labels_from(read_object(folder / LABELS_FILE, MAX_LABELS_BYTES))
     except (OSError, ValueError):
         return Labels()
-    return labels_from(found)
 
 
 def are_readable(folder: Path) -> bool:
-    """Return whether it can be known what is said of the run in a folder: a damaged file may say `keep`."""
+    """Return whether the labels of the run in a folder can be read: a damaged file may contain `keep`."""
     try:
         return isinstance(read_object(folder / LABELS_FILE, MAX_LABELS_BYTES).get("tags", []), list)
     except FileNotFoundError:
@@ -61,23 +60,23 @@ def are_readable(folder: Path) -> bool:
         return False
 
 
-def labels_from(found: Mapping[str, Any]) -> Labels:
-    """Return what is said by a JSON object; what cannot be understood counts as not said."""
-    name, tags, note = found.get("name"), found.get("tags"), found.get("note")
-    sound = [tag for tag in tags if is_tag(tag)] if isinstance(tags, list) else []
+def labels_from(values: Mapping[str, Any]) -> Labels:
+    """Return the labels in a JSON object; invalid ones are ignored."""
+    name, tags, note = values.get("name"), values.get("tags"), values.get("note")
+    valid = {tag for tag in tags if _is_tag(tag)} if isinstance(tags, list) else set()
     return Labels(
         name if isinstance(name, str) and name.isprintable() and len(name) <= 100 else "",
-        tuple(sorted(set(sound))[:MAX_TAGS]),
+        tuple(sorted(valid)[:MAX_TAGS]),
         note[:MAX_NOTE] if isinstance(note, str) else "",
     )
 
 
 def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
-    """Change what is said of the run in a folder, and return it; other processes wait meanwhile.
+    """Change the labels of the run in a folder, under a lock, and return them.
 
     Args:
         folder: the run's.
-        change: gets what is said, and returns what is to be said.
+        change: takes the current labels and returns the new ones.
 
     Raises:
         RunnerError: there are too many tags, or the note is too long.
@@ -100,14 +99,19 @@ def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
             ) from error
 
 
-def is_tag(text: Any) -> bool:
-    """Return whether this can be a tag."""
+def as_json(labels: Labels) -> dict[str, Any]:
+    """Return labels as the contents of their file; empty ones are left out."""
+    values = {"name": labels.name, "tags": list(labels.tags), "note": labels.note}
+    return {key: value for key, value in values.items() if value}
+
+
+def _is_tag(text: Any) -> bool:
     return isinstance(text, str) and _TAG.fullmatch(text) is not None
 
 
 def _check(labels: Labels) -> None:
     for tag in labels.tags:
-        if not is_tag(tag):
+        if not _is_tag(tag):
             raise RunnerError(f"tag: found {tag!r}, expected {TAG_EXPECTED}.")
     if len(labels.tags) > MAX_TAGS:
         raise RunnerError(f"tag: found {len(labels.tags)} tags, expected at most {MAX_TAGS}.")
@@ -115,9 +119,3 @@ def _check(labels: Labels) -> None:
         raise RunnerError(f"note: found {labels.note[:100]!r}, expected text in UTF-8.")
     if len(labels.note) > MAX_NOTE:
         raise RunnerError(f"note: found {len(labels.note):,} characters, expected at most {MAX_NOTE:,}.")
-
-
-def as_json(labels: Labels) -> dict[str, Any]:
-    """Return labels as their file has them; what is not said is left out."""
-    told = {"name": labels.name, "tags": list(labels.tags), "note": labels.note}
-    return {key: value for key, value in told.items() if value}

@@ -1,4 +1,4 @@
-"""Which process a run belongs to, and whether it still lives."""
+"""The process that owns a run, and whether it is alive."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HEARTBEAT_SECONDS: Final = 15.0
 
 
 def owner() -> dict[str, Any]:
-    """Return who this process is: host, boot, process id and its start."""
+    """Return the identity of this process: host, boot, process id and start."""
     pid = os.getpid()
     return {
         "host": socket.gethostname(),
@@ -28,35 +28,35 @@ def owner() -> dict[str, Any]:
     }
 
 
-def lives(owner: Mapping[str, Any], heart: Path) -> bool:
-    """Return whether an owner lives: its process, if it is of this machine; else its heart's last beat.
+def lives(owner: Mapping[str, Any], heartbeat: Path) -> bool:
+    """Return whether an owner is alive: its process, if it is on this machine; else by its last heartbeat.
 
     Args:
-        owner: who it said it is.
-        heart: the file whose time of change is set at each beat.
+        owner: its identity.
+        heartbeat: the file whose modification time is set at each heartbeat.
     """
     if owner.get("host") == socket.gethostname() and owner.get("boot_id") == boot_id():
         started = process_start(owner.get("pid", 0))
         return started is not None and started == owner.get("process_started")
     with contextlib.suppress(OSError):
-        return time.time() - heart.stat().st_mtime < HEARTBEAT_SECONDS
+        return time.time() - heartbeat.stat().st_mtime < HEARTBEAT_SECONDS
     return False
 
 
 def is_owned(folder: Path) -> bool:
-    """Return whether a living process is at the run in a folder, as its `run.json` says."""
+    """Return whether a living process owns the run in a folder, according to its `run.json`."""
     try:
         facts = read_object(folder / "run.json", _MAX_BYTES)
     except (OSError, ValueError):
         return False
     process = facts.get("owner")
-    if facts.get("status") != "running" or not isinstance(process, dict):
-        return False
-    return lives(process, folder / "run.json")
+    return (
+        facts.get("status") == "running" and isinstance(process, dict) and lives(process, folder / "run.json")
+    )
 
 
 def boot_id() -> str:
-    """Return what tells this start of the machine from any other."""
+    """Return an identifier of this boot of the machine."""
     with contextlib.suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     import psutil
@@ -65,20 +65,17 @@ def boot_id() -> str:
 
 
 def process_start(pid: int) -> float | None:
-    """Return when a process began; None if there is none. To be compared within one start of the machine.
+    """Return when a process started, comparable within one boot of the machine; None if there is none.
 
-    On Linux it is counted in ticks since the machine started, so that setting the clock changes nothing.
+    On Linux it is counted in ticks since the boot, so that setting the clock changes nothing.
     """
     if not isinstance(pid, int) or isinstance(pid, bool):
-        return None  # a file may say anything
-    try:
+        return None  # a file may contain anything
+    with contextlib.suppress(OSError, ValueError, IndexError):
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return None if fields[0] == "Z" else float(fields[19])
-    except (OSError, ValueError, IndexError):
-        return None if Path("/proc/self/stat").exists() else _process_start_elsewhere(pid)
-
-
-def _process_start_elsewhere(pid: int) -> float | None:
+    if Path("/proc/self/stat").exists():
+        return None
     import psutil
 
     try:

@@ -1,7 +1,7 @@
-"""What `run.json` and a recording's result say of a run, parsed once into typed records.
+"""The contents of `run.json` and of a recording's result, parsed once into typed records.
 
-Anyone may have written either of them. What does not fit is left out of the record and named in a
-problem, so that nothing after this has to doubt a type.
+Anyone may have written either of them. An invalid value is left out of the record and named in a problem, so
+that no other code has to check types.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Check(NamedTuple):
 
 @dataclass(frozen=True)
 class EvaluationMetrics:
-    """The figures of an evaluation that people quote; None if it does not know one."""
+    """The figures of an evaluation that people quote; None if one is unknown."""
 
     episode: int | None = None
     """Training episodes before it."""
@@ -62,7 +62,7 @@ class RecentTraining:
 
 @dataclass(frozen=True, eq=False)
 class Summary(Mapping[str, Any]):
-    """How a run ended, as its owner wrote it; also a mapping of the JSON values that were there and fit."""
+    """How a run ended, as its owner wrote it; also a mapping of the valid JSON values."""
 
     status: str | None = None
     """In a recording's result only."""
@@ -106,7 +106,7 @@ class ArchiveReference:
     """Path or URL of the archive; empty if the run was never archived."""
     digest: str = ""
     done: Summary = field(default_factory=Summary)
-    """How far the run came, if it did not come to its end."""
+    """How far the run got, if it was not finished."""
 
     def __bool__(self) -> bool:
         return bool(self.target)
@@ -125,20 +125,20 @@ class RunFile:
     """In UTC."""
     owner: Mapping[str, Any]
     config: Mapping[str, Any]
-    """As it was written: nothing but its depth is checked."""
+    """As it was written: only its depth is checked."""
     summary: Summary
     archive: ArchiveReference
     provenance: Mapping[str, str]
     proof: str | None
-    """The content digest that the run must come to again."""
+    """The content digest that the run must have again."""
     recording: str | None
-    """The name of the recording, if that stands alone."""
+    """The name of the recording, if it is not in a folder of its own."""
     problems: tuple[str, ...] = ()
-    """What does not fit, a sentence each without its full stop."""
+    """The invalid values, a sentence each without its full stop."""
 
 
 def parse_run_file(stated: Mapping[str, Any]) -> RunFile:
-    """Return the contents of a `run.json`; what does not fit is named in `problems`.
+    """Return the contents of a `run.json`; invalid values are named in `problems`.
 
     Args:
         stated: the JSON object; its `run_id` must be one.
@@ -167,12 +167,12 @@ def parse_run_file(stated: Mapping[str, Any]) -> RunFile:
 
 
 def parse_summary(stated: Mapping[str, Any], where: str, problems: list[str]) -> Summary:
-    """Return a summary, or a recording's result; what does not fit is left out.
+    """Return a summary, or a recording's result; invalid values are left out.
 
     Args:
         stated: the JSON object.
-        where: what its keys are within, for problems: `summary.`.
-        problems: gets a line for each value that does not fit.
+        where: the prefix of its keys in problems, such as `summary.`.
+        problems: a line is appended for each invalid value.
     """
     if not where and is_too_deep(stated):
         problems.append(f"found values nested more than {MAX_DEPTH} deep")
@@ -209,7 +209,7 @@ def is_too_deep(value: Any, depth: int = 0) -> bool:
 def _fitting(
     stated: Mapping[str, Any], checks: Mapping[str, Check], where: str, problems: list[str]
 ) -> dict[str, Any]:
-    """Return the values that fit, and those that there is no check for; name the others."""
+    """Return the valid values, and those without a check; name the others in `problems`."""
     known = {}
     for key, value in stated.items():
         check = checks.get(key)

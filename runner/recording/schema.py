@@ -1,6 +1,6 @@
-"""The recording format, stated once: topics, messages, fields, times and the version.
+"""The recording format, defined once: topics, messages, fields, times and the version.
 
-Every message is protobuf; `blocks` says how those that come by the million stand in the file.
+Every message is protobuf; `blocks` defines how the most frequent ones are laid out in the file.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ _BOOL, _BYTES, _STRING = Pb.TYPE_BOOL, Pb.TYPE_BYTES, Pb.TYPE_STRING
 _DOUBLE, _FIXED32, _SFIXED64 = Pb.TYPE_DOUBLE, Pb.TYPE_FIXED32, Pb.TYPE_SFIXED64
 _FIXED64 = Pb.TYPE_FIXED64
 
-# The order of the fields is the one that compresses best: what changes together stands together.
+# The order of the fields is the one that compresses best: fields that change together are adjacent.
 STEP = MessageType(
     "Step",
     (
@@ -289,7 +289,7 @@ LOOP_TOPICS: Final = {
         EVAL_RESET_VARIABLE,
     ),
 }
-"""What a recording of somebody's own loop has in this place, by the kind of its spaces."""
+"""The topics of steps and resets in the recording of a loop, by the kind of its spaces."""
 _LOOP_ANYWAY: Final = (
     *(TRAIN_EPISODE, EVAL_EPISODE, TRAIN_INFO, EVAL_INFO),
     *(SCALAR_TOPIC, ARRAY_TOPIC, TRAIN_FRAME, EVAL_FRAME, LOG_TOPIC),
@@ -298,7 +298,7 @@ KINDS: Final = {
     "job": TOPICS,
     **{kind: (*topics, *_LOOP_ANYWAY) for kind, topics in LOOP_TOPICS.items()},
 }
-"""Kind of a recording, as its metadata record `run` says it, to its topics."""
+"""The topics of each kind of recording, as the metadata record `run` names it."""
 ALL_TOPICS: Final = tuple(
     sorted({topic for topics in KINDS.values() for topic in topics}, key=lambda topic: topic.channel)
 )
@@ -310,7 +310,7 @@ MESSAGES: Final = tuple(dict.fromkeys(topic.message for topic in ALL_TOPICS))
 """Every message; the id of a schema is its place here, from 1."""
 
 BLOCK_TOPICS: Final = (TRAIN_STEP, EVAL_STEP, TRAIN_EPISODE, EVAL_EPISODE)
-"""Topics of a job whose messages have one size: read and written as blocks."""
+"""The topics of a job whose messages have one size: read and written as blocks."""
 ALL_BLOCK_TOPICS: Final = (
     *BLOCK_TOPICS,
     *(TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET),
@@ -319,9 +319,9 @@ ALL_BLOCK_TOPICS: Final = (
 PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_EPISODE)}
 """The step and the episode topic of each phase of a job."""
 PHASE_NAMES: Final = {"train": "training", "eval": "evaluation"}
-"""The phases in words."""
+"""The phases as texts name them."""
 
 NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", TRANSITION: "step", RESET: "reset"}
 """The field that numbers the messages of a fixed-width topic, from 0."""
 NEVER: Final = 2**32 - 1
-"""The `t` of a step in which a vector environment only reset one of its environments."""
+"""The `t` of a step at which a vector environment only reset one of its environments."""

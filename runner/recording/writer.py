@@ -1,7 +1,7 @@
-"""The MCAP file being written: records in order, and what the summary will say of them.
+"""The MCAP file being written: records in order, and the entries of its summary.
 
-The `mcap` library lays out every record but two: chunks and message indexes come ready-made as bytes
-(see `chunks`), since they are what a recording consists of.
+The `mcap` library lays out every record but chunks and message indexes, which `chunks` encodes: nearly all
+of a recording consists of them.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LIBRARY = f"dualtaxi {__version__}"
 
 
 class RecordingFile:
-    """A recording on its way to disk: append, then `finish`. Not thread-safe."""
+    """A recording that is written: append records, then `finish`. Not thread-safe."""
 
     def __init__(self, path: Path, topics: Sequence[Topic] = TOPICS) -> None:
         """Create the file; one that exists is never overwritten.
@@ -81,11 +81,11 @@ class RecordingFile:
 
     @classmethod
     def reopen(cls, path: Path, contents: Contents) -> RecordingFile:
-        """Open a recording to go on with it: what follows its last whole chunk is cut off.
+        """Open a recording to resume it: what follows its last whole chunk is cut off.
 
         Args:
             path: the recording.
-            contents: what of it is good, as `contents.survey` found.
+            contents: its good records, as `integrity.survey` found them.
 
         Raises:
             OSError: it cannot be written.
@@ -98,7 +98,7 @@ class RecordingFile:
 
     @classmethod
     def inspect(cls, path: Path, contents: Contents) -> RecordingFile:
-        """Open a recording for reading, to ask what its `tail` should be."""
+        """Open a recording for reading, to compute its `tail`."""
         file = cls.__new__(cls)
         file._reset(path, path.open("rb", buffering=0), contents.topics)
         file._take_over(contents)
@@ -125,7 +125,7 @@ class RecordingFile:
         self._metadata.append(index)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Append an attachment; its times are 0, as wall clock is provenance."""
+        """Append an attachment; its times are 0, because times of day belong to the provenance."""
         record = _bytes_of(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
         index = AttachmentIndex(
             offset=self._offset,
@@ -165,7 +165,7 @@ class RecordingFile:
         self._end_time = max(index.message_end_time, self._end_time)
 
     def sync(self) -> None:
-        """Ask the system to put on disk what was written."""
+        """Have the system write everything to disk."""
         os.fsync(self._stream.fileno())
 
     def cut_back(self) -> None:
@@ -174,7 +174,7 @@ class RecordingFile:
         self._stream.seek(self._offset)
 
     def finish(self, name: str = "", entries: Mapping[str, str] | None = None) -> None:
-        """Write a last metadata record, if one is named, summary and footer, and put all on disk.
+        """Write a last metadata record, if one is named, summary and footer, and sync the file.
 
         Raises:
             OSError: it could not all be written; the file is then as it was before.
@@ -192,7 +192,7 @@ class RecordingFile:
             raise
 
     def tail(self) -> bytes:
-        """Return what a finished recording has behind its data: data end, summary, footer, magic."""
+        """Return the end of a finished recording, after its data: data end, summary, footer, magic."""
         data_end = _bytes_of(DataEnd(self._crc))
         summary_start = self._offset + len(data_end)
         summary, offsets = self._summary(summary_start)
@@ -222,7 +222,7 @@ class RecordingFile:
         self._offset += len(data)
 
     def _summary(self, start: int) -> tuple[bytes, bytes]:
-        """Return the summary section and the summary offset section, to stand at `start`."""
+        """Return the summary section, which begins at `start`, and the summary offset section."""
         schemas, channels = _schema_and_channel_bytes(self._topics)
         groups = [
             (Opcode.SCHEMA, schemas),
@@ -291,7 +291,7 @@ def schemas_and_channels(topics: Sequence[Topic]) -> tuple[list[Schema], list[Ch
 
 
 def storage_error(file: RecordingFile, error: OSError) -> StorageError:
-    """Return the error that tells a user that writing failed, and what was kept."""
+    """Return the error for a failed write, with what was kept and what to do."""
     reason = error.strerror or os.strerror(error.errno or 0)
     return StorageError(
         f"{file.path}: writing failed ({reason}) after {file.size:,} bytes. What was written is kept and "
@@ -306,7 +306,7 @@ def _schema_and_channel_bytes(topics: tuple[Topic, ...]) -> tuple[bytes, bytes]:
 
 
 def schema_and_channel_bytes(topics: Sequence[Topic]) -> bytes:
-    """Return the records that stand behind the header of a recording with these topics."""
+    """Return the records after the header of a recording with these topics."""
     return b"".join(_schema_and_channel_bytes(tuple(topics)))
 
 

@@ -1,1 +1,1 @@
-"""Small functions that know nothing of runs: files, numbers in words, hashes."""
+"""General helpers that know nothing of runs: values, files, formatting, optional packages, processes."""

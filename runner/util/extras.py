@@ -1,4 +1,4 @@
-"""Optional packages: importing one, or saying how to install it the way the project itself was installed."""
+"""Optional packages: import one, or explain how to install it the way the project was installed."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ def missing(module: str, extra: str, purpose: str) -> MissingExtra:
 
 
 def install_command(extra: str) -> str:
-    """Return the command that installs an extra of the project, as it was itself installed.
+    """Return the command that installs an extra, by the tool that installed the project.
 
-    `direct_url.json` (PEP 610) tells a clone from a wheel or a repository; without one it came from an index.
+    `direct_url.json` (PEP 610) names a clone, a wheel or a repository; there is none if it is from an index.
     """
     code = Path(__file__).parents[1]
     try:
@@ -83,7 +83,7 @@ def install_command(extra: str) -> str:
 
 
 def _installer(distribution: metadata.Distribution) -> str:
-    """Return what installed the project: `pipx`, `uv tool`, `uv` or `pip`."""
+    """Return the tool that installed the project: `pipx`, `uv tool`, `uv` or `pip`."""
     prefix = Path(sys.prefix)
     if (prefix / "pipx_metadata.json").exists():
         return "pipx"
@@ -121,6 +121,6 @@ def _path_of(url: str) -> Path:
 
 
 def _short(path: Path) -> str:
-    """Return a path as it is typed in the present folder, if it lies in there."""
+    """Return a path, relative to the current folder if it is inside it."""
     here = Path.cwd()
     return os.fspath(path.relative_to(here)) if path.is_relative_to(here) else os.fspath(path)

@@ -1,4 +1,4 @@
-"""Sizes, times, numbers and long lists in words, as a table or a page shows them."""
+"""Sizes, times, numbers and long lists formatted for people, as in tables and pages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MOST_LISTED: Final = 6
 
 
 def size(count: float) -> str:
-    """Return a number of bytes in words: `7.6 MB`."""
+    """Return a number of bytes as text: `7.6 MB`."""
     if count < 1000:
         return f"{count:.0f} B"
     for unit in ("kB", "MB", "GB"):
@@ -22,7 +22,7 @@ def size(count: float) -> str:
 
 
 def amount(count: float) -> str:
-    """Return a large number in words: `9,500`, `12 thousand`, `3.4 million`."""
+    """Return a large number as text: `9,500`, `12 thousand`, `3.4 million`."""
     for divisor, word in ((1e9, "billion"), (1e6, "million"), (1e3, "thousand")):
         if count >= max(divisor, 1e4):
             return f"{_two_digits(count / divisor)} {word}"
@@ -34,7 +34,7 @@ def _two_digits(number: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a time span in words: `0.8 s`, `2 min 5 s`, `1 h 12 min`, `3 d`."""
+    """Return a time span as text: `0.8 s`, `2 min 5 s`, `1 h 12 min`, `3 d`."""
     if seconds < 10:
         return f"{max(seconds, 0):.1f} s"
     whole = round(seconds)
@@ -48,7 +48,7 @@ def duration(seconds: float) -> str:
 
 
 def age(seconds: float) -> str:
-    """Return how long ago something was, in one unit: `40 s`, `5 min`, `3 h`, `12 d`."""
+    """Return a time span in one unit: `40 s`, `5 min`, `3 h`, `12 d`."""
     whole = max(round(seconds), 0)
     for bound, divisor, unit in ((60, 1, "s"), (3600, 60, "min"), (86400, 3600, "h")):
         if whole < bound:
@@ -57,11 +57,11 @@ def age(seconds: float) -> str:
 
 
 def number(value: float | None, digits: int = 1) -> str:
-    """Return a number with some digits after the point; what is unknown (None, NaN) as a dash."""
+    """Return a number with `digits` decimals; an unknown one (None, NaN) as a dash."""
     return UNKNOWN if value is None or math.isnan(value) else f"{value:,.{digits}f}"
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return the first of some names, and how many more there are: `a, b, c, d, e, f and 3 more`."""
+    """Return a list of names, shortened to the first few: `a, b, c, d, e, f and 3 more`."""
     more = len(names) - MOST_LISTED
     return ", ".join(names[:MOST_LISTED]) + (f" and {more:,} more" if more > 0 else "")

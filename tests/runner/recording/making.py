@@ -1,7 +1,8 @@
-"""Runs made for tests: small, quick, with every kind of message."""
+"""Runs for tests: small, quick, with every kind of message."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ SAMPLED: dict[str, Any] = {"evaluation": {"every": 20, "trials": 3}}
 
 
 def experiment(*parts: dict[str, Any], **values: Any) -> ExperimentConfig:
-    """Return the experiment that these parts describe together; later ones win."""
+    """Return the experiment of merged parts; later ones take precedence."""
     merged: dict[str, Any] = {}
     for part in (*parts, values):
         merged |= part
@@ -50,13 +51,13 @@ def experiment(*parts: dict[str, Any], **values: Any) -> ExperimentConfig:
 
 
 def stopping_after(times: int) -> Callable[[], bool]:
-    """Return what says to stop when it has been asked so many times."""
-    asked = iter(range(10**9))
-    return lambda: next(asked) >= times
+    """Return a function that returns True from call number `times` on."""
+    calls = itertools.count()
+    return lambda: next(calls) >= times
 
 
 def with_id(run_id: str, source: Path, target: Path) -> Path:
-    """Write a recording anew under another run's id, and return where; all else stays as it is."""
+    """Copy a recording, with another run id and no other change, and return the copy's path."""
     rewrite(source, target, lambda name, entries: entries | {"run_id": run_id} if name == "run" else entries)
     return target
 

@@ -1,4 +1,4 @@
-"""Damaged, cut off, foreign and hostile files: what is good is read, anything else is a RecordingError."""
+"""Damaged, cut off, foreign and hostile files: good records are read, anything else is a RecordingError."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_file_cut_off_at_any_byte_gives_the_messages_before_the_cut(cuttable, 
     assert len(cuts) - len(unusable) > 500
 
 
-def test_what_is_left_of_a_cut_file_says_that_it_was_interrupted(lake, tmp_path):
+def test_a_cut_file_has_the_status_interrupted(lake, tmp_path):
     path = tmp_path / "cut.mcap"
     data = lake.recording.read_bytes()
     last_chunk = max(start for opcode, start, _ in records_of(data) if opcode == CHUNK)
@@ -118,8 +118,8 @@ def test_what_is_left_of_a_cut_file_says_that_it_was_interrupted(lake, tmp_path)
         assert recording.mdp.states == 16
 
 
-def test_the_steps_of_an_episode_that_never_ended_are_given(tmp_path):
-    """Its last chunk of episodes is lost, of its steps nothing is."""
+def test_the_steps_of_an_episode_that_never_ended_are_returned(tmp_path):
+    """Its last chunk of episodes is lost, but none of its steps."""
     data = make_run(tmp_path, LAKE, evaluation=None, log=None).recording.read_bytes()
     channels = {start: _channel(data, start) for opcode, start, _ in records_of(data) if opcode == CHUNK}
     cut = next(start for start, channel in channels.items() if channel == schema.TRAIN_EPISODE.channel)
@@ -136,7 +136,7 @@ def test_the_steps_of_an_episode_that_never_ended_are_given(tmp_path):
 
 
 def _channel(data: bytes, chunk: int) -> int:
-    """Return the channel of the message index behind a chunk."""
+    """Return the channel of the message index after a chunk."""
     end = chunk + 9 + struct.unpack_from("<Q", data, chunk + 1)[0]
     return struct.unpack_from("<H", data, end + 9)[0]
 
@@ -197,7 +197,7 @@ def test_bytes_too_many_or_too_few_do_not_get_past_the_integrity_check(change, l
 
 @pytest.mark.parametrize("made_of", [TAXIS, LAKE])
 @pytest.mark.parametrize("packing", [{"compression": "lz4"}, {"compression": "none", "index": "chunk"}])
-def test_what_the_recorder_writes_passes_the_integrity_check(made_of, packing, tmp_path):
+def test_a_written_recording_passes_the_integrity_check(made_of, packing, tmp_path):
     check_integrity(make_run(tmp_path, made_of, recording=packing).recording)
 
 
@@ -212,7 +212,7 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("kind", FOREIGN)
-def test_what_is_no_recording_is_refused_by_name(kind, tmp_path):
+def test_a_file_that_is_no_recording_is_refused_by_name(kind, tmp_path):
     content, message = FOREIGN[kind]
     path = tmp_path / "foreign.mcap"
     path.write_bytes(content)
@@ -312,7 +312,7 @@ def test_a_hostile_chunk_is_refused(kind, lake, tmp_path):
     ids=str,
 )
 def test_a_description_that_makes_no_sense_is_refused(entries, lake, tmp_path):
-    """The description has no checksum of its own: only what it says can give it away."""
+    """The description has no checksum of its own: only its values can reveal the damage."""
     data = lake.recording.read_bytes()
     opcode, start, end = next(record for record in records_of(data) if record[0] == 12)
     body = _text("run") + _mapping(entries)
@@ -351,7 +351,7 @@ def _mapping(entries: dict[str, str]) -> bytes:
 
 
 def bomb(data: bytes, messages: int, chunks: int) -> bytes:
-    """Return an unfinished recording of equal chunks, each of so many equal steps."""
+    """Return an unfinished recording of equal chunks of equal steps."""
     start = next(start for opcode, start, _ in records_of(data) if opcode == CHUNK)
     step = struct.pack("<BQHIQQ", 5, 22 + 60, 1, 0, 0, 0) + bytes(60)
     body = zstandard.compress(step * messages)
@@ -368,7 +368,7 @@ def test_chunks_of_more_messages_than_any_recorder_writes_are_refused_unpacked(l
     assert repair(path).kept.get("/train/step") is None
 
 
-def test_a_file_that_declares_to_hold_far_more_than_it_can_is_refused_before_it_is_unpacked(lake, tmp_path):
+def test_a_file_that_declares_far_more_than_it_can_hold_is_refused_before_it_is_unpacked(lake, tmp_path):
     path = tmp_path / "bomb.mcap"
     path.write_bytes(bomb(lake.recording.read_bytes(), 700_000, 100))
     with pytest.raises(RecordingError, match="made to exhaust memory"):

@@ -1,8 +1,8 @@
-"""The content of shipped experiments, pinned on x86-64: learning and format are what they were.
+"""The content of shipped experiments, pinned on x86-64: neither learning nor the format has changed.
 
-A digest here changes when, and only when, what is learned or how it is written changes. If that was meant,
-put in what the failing test found, and tell it in CHANGELOG.md: recordings made before cannot be resumed
-or verified any more. If it was not, the twin's tests (tests/runner/learning) say whether learning changed.
+A digest here changes if, and only if, learning or the format changes. If that is intended, enter the digest
+that the failing test found, and note it in CHANGELOG.md: older recordings cannot be resumed or verified any
+more. If it is not, the twin's tests (tests/runner/learning) show whether learning changed.
 """
 
 from __future__ import annotations

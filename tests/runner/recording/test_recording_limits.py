@@ -1,4 +1,4 @@
-"""Long runs and full disks: memory stays what it was, what was written before the disk was full is read."""
+"""Long runs and full disks: memory does not grow; what was written on a full disk can be read."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_memory_does_not_grow_with_the_number_of_steps(tmp_path):
 
 @contextlib.contextmanager
 def disk_of(size: int):
-    """Let no file grow beyond a size: as a full disk does, writing stops in the middle of a record."""
+    """Limit the size of files: as with a full disk, writing stops in the middle of a record."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
@@ -75,7 +75,7 @@ def disk_of(size: int):
 
 
 def run_on_small_disk(folder: Path, size: int, *parts, **values):
-    """Return the run that a full disk ended, and what was said of it."""
+    """Return the run that a full disk ended, and the error."""
     config = experiment(*parts, **values)
     run = create_run(folder, config, 0)
     with disk_of(size), pytest.raises(StorageError) as caught:
@@ -95,7 +95,7 @@ LARGE = LAKE | {"episodes": 400, "recording": {"chunk_steps": 256, "compression"
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Return the training steps of a run that had room."""
+    """Return the training steps of a run on a disk with enough space."""
     return train_steps(make_run(tmp_path_factory.mktemp("whole"), LARGE).recording)
 
 
@@ -122,8 +122,8 @@ def test_a_disk_that_is_full_at_the_very_end_loses_only_the_index(missing, tmp_p
 
 
 @pytest.mark.parametrize("size", [700, 2_600, 3_000, 5_000])
-def test_no_room_even_to_describe_the_run(size, tmp_path):
-    """700 bytes do not even hold what `run.json` would say of it."""
+def test_no_space_even_to_describe_the_run(size, tmp_path):
+    """700 bytes do not even hold its `run.json`."""
     run, error = run_on_small_disk(tmp_path, size, LAKE)
     assert error.exit_code == 1
     assert run.status == ("failed" if size > 1_500 else "running")
@@ -132,8 +132,8 @@ def test_no_room_even_to_describe_the_run(size, tmp_path):
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root may mount a disk")
 @pytest.mark.parametrize(("kilobytes", "threads"), [(80, True), (120, True), (200, True), (120, False)])
-def test_a_disk_that_is_really_full(kilobytes, threads, whole, tmp_path):
-    """Where the recording's blocks are gone, those of run.json are gone too."""
+def test_a_full_file_system_ends_the_run(kilobytes, threads, whole, tmp_path):
+    """When no block is left for the recording, none is left for run.json."""
     mount = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", str(tmp_path)]
     if subprocess.run(mount, capture_output=True, check=False).returncode:
         pytest.skip("mounting is not allowed here")
@@ -150,8 +150,8 @@ def test_a_disk_that_is_really_full(kilobytes, threads, whole, tmp_path):
 
 
 @pytest.mark.parametrize("threads", [True, False])
-def test_a_system_that_cannot_keep_what_it_took_ends_the_run(threads, tmp_path, monkeypatch):
-    """Some disks say that they are full only when asked to have written."""
+def test_a_failed_sync_ends_the_run(threads, tmp_path, monkeypatch):
+    """Some disks report that they are full only at a sync."""
 
     def full(self):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -160,11 +160,11 @@ def test_a_system_that_cannot_keep_what_it_took_ends_the_run(threads, tmp_path, 
     monkeypatch.setattr(pipeline, "SYNC_SECONDS", 0)
     config = experiment(LAKE, episodes=10**6, evaluation=None)
     run = create_run(tmp_path, config, 0)
-    told = []
+    episodes = []
     with pytest.raises(StorageError, match="No space left on device"):
-        run_job(Job(config, 0), run, lambda progress: told.append(progress.episode), threads=threads)
+        run_job(Job(config, 0), run, lambda progress: episodes.append(progress.episode), threads=threads)
     assert find_run(run.run_id, tmp_path).status == "failed"
-    assert max(told, default=0) < 900_000, "it is told soon, not when all is done"
+    assert max(episodes, default=0) < 900_000, "it is reported soon, not at the end"
 
 
 @pytest.mark.parametrize("threads", [True, False])

@@ -36,7 +36,7 @@ def test_each_step_of_either_phase_takes_the_next_tenth_of_a_second(recording):
     plan = recording.config["evaluation"]
     training = all_of(recording, schema.TRAIN_STEP)
     evaluated = all_of(recording, schema.EVAL_STEP) if plan else training[:0]
-    # Evaluation e comes after so many training episodes; its steps stand before the next one's.
+    # Evaluation e comes after a number of training episodes; its steps come before those of the next one.
     executed = []
     due = [n for n in range(recording.config["episodes"] + 1) if plan and n % plan["every"] == 0]
     for number, episodes in enumerate(due):

@@ -35,7 +35,7 @@ CONFIGS = {
 
 @pytest.fixture(scope="module", params=CONFIGS)
 def run(request, tmp_path_factory):
-    """A finished run, not to be changed; with the configuration it was made of."""
+    """A finished run, not to be changed; with its configuration."""
     folder = tmp_path_factory.mktemp("tables")
     return make_run(folder, CONFIGS[request.param], recording={"chunk_steps": 256})
 
@@ -52,7 +52,7 @@ def steps(run):
 
 @pytest.fixture(scope="module")
 def live(config):
-    """Return what gives the tables of a live learner that has taken so many steps."""
+    """Return a function that returns the tables of a live learner after a number of steps."""
     mdp = load_mdp(config.env.id, config.env.kwargs, config.rewards)
 
     def at(step: int) -> list[np.ndarray]:
