@@ -255,38 +255,36 @@ trial_option: Final = click.option(
 
 def output_option(default: Path | str, metavar: str = "FILE") -> Decorator:
     """Return the option -o, with a default path, or a text that describes the default."""
+    kind = "file" if metavar.startswith("FILE") else "folder"
     return click.option(
         "-o",
         "--output",
         type=click.Path(path_type=Path),
         default=default if isinstance(default, Path) else None,
-        show_default=default if isinstance(default, str) else True,
         metavar=metavar,
-        help="The file to write." if metavar.startswith("FILE") else "The folder to write.",
+        help=f"The {kind} to write.  [default: {default}]",
     )
 
 
-def limit_option(default: int | None, described: str = "") -> Decorator:
-    """Return the option --limit: the maximum number of rows, 0 for all."""
+def limit_option(default: int | str) -> Decorator:
+    """Return the option --limit, with a default number of rows, or a text that describes the default."""
     return click.option(
         "--limit",
         type=INDEX,
-        default=default,
-        show_default=described or True,
+        default=default if isinstance(default, int) else None,
         metavar="N",
-        help="Maximum number of rows, 0 for all.",
+        help=f"Maximum number of rows, 0 for all.  [default: {default}]",
     )
 
 
-def workers_option(default: int | None, described: str = "") -> Decorator:
-    """Return the option --workers: the number of runs done in parallel."""
+def workers_option(default: int | str) -> Decorator:
+    """Return the option --workers, with a default number, or a text that describes the default."""
     return click.option(
         "--workers",
         type=click.IntRange(1, 1024),
-        default=default,
-        show_default=described or True,
+        default=default if isinstance(default, int) else None,
         metavar="N",
-        help="Number of runs to do in parallel.",
+        help=f"Number of runs to do in parallel.  [default: {default}]",
     )
 
 

@@ -75,7 +75,7 @@ class _Query(NamedTuple):
     "--sort", default="", metavar="FIELD,...", help="Sort by these fields; -FIELD for descending order."
 )
 @click.option("--columns", metavar="FIELD,...", help="Show these fields.")
-@limit_option(None, f"{ON_A_TERMINAL} in a terminal's table, else all")
+@limit_option(f"{ON_A_TERMINAL} in a terminal's table, else all")
 @click.option("--offset", type=INDEX, default=0, metavar="N", help="Skip the first N.")
 @click.option("-q", "--quiet", is_flag=True, help="Print ids only.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print CSV.")

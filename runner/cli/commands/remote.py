@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,21 +13,22 @@ import click
 from runner.cli import Group, error_as_json, exit_code_of
 from runner.cli.options import ConfigName, RunName, json_option, limit_option, recordings_option
 from runner.cli.output import draw, facts, print_json, say, table
-from runner.cli.runs import find_recorded
+from runner.cli.progress import bytes_line
+from runner.cli.runs import find_recorded, print_received
 from runner.errors import ExitCode, RunnerError
+from runner.runs.run import recordings_folder
 from runner.util.humanize import UNKNOWN, size
 
 if TYPE_CHECKING:
     from runner.client.client import Client, UploadStatus
     from runner.client.connection import Report
-    from runner.client.jobs import JobEvent, RemoteJob
+    from runner.client.jobs import RemoteJob
     from runner.runs.run import Run
 
-    Push = Callable[[Report], tuple[UploadStatus, str, int]]
-    """Uploads a run; returns the upload, the run's name and its bytes."""
+    Upload = Callable[[Report], dict[str, Any]]
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Server:
     """The server that the options name, and the token for it."""
 
@@ -125,9 +126,10 @@ def push(
         raise click.UsageError("expected either runs or --outbox.")
     runs: list[dict[str, Any]] = []
     codes: list[int] = []
-    for name, push_run in _outbox(server) if outbox else _runs(names, server, recordings):
+    for name, upload in _outbox(server) if outbox else _named(names, server, recordings):
         try:
-            runs.append(_pushed(name, push_run))
+            with bytes_line(f"pushing {name}") as report:
+                runs.append(upload(report))
         except RunnerError as error:
             codes.append(exit_code_of(error))
             message = f"{name}: {error}"
@@ -135,50 +137,46 @@ def push(
     if as_json:
         print_json({"runs": runs})
     elif runs:
-        drawn = table("run", "name", "size", "", left=("run", "name", ""))
+        grid = table("run", "name", "size", "", left=("run", "name", ""))
         for run in runs:
             outcome = "was there already" if run["already"] else "stored"
-            drawn.add_row(run["run_id"], run["name"], size(run["bytes"]), outcome)
-        draw(drawn)
+            grid.add_row(run["run_id"], run["name"], size(run["bytes"]), outcome)
+        draw(grid)
     if codes:
         raise click.exceptions.Exit(max(codes))
 
 
-def _runs(names: tuple[str, ...], server: Server, recordings: Path | None) -> Iterator[tuple[str, Push]]:
-    """Yield the named runs, and the function that uploads each."""
+def _named(names: tuple[str, ...], server: Server, recordings: Path | None) -> Iterator[tuple[str, Upload]]:
+    """Yield the names of runs, and the function that uploads each."""
     from runner.client.client import UploadSource
 
-    def push_run(name: str, report: Report) -> tuple[UploadStatus, str, int]:
+    def upload(name: str, report: Report) -> dict[str, Any]:
         source = UploadSource.of_run(find_recorded(name, recordings))
-        return client.push(source, report), source.name, source.path.stat().st_size
+        return _stored(client.push(source, report), source.name, source.path.stat().st_size)
 
     with server.client() as client:
         for name in names:
-            yield name, functools.partial(push_run, name)
+            yield name, functools.partial(upload, name)
 
 
-def _outbox(server: Server) -> Iterator[tuple[str, Push]]:
-    """Yield the runs in the outbox, and the function that uploads each."""
+def _outbox(server: Server) -> Iterator[tuple[str, Upload]]:
+    """Yield the ids of the runs in the outbox, and the function that uploads each."""
     from runner.client.outbox import deliver, outbox_folder, waiting
 
-    def push_run(run: Run, url: str, report: Report) -> tuple[UploadStatus, str, int]:
-        run_bytes = run.recording.stat().st_size
+    def upload(run: Run, url: str, report: Report) -> dict[str, Any]:
+        run_bytes = run.recording.stat().st_size  # the run leaves the outbox when it is delivered
         with server.client(url) as client:
-            return deliver(run, client, report), run.name, run_bytes
+            return _stored(deliver(run, client, report), run.name, run_bytes)
 
     found = waiting(outbox_folder())
     if not found:
         say(f"The outbox {outbox_folder()} is empty; there is nothing to do.")
     for run, url in found:
-        yield run.run_id, functools.partial(push_run, run, url)
+        yield run.run_id, functools.partial(upload, run, url)
 
 
-def _pushed(name: str, push_run: Push) -> dict[str, Any]:
-    from runner.cli.progress import bytes_line
-
-    with bytes_line(f"pushing {name}") as report:
-        sent, run_name, run_bytes = push_run(report)
-    return {"run_id": sent.run_id, "name": run_name, "bytes": run_bytes, "already": sent.already}
+def _stored(status: UploadStatus, name: str, run_bytes: int) -> dict[str, Any]:
+    return {"run_id": status.run_id, "name": name, "bytes": run_bytes, "already": status.already}
 
 
 @remote_command.command("pull")
@@ -196,10 +194,6 @@ def pull(run_name: str, server: Server, recordings: Path | None, as_json: bool) 
       dualtaxi remote pull @latest --server http://localhost:8000
       dualtaxi remote pull k3v9m2xq --server https://runs.example.org --token-file ~/.dualtaxi-token
     """
-    from runner.cli.progress import bytes_line
-    from runner.cli.runs import print_received
-    from runner.runs.run import recordings_folder
-
     with server.client() as client, bytes_line(f"pulling {run_name}") as report:
         pulled = client.pull(run_name, recordings_folder(recordings), report)
     already = "this content" if pulled.already else ""
@@ -259,12 +253,12 @@ def jobs(limit: int, server: Server, as_json: bool) -> None:
     if as_json:
         print_json({"jobs": [_job_as_json(job) for job in found]})
     elif found:
-        drawn = table(
+        grid = table(
             "job", "kind", "name", "state", "runs", left=("kind", "name", "state"), shrinking=("name",)
         )
         for job in found:
-            drawn.add_row(str(job.number), job.kind, job.name, job.state, f"{job.runs:,}")
-        draw(drawn)
+            grid.add_row(str(job.number), job.kind, job.name, job.state, f"{job.runs:,}")
+        draw(grid)
     else:
         say("No jobs yet. `dualtaxi remote submit FILE` submits one.")
 
@@ -320,17 +314,13 @@ def resume(number: int, accept_changes: bool, server: Server, as_json: bool) -> 
 
 def _watched(client: Client, number: int) -> RemoteJob:
     """Print the events of a job on stderr until it is over, and return it."""
-    _print_events(client.watch(number))
-    return client.job(number)
-
-
-def _print_events(events: Iterable[JobEvent]) -> None:
-    for event in events:
+    for event in client.watch(number):
         if event.kind == "log":
             seed = f"seed {event.data['seed']}: " if "seed" in event.data else ""
             say(f"{seed}{event.data['text']}")
         elif event.kind == "state":
             say(event.data["state"])
+    return client.job(number)
 
 
 def _print_job(job: RemoteJob, as_json: bool) -> None:
@@ -343,12 +333,6 @@ def _print_job(job: RemoteJob, as_json: bool) -> None:
 
 
 def _job_as_json(job: RemoteJob) -> dict[str, Any]:
-    return {
-        "number": job.number,
-        "kind": job.kind,
-        "name": job.name,
-        "state": job.state,
-        "runs": job.runs,
-        "begun": [{"seed": seed, "run_id": run_id} for seed, run_id in job.begun.items()],
-        "error": job.error,
-    }
+    """Return a job with the keys of the HTTP API."""
+    begun = [{"seed": seed, "run_id": run_id} for seed, run_id in job.begun.items()]
+    return dataclasses.asdict(job) | {"begun": begun}

@@ -54,7 +54,7 @@ def sweep_command() -> None:
 
 @sweep_command.command("run")
 @click.argument("file", metavar="FILE", type=ConfigName("sweep"))
-@workers_option(None, "one per processor")
+@workers_option("one per processor")
 @click.option(
     "--ray",
     is_flag=False,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
 from types import SimpleNamespace
 
@@ -187,13 +188,11 @@ def test_exit_codes_are_explained_by_help():
     "name", ["all", "at", "limit", "workers", "target", "set", "json", "markdown", "recordings"]
 )
 def test_an_option_has_one_meaning(name):
-    meanings = {
-        option.help.removeprefix("The folder of runs")
-        .removeprefix("A folder of runs; may be repeated")
-        .rstrip(".")
+    texts = {
+        option.help
         for command in EVERY.values()
         for option in command.params
         if isinstance(option, click.Option) and f"--{name}" in option.opts
     }
-    heads = {meaning.partition(":")[0].partition("; may")[0] for meaning in meanings}
-    assert len(heads) == 1, heads
+    meanings = {re.split(r"[:;.]|  \[", text)[0].replace("A folder", "The folder") for text in texts}
+    assert len(meanings) == 1, texts
