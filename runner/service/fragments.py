@@ -1,8 +1,4 @@
-"""Parts of pages that take long to compute, for child processes: HTML, or JSON for a script.
-
-Analyses and exports are imported inside the functions: they load Numba and SciPy, which the process that
-answers requests does without.
-"""
+"""Parts of pages that take long to compute, for child processes: HTML, or JSON for a script."""
 
 from __future__ import annotations
 
@@ -16,21 +12,38 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from markupsafe import Markup
+
+from runner.analysis.diff import diff, with_seconds, without_ignored
 from runner.analysis.sections import Grid, Section
 from runner.analysis.step_reference import step_reference
+from runner.analysis.summary import random_policy_sentence
 from runner.drawing import svg
 from runner.errors import RecordingError, RunnerError
+from runner.export.plots.curves import footnote, panel_plots
+from runner.export.reports.diff import ShownDivergence, difference_view
+from runner.export.reports.episode import (
+    Episode,
+    last_episode,
+    last_whole_evaluation,
+    payload,
+    training_episode,
+    trial,
+    typical_trial,
+)
+from runner.export.reports.maps import maps_of, stages_of
 from runner.export.reports.rendering import Link, partials
+from runner.export.rerun.selection import Request, locate
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.addresses import after_step, link
 from runner.service.settings import without_folders
-
-if TYPE_CHECKING:
-    from runner.export.reports.episode import Episode
-    from runner.sweep.results import Results
+from runner.sweep.charts import learning, picture_of, picture_plots
+from runner.sweep.page import sweep_legend
+from runner.sweep.results import Results, effects_sections, ranking_sections, results_of
+from runner.sweep.state import read_sweep
 
 _STEPS_BEFORE: Final = 1
 """Steps before the first one of a part, so that it includes the step that led there."""
@@ -48,8 +61,6 @@ def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> 
     Raises:
         RecordingError: there is no such episode or step, or no steps were recorded.
     """
-    from runner.export.reports.episode import payload, training_episode, trial
-
     with open_recording(path) as recording:
         recording.require_job("a replay in the page", "The Rerun viewer shows what it recorded.")
         first = max(0, start - _STEPS_BEFORE)
@@ -71,16 +82,12 @@ def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> 
 
 def random_policy(path: Path) -> bytes:
     """Return a sentence on what a random policy achieves in a recording's environment; empty if unknown."""
-    from runner.analysis.summary import random_policy_sentence
-
     with open_recording(path) as recording:
         return random_policy_sentence(recording).encode()
 
 
 def typical_episode(path: Path) -> bytes:
     """Return the address of the episode to show first, below that of the replay: `eval/3000/17`."""
-    from runner.export.reports.episode import last_episode, last_whole_evaluation, typical_trial
-
     with open_recording(path) as recording:
         if last_whole_evaluation(recording) is None:
             return f"train/{last_episode(recording)}".encode()
@@ -90,8 +97,6 @@ def typical_episode(path: Path) -> bytes:
 
 def maps(path: Path) -> bytes:
     """Return the maps of policy and values at stages of learning, as HTML."""
-    from runner.export.reports.maps import maps_of, stages_of
-
     with open_recording(path) as recording:
         rows = []
         drawing = svg.drawing_of(recording.mdp) if recording.is_job else None
@@ -101,8 +106,6 @@ def maps(path: Path) -> bytes:
 
 
 def _typical_start(recording: Recording) -> int:
-    from runner.export.reports.episode import trial, typical_trial
-
     try:
         return int(trial(recording, *typical_trial(recording)).states[0])
     except RecordingError:
@@ -114,9 +117,6 @@ def difference(a: Run, b: Run) -> bytes:
 
     Its keys: `lead`, `notes`, `first_step` (the first step that differs; may be null), `body` and `tables`.
     """
-    from runner.analysis.diff import diff, with_seconds, without_ignored
-    from runner.export.reports.diff import ShownDivergence, difference_view
-
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
         view = difference_view(without_ignored(with_seconds(diff(ours, theirs), a, b), ()), ours, theirs)
 
@@ -145,8 +145,6 @@ def difference(a: Run, b: Run) -> bytes:
 
 def timeline_step(run: Run, at: tuple[int, ...]) -> bytes:
     """Return the step of the viewer's timeline at (episode, t) or (training episodes before, trial, t)."""
-    from runner.export.rerun.selection import Request, locate
-
     return str(locate(run, Request(), at or None).time).encode()
 
 
@@ -171,16 +169,11 @@ def load_sweep_libraries() -> None:
 @lru_cache(maxsize=1)
 def _results(name: str, recordings: Path, digest: str) -> Results:  # noqa: ARG001
     """Return the results of a sweep in the state that the digest identifies."""
-    from runner.sweep.results import results_of
-    from runner.sweep.state import read_sweep
-
     return results_of(read_sweep(name, recordings), recordings)
 
 
 def sweep_results(name: str, recordings: Path, digest: str) -> bytes:
     """Return the ranking of a sweep as HTML, with links to its runs."""
-    from runner.sweep.results import ranking_sections
-
     results = _results(name, recordings, digest)
     ranking, *others = (_without_folders(each, recordings) for each in ranking_sections(results, None))
     runs = {str(entry.number): _run_links(entry.runs) for entry in results.ranking}
@@ -195,8 +188,6 @@ def sweep_results(name: str, recordings: Path, digest: str) -> bytes:
 
 
 def _run_links(runs: Mapping[Any, str]) -> str:
-    from markupsafe import Markup
-
     links = [
         Markup('<a href="/runs/{0}" title="{0}">{1}</a>').format(run, seed) for seed, run in runs.items()
     ]
@@ -205,8 +196,6 @@ def _run_links(runs: Mapping[Any, str]) -> str:
 
 def sweep_importance(name: str, recordings: Path, digest: str) -> bytes:
     """Return the importance of a sweep's parameters as HTML, empty if it is unknown."""
-    from runner.sweep.results import effects_sections
-
     shown = partials()
     sections = [
         _without_folders(each, recordings) for each in effects_sections(_results(name, recordings, digest))
@@ -222,10 +211,6 @@ def _without_folders(section: Section, recordings: Path) -> Section:
 
 def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
     """Return the charts of a sweep as HTML: its parameters, and learning curves of some of its trials."""
-    from runner.export.plots.curves import footnote, panel_plots
-    from runner.sweep.charts import learning, picture_of, picture_plots
-    from runner.sweep.page import sweep_legend
-
     results, shown, html = _results(name, recordings, digest), partials(), ""
     with contextlib.suppress(RunnerError):  # no trial is finished yet, as the ranking says
         picture = picture_of(results)

@@ -20,6 +20,7 @@ from filelock import FileLock
 
 from runner.analysis.step_reference import parse_step_reference
 from runner.export.reports.rendering import View
+from runner.export.rerun import viewer as native_viewer
 from runner.service import fragments
 from runner.service.addresses import episode_in_words, link, replay_address
 from runner.service.api.replay import LONG
@@ -141,24 +142,20 @@ def viewer_files() -> Path:
 
 def _fetch_files(folder: Path) -> None:
     """Fetch the files from the executable, which serves them."""
-    from runner.export.rerun import viewer
-
-    port = viewer.free_port()
-    with viewer.web_viewer(port):
+    port = native_viewer.free_port()
+    with native_viewer.web_viewer(port):
         for name in FILES:
             with replacing(folder / name) as fresh:
                 fresh.write_bytes(_fetch(port, name))
 
 
 def _fetch(port: int, name: str) -> bytes:
-    from runner.export.rerun import viewer
-
     with contextlib.closing(
-        http.client.HTTPConnection(viewer.LOOPBACK, port, timeout=_SECONDS)
+        http.client.HTTPConnection(native_viewer.LOOPBACK, port, timeout=_SECONDS)
     ) as connection:
         connection.request("GET", f"/{name}")
         response = connection.getresponse()
         body = response.read()
     if response.status != HTTPStatus.OK or len(body) < 1000:
-        raise viewer.ViewerError(f"the Rerun viewer has no {name}; install rerun-sdk again.")
+        raise native_viewer.ViewerError(f"the Rerun viewer has no {name}; install rerun-sdk again.")
     return body

@@ -22,6 +22,7 @@ from runner.service.errors import Refused
 from runner.service.jobs.checking import SWEEP_KEYS, CheckedJob
 from runner.service.pages.rendering import Form, page, viewer_of
 from runner.service.problems import error_body
+from runner.sweep.model import SweepFile
 
 router = APIRouter(prefix="/submit", include_in_schema=False)
 
@@ -153,8 +154,6 @@ def config_keys() -> list[Key]:
 @functools.cache
 def sweep_keys() -> list[Key]:
     """Return the keys of a sweep."""
-    from runner.sweep.model import SweepFile
-
     return list(_keys(without_references(SweepFile.model_json_schema())["properties"]))
 
 
