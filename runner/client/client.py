@@ -205,7 +205,7 @@ class Client(Connection):
         return self._upload("PATCH", f"/uploads/{upload.id}", content=content, headers=headers)
 
     def upload_status(self, upload: UploadStatus, wait: float = 0) -> UploadStatus:
-        """Return the state of an upload; wait for its verification at most so many seconds."""
+        """Return the state of an upload; wait up to some seconds for its verification."""
         return self._upload("GET", f"/uploads/{upload.id}", params={"wait": wait})
 
     def complete_upload(

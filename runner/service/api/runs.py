@@ -1,4 +1,4 @@
-"""Runs: listed, searched, told all about, labelled."""
+"""Runs: list, search, describe, label."""
 
 from __future__ import annotations
 

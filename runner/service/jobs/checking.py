@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -149,23 +148,15 @@ class JobChecker:
             ConfigError: as for `check`, or it is too large, or its check took too much time or memory.
             Busy: other texts were being checked all the time.
         """
-        future = self._submit(text, source)
+        if len(text) > MAX_BYTES or len(text.encode()) > MAX_BYTES:
+            raise ConfigError(f"{source}: larger than 1 MiB, expected a configuration of a few kilobytes")
+        future = self._pool.submit(_check_as_config_errors, text, source, self._recordings)
         waiting = asyncio.wrap_future(future)
         done, _ = await asyncio.wait({waiting}, timeout=QUEUE_SECONDS)
         if not done and future.cancel():
             raise Busy
         with _limits_as_config_errors(source):
             return await waiting
-
-    def check_now(self, text: str, source: str) -> CheckedJob:
-        """Return the meaning of a text, for a thread that may wait; errors as for `check`."""
-        with _limits_as_config_errors(source):
-            return self._submit(text, source).result()
-
-    def _submit(self, text: str, source: str) -> Future[CheckedJob]:
-        if len(text) > MAX_BYTES or len(text.encode()) > MAX_BYTES:
-            raise ConfigError(f"{source}: larger than 1 MiB, expected a configuration of a few kilobytes")
-        return self._pool.submit(_check_as_config_errors, text, source, self._recordings)
 
 
 @contextlib.contextmanager

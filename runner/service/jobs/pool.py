@@ -1,9 +1,5 @@
 """The jobs of a recordings folder, run by worker processes next to the server.
 
-    with JobPool(recordings, workers=2) as jobs:
-        job = jobs.submit(text, "quick.yaml")
-        jobs.progress(job.number)
-
 One thread starts the workers and receives their messages; the other methods read, or store a request.
 """
 
@@ -25,7 +21,7 @@ from runner.execution.estimate import free_bytes
 from runner.runs.run import new_run_id
 from runner.service.errors import JobStateConflict
 from runner.service.jobs.channel import JobSpec, Outcome
-from runner.service.jobs.checking import DEFAULT_SOURCE, CheckedJob, JobChecker
+from runner.service.jobs.checking import CheckedJob, JobChecker
 from runner.service.jobs.store import Job, JobStore, now
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
@@ -35,7 +31,7 @@ STOP_SECONDS: Final = 15.0
 """How long a worker may take to close its recording before it is killed."""
 RECEIVE_SECONDS: Final = 0.1
 MAX_DEATHS: Final = 2
-"""A job fails when so many of its workers have died."""
+"""A job fails when this number of its workers have died."""
 RESERVE_BYTES: Final = 256 << 20
 """No job is started while the disk has less space."""
 RETRY_SECONDS: Final = 5.0
@@ -54,7 +50,7 @@ class _Worker:
     """How many it last reported to use, or to be allowed."""
     outcome: Outcome | None = None
     stopped: float | None = None
-    """When it was asked to stop."""
+    """When the request to stop was sent."""
 
     def send(self, kind: str, value: Any = None) -> None:
         with contextlib.suppress(OSError):  # it is dead
@@ -133,19 +129,6 @@ class JobPool:
     def is_working(self) -> bool:
         """Whether queued jobs are started: the thread that does so is alive and can start workers."""
         return self._thread.is_alive() and not self._start_problem
-
-    def submit(self, text: str, source: str = DEFAULT_SOURCE) -> Job:
-        """Check the text of a configuration or a sweep, and queue it; waits for the check.
-
-        Args:
-            text: YAML, as a file has it.
-            source: the file's name, for messages; the default name of the job.
-
-        Raises:
-            ConfigError: it cannot be used; a line for each problem, with line, column and key.
-            Busy: other texts were being checked all the time.
-        """
-        return self.add(text, self.checker.check_now(text, source))
 
     def add(self, text: str, checked: CheckedJob) -> Job:
         """Queue a text that was checked.

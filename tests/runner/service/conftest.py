@@ -1,4 +1,4 @@
-"""What the service's tests share: some runs, and a client of an application over them."""
+"""Fixtures of the service's tests: some runs, and a client of an application for them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def settings(recordings: Path, tmp_path: Path) -> Settings:
 
 @pytest.fixture
 def connect() -> Iterator[Callable[..., TestClient]]:
-    """Return what makes a client of a service with some settings; a page of its own unless told else."""
+    """Return a function that connects a client to a service; by default as a page of its own."""
     opened = []
 
     def make(settings: Settings, **headers: str) -> TestClient:

@@ -1,4 +1,4 @@
-"""A service in a process of its own, to be asked, stopped, killed and started again."""
+"""A service in a process of its own, which tests stop, kill and start again."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Served:
         self.stop()
 
     def start(self) -> None:
-        """Start it, and wait until it can be asked."""
+        """Start it, and wait until it responds."""
         words = ["serve", "--port", str(self.port), "--recordings", str(self.recordings), *self.options]
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
@@ -56,17 +56,17 @@ class Served:
         if self.process.stdout.readline() != f"{self.url}/\n":
             self.kill()
             raise AssertionError(self.log.read_text())
-        httpx2.get(f"{self.url}/healthz", timeout=60)  # answered when the folder is its own
+        httpx2.get(f"{self.url}/healthz", timeout=60)  # answered when it has the folder
 
     def stop(self) -> int | None:
-        """Have it end properly, if it runs; return its exit code."""
+        """Stop it, if it runs; return its exit code."""
         if self.process is None:
             return None
         self.process.terminate()
         return self._ended()
 
     def kill(self, with_workers: bool = False) -> list[psutil.Process]:
-        """End it without warning, its workers too if that is asked for; return those that it had."""
+        """Kill it, and its workers if `with_workers`; return its workers."""
         workers = self.workers()
         self.process.kill()
         for worker in workers if with_workers else ():
@@ -85,17 +85,17 @@ class Served:
                 process.kill()  # which does nothing to one that has ended
 
     def workers(self) -> list[psutil.Process]:
-        """Return the processes that it has started, and theirs."""
+        """Return its child processes, and theirs."""
         return psutil.Process(self.process.pid).children(recursive=True)
 
     def get(self, path: str) -> Any:
-        """Return what is at a path of the API."""
+        """Return the JSON at a path of the API."""
         return self.client.get(path).raise_for_status().json()
 
     def post(self, path: str, text: str = "") -> Any:
-        """Return the answer to a text that is sent to a path of the API."""
+        """Post a text to a path of the API; return the JSON of the response."""
         return self.client.post(path, content=text.encode()).raise_for_status().json()
 
-    def until(self, is_so: Any, seconds: float = 90) -> dict[int, dict[str, Any]]:
-        """Wait until the jobs, by number, are so; return them."""
-        return until(is_so, lambda: {job["number"]: job for job in self.get("/jobs")["jobs"]}, seconds)
+    def until(self, condition: Any, seconds: float = 90) -> dict[int, dict[str, Any]]:
+        """Wait until the jobs, by number, satisfy a condition; return them."""
+        return until(condition, lambda: {job["number"]: job for job in self.get("/jobs")["jobs"]}, seconds)

@@ -1,7 +1,8 @@
-"""What is submitted is checked as a file is, with a few things more that a server must not do."""
+"""Submitted texts are checked as files are, and for what a server must not do."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from concurrent.futures import ThreadPoolExecutor
 
@@ -25,13 +26,17 @@ objective: {metric: training.mean_reward}
 """
 
 
+def check_in_child(checker, text, source):
+    return asyncio.run(checker.check(text, source))
+
+
 def refused(text, tmp_path):
     with pytest.raises(ConfigError) as caught:
         check(text, "job.yaml", tmp_path)
     return caught.value
 
 
-def test_a_text_means_what_the_file_means(tmp_path):
+def test_a_text_has_the_meaning_of_the_file(tmp_path):
     file = tmp_path / "tiny.yaml"
     file.write_text(TINY)
     found = check(TINY, "tiny.yaml", tmp_path)
@@ -40,13 +45,13 @@ def test_a_text_means_what_the_file_means(tmp_path):
     assert found.bytes > 0
 
 
-def test_a_sweep_is_told_by_its_keys(tmp_path):
+def test_a_sweep_is_recognised_by_its_keys(tmp_path):
     found = check(SWEEP, "job.yaml", tmp_path)
     assert (found.kind, found.name, found.runs) == ("sweep", "small", 6)
     assert from_values(found.values).to_mapping() == found.values
 
 
-def test_mistakes_are_those_of_the_file_at_their_lines(tmp_path):
+def test_mistakes_have_the_lines_of_the_file(tmp_path):
     text = "episodes: many\nepsilom: 0.1\n"
     file = tmp_path / "job.yaml"
     file.write_text(text)
@@ -71,13 +76,13 @@ def test_mistakes_are_those_of_the_file_at_their_lines(tmp_path):
         ("base: cooperative.yaml\nstrategy: grid\nparameters: {discount: [0.1]}\n", 1, "found the path"),
     ],
 )
-def test_what_only_a_server_refuses_has_its_line_too(text, line, message, tmp_path):
+def test_mistakes_on_a_server_only_have_lines_too(text, line, message, tmp_path):
     error = refused(text, tmp_path)
     assert error.problems[0].line == line, error
     assert message in str(error)
 
 
-def test_a_sweep_of_the_same_name_goes_on_but_for_another_it_is_refused(tmp_path):
+def test_a_sweep_can_be_resumed_but_not_changed(tmp_path):
     state.begin(from_values(check(SWEEP, "job.yaml", tmp_path).values), tmp_path, False, False)
     assert check(SWEEP, "job.yaml", tmp_path).name == "small"
     error = refused(SWEEP.replace("0.5", "0.6"), tmp_path)
@@ -85,42 +90,42 @@ def test_a_sweep_of_the_same_name_goes_on_but_for_another_it_is_refused(tmp_path
     assert error.problems[0].line == 1
 
 
-def test_more_runs_than_a_job_may_make_are_refused(tmp_path):
+def test_a_job_with_too_many_runs_is_refused(tmp_path):
     assert "makes 10,001 runs" in str(refused("episodes: 1\nseeds: {count: 10001}\n", tmp_path))
 
 
-def test_the_process_answers_as_the_function_does(tmp_path):
+def test_the_child_process_returns_the_result_of_the_function(tmp_path):
     with contextlib.closing(JobChecker(tmp_path)) as checker:
-        assert checker.check_now(TINY, "tiny.yaml") == check(TINY, "tiny.yaml", tmp_path)
+        assert check_in_child(checker, TINY, "tiny.yaml") == check(TINY, "tiny.yaml", tmp_path)
         with pytest.raises(ConfigError) as caught:
-            checker.check_now("episodes: many", "job.yaml")
+            check_in_child(checker, "episodes: many", "job.yaml")
         assert caught.value.problems == refused("episodes: many", tmp_path).problems
         with pytest.raises(ConfigError, match="larger than 1 MiB"):
-            checker.check_now("x" * (1 << 20) + "x", "job.yaml")
+            check_in_child(checker, "x" * (1 << 20) + "x", "job.yaml")
 
 
-def test_an_environment_that_hangs_or_kills_costs_only_its_own_process(tmp_path, environments, monkeypatch):
+def test_an_environment_that_hangs_or_kills_affects_only_its_own_process(tmp_path, environments, monkeypatch):
     with contextlib.closing(JobChecker(tmp_path)) as checker:
         with pytest.raises(ConfigError, match="ended the process that was checking it"):
-            checker.check_now(environments["killing"], "job.yaml")
-        assert checker.check_now(TINY, "tiny.yaml").runs == 2
+            check_in_child(checker, environments["killing"], "job.yaml")
+        assert check_in_child(checker, TINY, "tiny.yaml").runs == 2
     monkeypatch.setattr(checking, "CHECK_SECONDS", 1.0)
     with (
         contextlib.closing(JobChecker(tmp_path)) as checker,
         pytest.raises(ConfigError, match="took longer than 1 s to check"),
     ):
-        checker.check_now(environments["hanging"], "job.yaml")
+        check_in_child(checker, environments["hanging"], "job.yaml")
 
 
-def test_an_environment_that_takes_too_much_memory_is_refused(tmp_path, environments, monkeypatch):
+def test_an_environment_that_needs_too_much_memory_is_refused(tmp_path, environments, monkeypatch):
     monkeypatch.setattr(checking, "MEMORY_BYTES", 256 << 20)
     with contextlib.closing(JobChecker(tmp_path)) as checker:
         with pytest.raises(ConfigError, match=r"needs more than 0\.25 GiB of memory"):
-            checker.check_now(environments["greedy"], "job.yaml")
-        assert checker.check_now(TINY, "tiny.yaml").runs == 2
+            check_in_child(checker, environments["greedy"], "job.yaml")
+        assert check_in_child(checker, TINY, "tiny.yaml").runs == 2
 
 
-def test_checks_that_hang_keep_no_other_request_waiting(client, environments):
+def test_checks_that_hang_do_not_block_other_requests(client, environments):
     with ThreadPoolExecutor(10) as threads:
         hanging = [
             threads.submit(client.post, "/api/v1/jobs/check", content=environments["hanging"])
@@ -135,12 +140,12 @@ def test_checks_that_hang_keep_no_other_request_waiting(client, environments):
 
 @pytest.fixture
 def environments(tmp_path, monkeypatch):
-    """Return configurations whose environment, when it is imported, does what its name says."""
+    """Return configurations by what their environment does when it is imported."""
     monkeypatch.syspath_prepend(tmp_path)
     codes = {
         "hanging": "import time\ntime.sleep(600)\n",
         "killing": "import os\nos._exit(3)\n",
-        "greedy": "kept = bytearray(1 << 30)\n",
+        "greedy": "data = bytearray(1 << 30)\n",
     }
     for name, code in codes.items():
         (tmp_path / f"{name}.py").write_text(code)

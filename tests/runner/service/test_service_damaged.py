@@ -1,4 +1,4 @@
-"""Values in `run.json` and in results that cannot be: listed, shown and removable, never believed."""
+"""Impossible values in `run.json` and in results: listed, shown and removable, never trusted."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_no_value_in_a_run_file_breaks_a_command_or_a_page(recordings, client):
         assert shown(recordings, "show", first.run_id).exit_code == 0, what
 
 
-def test_no_value_in_a_run_file_hides_the_run_from_lists_or_keeps_it(recordings, tmp_path):
+def test_no_value_in_a_run_file_hides_the_run_or_prevents_its_removal(recordings, tmp_path):
     first, _ = reversed(list_runs(recordings))
     whole = json.loads(json.dumps(first.facts))
     many = tmp_path / "many"
@@ -101,7 +101,7 @@ def test_no_value_in_a_run_file_hides_the_run_from_lists_or_keeps_it(recordings,
     assert shown(many, "ls", "--quiet", "status:damaged").stdout == ""
 
 
-def test_a_damaged_run_says_what_of_it_is_wrong(recordings, client):
+def test_a_damaged_run_has_a_message(recordings, client):
     first, _ = reversed(list_runs(recordings))
     facts = json.loads(json.dumps(first.facts))
     facts["summary"]["train_steps"] = "many"
@@ -112,10 +112,10 @@ def test_a_damaged_run_says_what_of_it_is_wrong(recordings, client):
     assert "damaged" in flat
     assert what in client.get(f"/runs/{first.run_id}").text.replace("&#39;", "'")
     assert what in shown(recordings, "ls").stderr
-    (told,) = (
+    (row,) = (
         run for run in json.loads(shown(recordings, "ls", "--json").stdout)["runs"] if run["name"] == "first"
     )
-    assert (told["status"], told["train_steps"]) == ("damaged", None)
+    assert (row["status"], row["train_steps"]) == ("damaged", None)
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ def test_a_damaged_run_says_what_of_it_is_wrong(recordings, client):
         ("more", nested(200)),
     ],
 )
-def test_a_result_that_cannot_be_is_refused(recordings, tmp_path, key, wrong):
+def test_an_impossible_result_is_refused(recordings, tmp_path, key, wrong):
     first, _ = reversed(list_runs(recordings))
 
     def change(entries):
@@ -147,9 +147,9 @@ def test_a_result_that_cannot_be_is_refused(recordings, tmp_path, key, wrong):
     assert shown(recordings, "show", made).exit_code == 0
     shutil.copy(made, first.recording)
     (first.folder / RUN_FILE).unlink()
-    (told,) = (
+    (row,) = (
         run for run in json.loads(shown(recordings, "ls", "--json").stdout)["runs"] if run["name"] == "first"
     )
-    assert told["status"] == ("interrupted" if wrong == "running" else "damaged")
+    assert row["status"] == ("interrupted" if wrong == "running" else "damaged")
     assert shown(recordings, "show", first.run_id).exit_code == 0
     assert shown(recordings, "rm", "--yes", first.run_id).exit_code == 0

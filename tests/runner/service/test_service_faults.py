@@ -1,4 +1,4 @@
-"""What goes wrong around a service that runs: slow clients, a full disk, a lost index, a stop."""
+"""Faults around a running service: slow clients, a full disk, a lost index, a stop."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.waiting import until
 
 @pytest.fixture
 def impatient(settings):
-    """Return the port of a service that waits half a second only."""
+    """Return the port of a service with timeouts of half a second."""
     limits = Limits(header_seconds=0.5, idle_seconds=0.5, keep_alive_seconds=1, stop_seconds=1)
     settings = dataclasses.replace(settings, port=0, limits=limits)
     app, listening = create_app(settings), bind(settings)
@@ -62,13 +62,13 @@ def _seconds_until_cut_off(connection):
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"\r\n"])
-def test_who_does_not_ask_is_cut_off(impatient, sent):
+def test_a_client_that_sends_no_request_is_cut_off(impatient, sent):
     with socket.create_connection(("localhost", impatient)) as connection:
         connection.sendall(sent)
         assert 0.2 < _seconds_until_cut_off(connection) < 3
 
 
-def test_who_sends_a_header_at_a_time_is_cut_off(impatient):
+def test_a_client_that_sends_headers_slowly_is_cut_off(impatient):
     with socket.create_connection(("localhost", impatient)) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\n")
         began = time.monotonic()
@@ -79,7 +79,7 @@ def test_who_sends_a_header_at_a_time_is_cut_off(impatient):
         assert time.monotonic() - began < 3
 
 
-def test_a_body_that_does_not_come_is_refused(impatient):
+def test_a_body_that_does_not_arrive_is_refused(impatient):
     with socket.create_connection(("localhost", impatient)) as connection:
         origin = f"Origin: http://localhost:{impatient}\r\nHost: localhost:{impatient}\r\n"
         head = f"PATCH /api/v1/runs/first HTTP/1.1\r\n{origin}Content-Type: application/json\r\n"
@@ -88,7 +88,7 @@ def test_a_body_that_does_not_come_is_refused(impatient):
         assert connection.recv(65536).startswith(b"HTTP/1.1 408")
 
 
-def test_a_head_without_end_is_refused(impatient):
+def test_an_endless_head_is_refused(impatient):
     with socket.create_connection(("localhost", impatient)) as connection:
         connection.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
         sent = 0
@@ -100,7 +100,7 @@ def test_a_head_without_end_is_refused(impatient):
         assert sent < 1000
 
 
-def test_who_does_not_read_is_cut_off(impatient, recordings):
+def test_a_client_that_does_not_read_is_cut_off(impatient, recordings):
     large = next(recordings.glob("*/recording.mcap"))
     with large.open("r+b") as stream:
         stream.truncate(64 << 20)
@@ -117,7 +117,7 @@ def test_who_does_not_read_is_cut_off(impatient, recordings):
         assert received < 32 << 20
 
 
-def test_many_slow_clients_do_not_keep_others_waiting(impatient):
+def test_many_slow_clients_do_not_block_others(impatient):
     slow = [socket.create_connection(("localhost", impatient)) for _ in range(200)]
     try:
         for connection in slow:
@@ -128,7 +128,7 @@ def test_many_slow_clients_do_not_keep_others_waiting(impatient):
             connection.close()
 
 
-def test_the_index_deleted_under_it_is_made_anew(client, recordings):
+def test_a_deleted_or_damaged_index_is_created_again(client, recordings):
     before = client.get("/api/v1/runs").json()
     for damage in (index_path().unlink, lambda: index_path().write_bytes(b"no database" * 1000)):
         damage()
@@ -137,7 +137,7 @@ def test_the_index_deleted_under_it_is_made_anew(client, recordings):
         assert after == before
 
 
-def test_a_run_that_appears_or_goes_is_told_soon(client, recordings):
+def test_new_and_removed_runs_are_noticed_soon(client, recordings):
     import shutil
 
     assert client.get("/api/v1/runs").json()["total"] == 2
@@ -145,7 +145,7 @@ def test_a_run_that_appears_or_goes_is_told_soon(client, recordings):
     until(lambda total: total == 1, lambda: client.get("/api/v1/runs").json()["total"], 10)
 
 
-def test_a_full_disk_is_said(client, monkeypatch):
+def test_a_full_disk_is_reported(client, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -157,7 +157,7 @@ def test_a_full_disk_is_said(client, monkeypatch):
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
-def test_a_stop_lets_an_answer_come_to_its_end(recordings, how):
+def test_a_stop_completes_running_responses(recordings, how):
     large = next(recordings.glob("*/recording.mcap"))
     with large.open("r+b") as stream:
         stream.truncate(40 << 20)
@@ -173,12 +173,12 @@ def test_a_stop_lets_an_answer_come_to_its_end(recordings, how):
             received += sum(map(len, parts))
         assert received == 40 << 20
         assert served.process.wait(10) == 0
-    assert served.log.read_text() == "", "all that it says is in the log"
+    assert served.log.read_text() == "", "everything is in the log"
     events = [json.loads(line)["event"] for line in log.read_text().splitlines()]
     assert events.count("stopping") == 1
 
 
-def test_a_port_that_is_taken_and_a_folder_that_is_served_are_said(recordings):
+def test_a_used_port_and_a_served_folder_are_reported(recordings):
     with Served(recordings) as served:
         port, elsewhere = str(served.port), recordings.with_name("elsewhere")
         taken, twice = (

@@ -1,4 +1,4 @@
-"""JobPool over HTTP: submitted, watched, cancelled, resumed."""
+"""Jobs over HTTP: submitted, watched, cancelled, resumed."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def job(client, number):
     return client.get(f"/api/v1/jobs/{number}").json()
 
 
-def job_until(client, number, is_so):
-    return until(is_so, lambda: job(client, number))
+def job_until(client, number, condition):
+    return until(condition, lambda: job(client, number))
 
 
 def watched(client, number, last=None):
-    """Return all that a watcher sees until the stream ends: (id, event, data)."""
+    """Return all events of a stream as (id, event, data)."""
     headers = {} if last is None else {"Last-Event-ID": str(last)}
     answer = client.get(f"/api/v1/jobs/{number}/events", headers=headers)
     assert answer.headers["content-type"].startswith("text/event-stream")
@@ -60,7 +60,7 @@ def watched(client, number, last=None):
     return seen
 
 
-def test_a_configuration_is_done_seed_by_seed_as_from_the_command_line(client, submit, recordings, tmp_path):
+def test_a_configuration_is_run_seed_by_seed_as_from_the_command_line(client, submit, recordings, tmp_path):
     number = submit(CONFIG)
     seen = watched(client, number)
     done = job(client, number)
@@ -84,7 +84,7 @@ def test_a_configuration_is_done_seed_by_seed_as_from_the_command_line(client, s
     assert progress[-1]["last_evaluation"]["episode"] == 200
 
 
-def test_a_watcher_comes_back_to_where_it_was(client, submit):
+def test_a_watcher_continues_after_the_last_event(client, submit):
     number = submit(CONFIG | {"seeds": [0]})
     seen = [event for event in watched(client, number) if event[0]]
     assert [event for event in watched(client, number) if event[0]] == seen
@@ -94,14 +94,14 @@ def test_a_watcher_comes_back_to_where_it_was(client, submit):
     assert end.status_code == 204
 
 
-def test_a_watcher_that_comes_after_the_end_is_told_how_far_the_job_came(client, submit):
+def test_a_late_watcher_receives_the_last_progress(client, submit):
     number = submit(CONFIG)
     job_until(client, number, lambda job: job["state"] == "finished" and job["progress"] is None)
     (progress,) = [data for _, event, data in watched(client, number) if event == "progress"]
     assert (progress["run"], progress["runs"], progress["episode"]) == (2, 2, 200)
 
 
-def test_a_running_job_is_cancelled_and_goes_on_when_it_is_resumed(client, submit, recordings):
+def test_a_running_job_is_cancelled_and_resumed(client, submit, recordings):
     config = {"episodes": 1500, "mode": "cooperative", "evaluation": {"every": 100, "trials": 200}}
     number = submit(config)
     job_until(client, number, lambda job: (job["progress"] or {}).get("episode", 0) > 0)
@@ -124,14 +124,12 @@ def test_a_running_job_is_cancelled_and_goes_on_when_it_is_resumed(client, submi
     alone = runner.run(config, recordings=recordings)
     assert run.summary["content_digest"] == alone.summary["content_digest"]
     log = [data["text"] for _, event, data in watched(client, number) if event == "log"]
-    said = [text for text in log if text.startswith("evaluation")]
-    assert len(said) == len(set(said)) == 16, "no line is said again by a run that goes on"
+    lines = [text for text in log if text.startswith("evaluation")]
+    assert len(lines) == len(set(lines)) == 16, "a resumed run repeats no line"
     assert client.post(f"/api/v1/jobs/{number}/resume").status_code == 409
 
 
-def test_no_more_jobs_run_than_there_are_workers_and_those_that_wait_can_be_cancelled(
-    connect, settings, client
-):
+def test_jobs_wait_for_workers_and_can_be_cancelled_meanwhile(connect, settings, client):
     numbers = [client.post("/api/v1/jobs", content=json.dumps(ENDLESS)).json()["number"] for _ in range(4)]
     job_until(client, numbers[1], lambda job: job["progress"] is not None)
     page = client.get("/api/v1/jobs").json()
@@ -144,7 +142,7 @@ def test_no_more_jobs_run_than_there_are_workers_and_those_that_wait_can_be_canc
     job_until(client, numbers[3], lambda job: job["state"] == "running")
 
 
-def test_a_sweep_is_done_and_may_use_the_workers_that_nobody_waits_for(client, submit, recordings, tmp_path):
+def test_a_sweep_uses_the_free_workers(client, submit, recordings, tmp_path):
     number = submit(SWEEP)
     busy = client.post("/api/v1/jobs", content=json.dumps(SWEEP))
     assert busy.status_code == 409
@@ -163,7 +161,7 @@ def test_a_sweep_is_done_and_may_use_the_workers_that_nobody_waits_for(client, s
     assert 'data-later="/sweeps/small/pictures"' in first
 
     def texts():
-        """The index notices late that the last runs are over, and then the page is made once more."""
+        """Return the pages, which change once more when the index notices that the last runs are over."""
         return [client.get(f"/sweeps/small{rest}").text for rest in ("?whole=true", "", "/results")]
 
     page, _, table = until(lambda seen: seen[0] == seen[1] and seen[2] in seen[0], texts)
@@ -171,7 +169,7 @@ def test_a_sweep_is_done_and_may_use_the_workers_that_nobody_waits_for(client, s
     assert 'alt="Length of evaluation trials over training episodes"' in page
 
 
-def test_a_job_whose_worker_dies_is_tried_again_and_then_fails(client, submit):
+def test_a_job_whose_worker_dies_is_retried_and_then_fails(client, submit):
     import psutil
 
     number = submit(ENDLESS)
@@ -185,18 +183,18 @@ def test_a_job_whose_worker_dies_is_tried_again_and_then_fails(client, submit):
     assert failed["error"].startswith("its worker died 2 times, at last with exit code -9")
 
 
-def test_a_job_that_cannot_be_done_says_why_and_is_tried_again_when_asked(client, submit):
+def test_a_failed_job_has_a_message_and_can_be_resumed(client, submit):
     number = submit(SWEEP | {"objective": {"metric": "training.mean_rewards"}})
     failed = job_until(client, number, lambda job: job["state"] == "failed")
     assert "Did you mean 'training.mean_reward'?" in failed["error"]
-    told = watched(client, number)[-1][2]
-    assert (told["state"], told["error"]) == ("failed", failed["error"])
+    last = watched(client, number)[-1][2]
+    assert (last["state"], last["error"]) == ("failed", failed["error"])
     again = client.post(f"/api/v1/jobs/{number}/resume").json()
     assert (again["state"], again["error"]) == ("queued", "")
     assert job_until(client, number, lambda job: job["state"] == "failed")["error"] == failed["error"]
 
 
-def test_mistakes_are_told_with_line_and_key(client, recordings):
+def test_mistakes_are_reported_with_line_and_key(client, recordings):
     answer = client.post("/api/v1/jobs", params={"source": "my.yaml"}, content="episodes: 3\nepsilom: 1\n")
     assert answer.status_code == 422
     error = answer.json()["error"]
@@ -215,7 +213,7 @@ def test_a_text_can_be_checked_without_being_queued(client):
     assert client.get("/api/v1/jobs").json()["total"] == 0
 
 
-def test_what_the_disk_would_not_hold_is_refused_and_a_full_one_is_waited_for(client, submit, monkeypatch):
+def test_a_job_that_is_too_large_is_refused_and_a_full_disk_delays_jobs(client, submit, monkeypatch):
     monkeypatch.setattr(pool, "free_bytes", lambda _: 1000)
     refused = client.post("/api/v1/jobs", content=json.dumps(CONFIG))
     assert refused.status_code == 507
@@ -229,7 +227,7 @@ def test_what_the_disk_would_not_hold_is_refused_and_a_full_one_is_waited_for(cl
     job_until(client, number, lambda job: job["state"] == "finished")
 
 
-def test_unknown_jobs_are_told(client):
+def test_unknown_jobs_are_not_found(client):
     for path in ("", "/events", "/submitted"):
         assert client.get(f"/api/v1/jobs/7{path}").status_code == 404
     for verb in ("cancel", "resume"):
@@ -237,13 +235,13 @@ def test_unknown_jobs_are_told(client):
     assert client.get("/api/v1/jobs/0").status_code == 422
 
 
-def test_what_was_submitted_is_given_back(client, submit):
+def test_the_submitted_text_is_returned(client, submit):
     number = submit(ENDLESS)
     assert json.loads(client.get(f"/api/v1/jobs/{number}/submitted").text) == ENDLESS
 
 
 @pytest.mark.parametrize("folder", ["missing", "there"])
-def test_a_run_that_was_promised_but_never_made_is_made(tmp_path, folder):
+def test_a_reserved_run_that_was_never_made_is_made(tmp_path, folder):
     """The server reserved the run's id, or the worker made its folder as well, and was killed."""
     with JobPool(tmp_path, 1) as jobs:
         if folder == "there":
@@ -259,10 +257,10 @@ def test_a_run_that_was_promised_but_never_made_is_made(tmp_path, folder):
         assert [run.run_id for run in runs] == [jobs.store.run_ids(queued.number)[3]] == ["abcdefgh"]
 
 
-def test_a_worker_that_cannot_be_started_is_waited_for_and_readiness_says_so(
+def test_a_worker_that_cannot_be_started_is_retried_and_readiness_reports_it(
     client, submit, settings, monkeypatch
 ):
-    """The system has no process to give for a while: the queue must not stand still for ever."""
+    """The system has no process to give for a while: the queue must continue afterwards."""
 
     def refused(_):
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
@@ -282,13 +280,13 @@ def test_a_worker_that_cannot_be_started_is_waited_for_and_readiness_says_so(
     assert client.get("/readyz").status_code == 200
 
 
-def test_what_goes_wrong_with_one_job_does_not_stop_the_others(client, submit, monkeypatch):
+def test_an_error_of_one_job_does_not_stop_the_others(client, submit, monkeypatch):
     jobs = jobs_of(client)
     add_events = jobs.store.add_events
 
     def failing(number, *facts):
         if number == 1:
-            raise RuntimeError("a fault of our own")
+            raise RuntimeError("our own fault")
         add_events(number, *facts)
 
     monkeypatch.setattr(jobs.store, "add_events", failing)
@@ -299,7 +297,7 @@ def test_what_goes_wrong_with_one_job_does_not_stop_the_others(client, submit, m
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_readiness_tells_when_the_thread_of_the_jobs_is_dead(client, monkeypatch):
+def test_readiness_reports_a_dead_job_thread(client, monkeypatch):
     def fatal(*_):
         raise SystemExit
 
@@ -316,7 +314,7 @@ def test_a_cancelled_job_is_not_forgotten_while_its_worker_closes(client, submit
     job_until(client, number, lambda job: job["progress"] is not None)
     with jobs._lock:  # the worker's end is not taken in before the next job is there
         jobs.cancel(number)
-        other = jobs.submit(json.dumps(CONFIG | {"seeds": [0]})).number
+        other = jobs.store.add("config", "icy", 1, "", one_seed()).number
     job_until(client, other, lambda job: job["state"] == "finished")
 
 

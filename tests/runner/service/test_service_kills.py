@@ -1,4 +1,4 @@
-"""A server that is killed in the middle of its jobs, and started again."""
+"""A server that is killed during its jobs, and started again."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SWEEP = {
 
 
 def is_under_way(jobs):
-    """Return whether a job is in its middle, and others before it."""
+    """Return whether a job has made progress."""
     return any(
         job["state"] == "running" and (job["progress"] or {}).get("episode", 0) > 0 for job in jobs.values()
     )
@@ -57,7 +57,7 @@ def submitted(server, seeds):
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
-    """The content digests of the runs of five seeds, by seed, as nothing disturbed them."""
+    """The content digests of undisturbed runs of five seeds, by seed."""
     runs = runner.run_all(CONFIG | {"seeds": list(range(5))}, recordings=tmp_path_factory.mktemp("alone"))
     return {run.seed: run.summary["content_digest"] for run in runs}
 
@@ -68,7 +68,7 @@ def digests(recordings):
     return sorted((run.seed, run.summary["content_digest"]) for run in runs)
 
 
-def test_five_jobs_survive_that_the_server_and_then_everything_is_killed(tmp_path, undisturbed):
+def test_five_jobs_survive_kills_of_the_server_and_of_everything(tmp_path, undisturbed):
     with Served(tmp_path) as server:
         submitted(server, range(5))
         server.until(is_under_way)
@@ -109,7 +109,7 @@ def test_a_new_server_waits_for_a_worker_that_has_not_stopped_yet(tmp_path, undi
         assert digests(tmp_path) == [(0, undisturbed[0])]
 
 
-def test_a_server_that_is_told_to_stop_leaves_its_job_resumable_and_lets_watchers_go(tmp_path):
+def test_a_stopped_server_leaves_its_job_resumable_and_ends_event_streams(tmp_path):
     config = CONFIG | {"evaluation": {"every": 100, "trials": 3500}, "recording": {"steps": "none"}}
     with Served(tmp_path, "--workers", "1") as server:
         server.post("/jobs", json.dumps(config))
@@ -163,12 +163,12 @@ class Here:
 
 
 def tried(folder):
-    """Return the trials of the sweep, with what came of them."""
+    """Return the trials of the sweep with their results."""
     trials = recorded(Trials(state.read_sweep("small", folder)), folder)
     return [(trial.values, trial.value, trial.results[0].digest) for trial in trials]
 
 
-def test_a_sweep_that_was_killed_ends_as_if_it_never_had_been(tmp_path):
+def test_a_killed_sweep_ends_as_if_it_never_was(tmp_path):
     calm, killed = tmp_path / "calm", tmp_path / "killed"
     sweep = from_values(SWEEP)
     state.begin(sweep, calm, resume=False, accept_changes=False)

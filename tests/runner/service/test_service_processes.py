@@ -43,7 +43,7 @@ def test_results_and_errors_are_those_of_the_function_on_any_event_loop(pool):
         loop.run(calls())
 
 
-def test_what_exceeds_a_limit_or_dies_is_given_up(pool):
+def test_a_call_that_exceeds_a_limit_or_dies_fails(pool):
     with pytest.raises(OutOfMemory, match=r"more than 0\.25 GiB"):
         pool.submit(bytearray, 2 * MEMORY).result()
     with pytest.raises(ProcessDied):
@@ -52,19 +52,19 @@ def test_what_exceeds_a_limit_or_dies_is_given_up(pool):
         hasty.submit(time.sleep, 600).result()
 
 
-def test_closing_ends_calls_that_are_under_way():
+def test_closing_ends_running_calls():
     pool = ProcessPool(1, 600, MEMORY)
     calls = [pool.submit(time.sleep, 600) for _ in range(3)]
     pool.close()
     assert all(isinstance(call.exception(), ProcessDied) for call in calls)
 
 
-def test_a_process_is_used_again_when_it_is_kept():
+def test_a_process_can_be_reused():
     with ProcessPool(1, 30, MEMORY, is_reused=True) as pool:
         assert pool.submit(os.getpid).result() == pool.submit(os.getpid).result()
 
 
-def test_calls_of_a_kept_process_leave_no_threads_behind():
+def test_calls_of_a_reused_process_leak_no_threads():
     with ProcessPool(1, 30, MEMORY, is_reused=True) as pool:
         pool.submit(os.getpid).result()
         before = threading.active_count()

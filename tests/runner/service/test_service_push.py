@@ -1,4 +1,4 @@
-"""Runs on their way to a server and back: commands, loops, crashes, servers that are killed or away."""
+"""Pushing and pulling runs: commands, loops, crashes, servers that are killed or unavailable."""
 
 from __future__ import annotations
 
@@ -78,8 +78,8 @@ def run(recordings):
     return find_run("first", recordings)
 
 
-def dualtaxi(*words):
-    return CliRunner().invoke(cli, [str(word) for word in words])
+def dualtaxi(*args):
+    return CliRunner().invoke(cli, [str(arg) for arg in args])
 
 
 def copies(run, folder, count):
@@ -94,7 +94,7 @@ def copies(run, folder, count):
 # --- commands ---------------------------------------------------------------------------------------------
 
 
-def test_a_run_is_pushed_and_pulled_with_all_that_is_known_of_it(server, run, recordings, tmp_path):
+def test_a_run_is_pushed_and_pulled_with_its_labels(server, run, recordings, tmp_path):
     change_labels(run.folder, lambda labels: replace(labels, name="renamed", tags=("good",), note="seen"))
     push = ("remote", "push", run.run_id, "--recordings", recordings, "--server", server.url, "--json")
     pushed = json.loads(dualtaxi(*push).stdout)
@@ -121,7 +121,7 @@ def test_an_exported_file_is_pushed_like_its_run(server, recordings, tmp_path):
     assert find_run(run.run_id, server.recordings).recording.read_bytes() == run.recording.read_bytes()
 
 
-def test_what_cannot_be_pushed_is_said_and_the_others_are_pushed(server, run, recordings):
+def test_runs_that_cannot_be_pushed_are_reported_and_the_others_pushed(server, run, recordings):
     result = dualtaxi(
         "remote", "push", "nosuch", run.run_id, "--recordings", recordings, "--server", server.url
     )
@@ -135,7 +135,7 @@ def test_what_cannot_be_pushed_is_said_and_the_others_are_pushed(server, run, re
     assert (missing.exit_code, "nosuch" in missing.stderr) == (2, True)
 
 
-def test_a_refused_run_is_said_to_be(server, run, tmp_path):
+def test_a_refused_run_is_reported(server, run, tmp_path):
     data = bytearray(run.recording.read_bytes())
     data[len(data) // 2] ^= 1
     (tmp_path / "bad.mcap").write_bytes(data)
@@ -143,7 +143,7 @@ def test_a_refused_run_is_said_to_be(server, run, tmp_path):
         client.push(UploadSource(tmp_path / "bad.mcap"))
 
 
-def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recordings, tmp_path, monkeypatch):
+def test_a_token_is_found_and_never_printed(own_server, run, recordings, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     token = dualtaxi("token", "create", "pusher", "--scope", "write").stdout.strip()
     own_server.options = ("--require-token",)
@@ -163,26 +163,26 @@ def test_a_token_is_taken_from_where_it_is_and_never_told(own_server, run, recor
     assert all(token not in path.read_text() for path in states)
 
 
-def test_what_is_waited_for_is_told_and_for_as_long_as_the_server_says(monkeypatch):
-    slept, told = [], []
+def test_pauses_are_logged_and_as_long_as_the_server_asks(monkeypatch):
+    slept, messages = [], []
     monkeypatch.setattr("runner.client.connection.time.sleep", slept.append)
     locked = ServerUnavailable("token: too many wrong ones; try again in 40 s.", 429, 40)
-    backoff = Backoff(60, told.append)
+    backoff = Backoff(60, messages.append)
     backoff.wait(locked)
-    assert (slept, told) == ([40], [f"{locked} Trying again, for 60 s at most."])
+    assert (slept, messages) == ([40], [f"{locked} Trying again, for 60 s at most."])
     with pytest.raises(ServerUnavailable, match="too many"):
-        Backoff(30, told.append).wait(locked)
-    slept.clear(), told.clear()
+        Backoff(30, messages.append).wait(locked)
+    slept.clear(), messages.clear()
     backoff.reset()
     for _ in range(3):
         backoff.wait(ServerUnavailable("does not answer"))
-    assert (slept, told) == ([0.2, 0.4, 0.8], []), "what is over at once is not told"
+    assert (slept, messages) == ([0.2, 0.4, 0.8], []), "short pauses are not logged"
     for _ in range(2):
         backoff.wait(ServerUnavailable("does not answer"))
-    assert (slept[3:], len(told)) == ([1.6, 3.2], 1)
+    assert (slept[3:], len(messages)) == ([1.6, 3.2], 1)
 
 
-def test_how_long_a_server_has_one_wait_is_heard():
+def test_the_header_retry_after_is_obeyed():
     answer = httpx2.Response(429, headers={"retry-after": "40"}, json={"error": {"message": "too many"}})
     with Client("http://localhost:8000") as client:
         client._http = httpx2.Client(transport=httpx2.MockTransport(lambda _: answer), base_url=client.url)
@@ -210,7 +210,7 @@ def test_tokens_and_addresses_are_checked(tmp_path, monkeypatch):
 # --- faults -----------------------------------------------------------------------------------------------
 
 
-def test_a_server_killed_in_the_middle_of_twenty_uploads_loses_none(own_server, run, tmp_path, monkeypatch):
+def test_a_server_killed_during_twenty_uploads_loses_none(own_server, run, tmp_path, monkeypatch):
     monkeypatch.setattr(client_module, "PIECE", 8 << 10)
     sources = copies(run, tmp_path, 20)
     own_server.start()
@@ -239,7 +239,7 @@ def test_a_server_killed_in_the_middle_of_twenty_uploads_loses_none(own_server, 
     assert not list(own_server.recordings.glob(".uploads/*/body"))
 
 
-def test_a_connection_that_lies_or_is_cut_leaves_what_came(server, run):
+def test_a_broken_connection_leaves_what_was_received(server, run):
     data = run.recording.read_bytes()
     with Client(server.url) as client:
         sent = client.begin_upload(digest=blake3(data).hexdigest() if data else None, size=len(data) + 5)
@@ -262,7 +262,7 @@ def test_a_connection_that_lies_or_is_cut_leaves_what_came(server, run):
             client.upload_status(now)
 
 
-def test_a_pull_goes_on_where_it_was_cut_off(server, recordings, tmp_path, monkeypatch):
+def test_a_pull_is_resumed(server, recordings, tmp_path, monkeypatch):
     run = find_run("second", recordings)
     real, begun = Client.download, []
 
@@ -327,7 +327,7 @@ def drive(env, steps):
             env.reset()
 
 
-def test_a_loop_recorded_for_a_server_is_there_at_its_end(server, outbox):
+def test_a_loop_recorded_for_a_server_is_stored_at_its_end(server, outbox):
     with runner.record(gymnasium.make("FrozenLake-v1"), server.url, name="loop", config={"lr": 0.1}) as rec:
         drive(rec, 2_000)
         assert [run.run_id for run in list_runs(outbox)] == [rec.run.run_id]
@@ -347,7 +347,7 @@ def fail_at_length(env):
     raise KeyError("x" * 100_000)
 
 
-def test_a_loop_that_failed_at_length_is_pushed_with_the_beginning_of_its_error(server, outbox):
+def test_a_long_error_of_a_loop_is_shortened(server, outbox):
     rec = runner.record(gymnasium.make("FrozenLake-v1"), server.url, name="long")
     with pytest.raises(KeyError, match="xxx"), rec:
         fail_at_length(rec)
@@ -356,7 +356,7 @@ def test_a_loop_that_failed_at_length_is_pushed_with_the_beginning_of_its_error(
     assert list(outbox.iterdir()) == []
 
 
-def test_a_loop_whose_server_is_away_waits_in_the_outbox(own_server, outbox, monkeypatch):
+def test_a_loop_waits_in_the_outbox_for_an_unavailable_server(own_server, outbox, monkeypatch):
     monkeypatch.setattr("runner.client.outbox.LAST_SECONDS", 0.5)
     with pytest.warns(UserWarning, match="dualtaxi remote push --outbox"):  # noqa: SIM117
         with runner.record(gymnasium.make("FrozenLake-v1"), own_server.url, name="away") as rec:
@@ -387,24 +387,24 @@ def test_a_loop_that_is_killed_leaves_what_it_recorded(server, outbox):
         assert recording.count(recording.topic("/train/step")) == 3_000
 
 
-def test_loops_in_many_processes_are_all_there_with_equal_digests(server, outbox):
+def test_loops_of_several_processes_are_stored_with_equal_digests(server, outbox):
     with contextlib.ExitStack() as stack:
         loops = [stack.enter_context(loop(server.url, seed, 5_000)) for seed in range(4)]
-        told = [started.communicate(timeout=200)[0] for started in loops]
-    for line in told:
+        outputs = [started.communicate(timeout=200)[0] for started in loops]
+    for line in outputs:
         assert re.fullmatch(r"\w+ [0-9a-f]{64}\n", line), line
         run_id, digest = line.split()
         assert find_run(run_id, server.recordings).summary["content_digest"] == digest
     assert list(outbox.iterdir()) == []
 
 
-def test_what_is_no_server_is_refused_before_anything_is_recorded(outbox):
+def test_an_invalid_address_is_refused_before_recording(outbox):
     with pytest.raises(runner.RunnerError, match="password"):
         runner.record(gymnasium.make("FrozenLake-v1"), "http://me:secret@localhost")
     assert not outbox.exists()
 
 
-def test_an_upload_begun_with_other_bytes_is_sent_anew(server, run):
+def test_an_upload_begun_with_other_bytes_is_sent_again(server, run):
     with Client(server.url) as client:
         begun = client.begin_upload(name="stale")
         wrong = client.append_upload(begun, run.recording, 5_000)

@@ -1,4 +1,4 @@
-"""What the service tells of a run is what the recording holds and the commands print."""
+"""The API returns what the recording contains and the commands print."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def recording(recordings):
         yield opened
 
 
-def test_one_run_is_told_as_show_does(client, recordings):
-    told = client.get(RUN).json()
+def test_a_run_is_described_as_by_show(client, recordings):
+    shown_here = client.get(RUN).json()
     shown = _printed("show", "first", "--json", "--recordings", str(recordings))
     same = set(shown) - {"eval", "train", "optimality", "path"}
-    assert {key: told[key] for key in same} == {key: shown[key] for key in same}
-    assert told["last_evaluation"] == shown["eval"][-1]
-    assert "path" not in told
+    assert {key: shown_here[key] for key in same} == {key: shown[key] for key in same}
+    assert shown_here["last_evaluation"] == shown["eval"][-1]
+    assert "path" not in shown_here
     for part, name in (("eval", "evaluations"), ("train", "training"), ("optimality", "optimality")):
         answer = client.get(f"{RUN}/{name}").json()
         assert answer["records"] == shown[part]
@@ -69,7 +69,7 @@ def test_steps_and_episodes_are_those_recorded(client, recording, phase):
     assert episodes["columns"]["length"] == recording.episodes(phase, 1, 3)["length"].tolist()
 
 
-def test_arrow_holds_the_same_columns(client):
+def test_arrow_has_the_same_columns(client):
     for table in ("steps", "episodes"):
         asked = {"start": 5, "stop": 30}
         listed = client.get(f"{RUN}/{table}/train", params=asked).json()["columns"]
@@ -83,12 +83,12 @@ def test_the_q_table_at_a_step_is_the_exact_one(client, recording, recordings):
         np.load(io.BytesIO(body), allow_pickle=False), one_array(tables_at(recording, 777))
     )
     asked = {"step": 777, "state": 17}
-    told = client.get(f"{RUN}/qtable", params=asked).json()
+    shown_here = client.get(f"{RUN}/qtable", params=asked).json()
     words = ("--step", "777", "--state", "17", "--json", "--recordings", str(recordings))
-    assert told == _printed("qtable", "first", *words)
+    assert shown_here == _printed("qtable", "first", *words)
 
 
-def test_a_moment_that_was_not_is_refused(client):
+def test_a_moment_that_does_not_exist_is_refused(client):
     assert client.get(f"{RUN}/qtable", params={"step": 10**9}).status_code == 409
     assert client.get(f"{RUN}/qtable", params={"step": 1, "episode": 1}).status_code == 422
     assert client.get(f"{RUN}/qtable", params={"step": 1, "state": 10**6}).status_code == 400
@@ -96,7 +96,7 @@ def test_a_moment_that_was_not_is_refused(client):
     assert client.get(f"{RUN}/steps/test").status_code == 422
 
 
-def test_a_range_beyond_the_end_is_empty_and_one_too_long_refused(client):
+def test_a_range_after_the_end_is_empty_and_a_too_long_one_refused(client):
     answer = client.get(f"{RUN}/steps/train", params={"start": 10**9, "stop": 10**9 + 5})
     assert answer.status_code == 200
     assert answer.json()["columns"]["step"] == []
@@ -105,7 +105,7 @@ def test_a_range_beyond_the_end_is_empty_and_one_too_long_refused(client):
     assert "in parts" in long.json()["error"]["message"]
 
 
-def test_metrics_are_whole_or_say_that_they_are_thinned(client, recording):
+def test_metrics_are_complete_or_marked_as_thinned(client, recording):
     curves = client.get(f"{RUN}/metrics").json()["curves"]
     finish = next(curve for curve in curves if curve["metric"] == "success_percent")
     recorded = [record["success_percent"] for record in recording.metrics("eval")]
@@ -128,7 +128,7 @@ def test_plots_are_pictures(client):
     assert client.get(f"{RUN}/plot.gif").status_code == 422
 
 
-def test_diff_and_compare_are_those_of_the_commands(client, recordings):
+def test_diff_and_compare_equal_the_commands(client, recordings):
     place = ("--json", "--recordings", str(recordings))
     diff = client.get("/api/v1/diff", params={"a": "first", "b": "second", "target": "success_percent=1"})
     assert diff.json() == _printed("diff", "first", "second", "--target", "success_percent=1", *place, code=1)
@@ -140,7 +140,7 @@ def test_diff_and_compare_are_those_of_the_commands(client, recordings):
     assert "expected at least two" in alone.json()["error"]["message"]
 
 
-def test_the_recording_comes_whole_and_in_ranges(client, recordings):
+def test_the_recording_is_served_whole_and_in_ranges(client, recordings):
     run = find_run("first", recordings)
     whole = run.recording.read_bytes()
     answer = client.get(f"{RUN}/recording")
@@ -157,7 +157,7 @@ def test_the_recording_comes_whole_and_in_ranges(client, recordings):
     assert int(head.headers["content-length"]) == len(whole)
 
 
-def test_the_replay_is_made_once_and_kept(client, recordings):
+def test_the_replay_is_made_once_and_cached(client, recordings):
     first = client.get(f"{RUN}/replay.rrd", params={"episodes": "0:2"})
     assert first.content.startswith(b"RRF2")
     again = client.get(f"{RUN}/replay.rrd", params={"episodes": "0:2"})
@@ -165,19 +165,19 @@ def test_the_replay_is_made_once_and_kept(client, recordings):
     assert client.get(f"{RUN}/replay.rrd", params={"episodes": "x"}).status_code == 422
 
 
-def test_a_damaged_recording_is_told_not_thrown(client, recordings):
+def test_a_damaged_recording_is_reported(client, recordings):
     run = find_run("first", recordings)
     run.recording.write_bytes(run.recording.read_bytes()[:1000])
     assert client.get(f"{RUN}/metrics").status_code == 409
-    told = client.get(RUN).json()
-    assert told["problems"]
-    assert told["status"] == "finished"
+    shown_here = client.get(RUN).json()
+    assert shown_here["problems"]
+    assert shown_here["status"] == "finished"
     run.recording.unlink()
     assert client.get(f"{RUN}/steps/train").status_code == 409
     assert client.get(f"{RUN}/recording").status_code == 409
 
 
-def test_a_loop_of_composed_values_is_read_a_column_a_part(client, recordings):
+def test_composed_values_of_a_loop_are_separate_columns(client, recordings):
     space = gymnasium.spaces.Dict(
         {"place": gymnasium.spaces.Box(-1, 1, (2,)), "go": gymnasium.spaces.Discrete(3)}
     )
@@ -196,8 +196,8 @@ def test_a_loop_of_composed_values_is_read_a_column_a_part(client, recordings):
         for _ in range(4):
             env.reset(seed=1)
             env.step(0)
-    told = client.get("/api/v1/runs/walk/steps/train").json()["columns"]
-    assert np.shape(told["next_observation.place"]) == (4, 2)
+    shown_here = client.get("/api/v1/runs/walk/steps/train").json()["columns"]
+    assert np.shape(shown_here["next_observation.place"]) == (4, 2)
     body = client.get("/api/v1/runs/walk/steps/train.arrow").content
-    assert pa.ipc.open_stream(body).read_all().to_pydict() == told
+    assert pa.ipc.open_stream(body).read_all().to_pydict() == shown_here
     assert client.get("/api/v1/runs/walk/qtable").status_code == 400

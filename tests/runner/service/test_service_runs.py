@@ -1,4 +1,4 @@
-"""The list of runs over HTTP is the one of `dualtaxi ls`."""
+"""The list of runs over HTTP equals that of `dualtaxi ls`."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def _ls(recordings, *words):
     return json.loads(result.stdout)["runs"]
 
 
-def test_the_list_is_that_of_ls(client, recordings):
+def test_the_list_equals_ls(client, recordings):
     answer = client.get("/api/v1/runs")
     assert answer.status_code == 200
     assert answer.json() == {"runs": _ls(recordings), "total": 2, "offset": 0, "limit": 50}
 
 
-def test_filter_sort_columns_and_paging_are_those_of_ls(client, recordings):
+def test_filter_sort_columns_and_paging_equal_ls(client, recordings):
     asked = {"filter": "status:finished", "sort": "-seed", "columns": "id,seed", "limit": 1, "offset": 1}
     page = client.get("/api/v1/runs", params=asked).json()
     assert page["runs"] == _ls(
@@ -41,25 +41,25 @@ def test_filter_sort_columns_and_paging_are_those_of_ls(client, recordings):
     assert [run["seed"] for run in page["runs"]] == [0]
 
 
-def test_a_wrong_filter_is_refused_with_what_was_meant(client):
+def test_a_wrong_filter_is_refused_with_a_suggestion(client):
     answer = client.get("/api/v1/runs", params={"filter": "stauts:finished"})
     assert answer.status_code == 400
     assert "Did you mean 'status'?" in answer.json()["error"]["message"]
 
 
-def test_a_parameter_that_cannot_be_is_named(client):
+def test_an_invalid_parameter_is_named(client):
     answer = client.get("/api/v1/runs", params={"limit": "many"})
     assert answer.status_code == 422
     assert answer.json()["error"]["problems"][0]["path"] == "query.limit"
 
 
-def test_a_run_begun_after_the_folders_were_looked_at_is_found_at_once(client, recordings):
+def test_a_run_begun_after_the_last_scan_is_found_at_once(client, recordings):
     assert client.get("/api/v1/runs/fresh").status_code == 404
     runner.run({"name": "fresh", "env": {"id": "FrozenLake-v1"}, "episodes": 300}, recordings=recordings)
     assert client.get("/api/v1/runs/fresh").status_code == 200
 
 
-def test_the_page_of_runs_is_of_now_after_a_change_here(client, recordings):
+def test_the_page_of_runs_is_current_after_a_change(client, recordings):
     run = client.get("/api/v1/runs").json()["runs"][0]["run_id"]
     for name in ("once", "twice", "thrice"):
         client.patch(f"/api/v1/runs/{run}", json={"name": name})

@@ -1,4 +1,4 @@
-"""Nobody reads or writes who may not: tokens, hosts, origins, rates, sizes; and nothing of it is logged."""
+"""Access control: tokens, hosts, origins, rates, sizes; and no secrets in the log."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_another_host_without_a_token_does_not_start(open_to_others, tokens):
     create_app(open_to_others)
 
 
-def test_on_another_host_reading_needs_a_token_and_writing_one_that_may(connect, open_to_others, tokens):
+def test_on_another_host_reading_and_writing_need_a_token(connect, open_to_others, tokens):
     _, reads = tokens.create("reader", (READ,))
     _, writes = tokens.create("writer", (READ, WRITE))
     client = connect(open_to_others)
@@ -64,7 +64,7 @@ def test_on_another_host_reading_needs_a_token_and_writing_one_that_may(connect,
     assert client.get("/healthz").status_code == 200
 
 
-def test_a_token_is_kept_hashed_in_a_file_of_the_owner_alone(tokens):
+def test_a_token_is_stored_as_a_hash_for_its_owner_only(tokens):
     token, secret = tokens.create("laptop", (READ,))
     text = tokens.path.read_text()
     assert secret not in text
@@ -93,16 +93,16 @@ def test_wrong_tokens_lock_nobody_out(connect, open_to_others, tokens):
 @pytest.mark.parametrize(
     "host", ["evil.example", "localhost.evil.example", "127.0.0.1.evil.example", "", "a b"]
 )
-def test_a_name_that_was_made_to_point_here_is_refused(client, host):
+def test_an_unknown_host_name_is_refused(client, host):
     assert client.get(RUNS, headers={"Host": host}).status_code == 421
 
 
 @pytest.mark.parametrize("host", ["localhost", "LOCALHOST:8000", "127.0.0.1:1", "[::1]:8000", "10.0.0.1"])
-def test_addresses_and_localhost_are_ours(host):
+def test_addresses_and_localhost_are_allowed(host):
     assert is_allowed_host(host, ())
 
 
-def test_a_name_behind_a_proxy_is_ours_when_allowed(connect, settings):
+def test_the_name_of_a_proxy_can_be_allowed(connect, settings):
     client = connect(dataclasses.replace(settings, hosts=("runs.example.org",)))
     assert client.get(RUNS, headers={"Host": "runs.example.org"}).status_code == 200
 
@@ -128,7 +128,7 @@ def test_no_other_site_can_write(connect, settings, headers, recordings):
 
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site"])
-def test_no_other_site_has_the_service_work_for_it_but_links_lead_here(connect, settings, site):
+def test_other_sites_can_link_to_pages_but_not_embed_them(connect, settings, site):
     client = connect(settings, **{"Sec-Fetch-Site": site, "Sec-Fetch-Mode": "no-cors"})
     assert client.get(f"{RUN}/plot.svg").status_code == 403
     assert client.get("/runs", headers={"Sec-Fetch-Mode": "navigate"}).status_code == 200
@@ -148,7 +148,7 @@ def test_a_token_writes_from_anywhere_on_loopback_too(connect, settings, tokens)
     assert client.patch(RUN, json={"note": "x"}, headers=_bearer("wrong")).status_code == 401
 
 
-def test_a_login_is_kept_in_a_cookie_that_cannot_write_from_elsewhere(connect, open_to_others, tokens):
+def test_a_login_sets_a_cookie_that_cannot_write_from_other_sites(connect, open_to_others, tokens):
     _, secret = tokens.create("writer", (READ, WRITE))
     client = connect(open_to_others, accept="text/html")
     asked = client.get("/runs?filter=x", follow_redirects=False)
@@ -199,7 +199,7 @@ def test_a_session_survives_a_restart_and_ends_with_its_token_or_its_time(
     assert status() == 401
 
 
-def test_a_token_for_reading_is_offered_nothing_that_it_may_not_do(connect, open_to_others, tokens):
+def test_pages_offer_a_read_token_no_writes(connect, open_to_others, tokens):
     _, reads = tokens.create("reader", (READ,))
     _, writes = tokens.create("writer", (READ, WRITE))
     client = connect(open_to_others, **OWN, accept="text/html")
@@ -222,7 +222,7 @@ def test_a_token_for_reading_is_offered_nothing_that_it_may_not_do(connect, open
 
 
 @pytest.mark.parametrize("where", ["//evil.example", "https://evil.example", "/\\evil.example", ""])
-def test_a_login_leads_nowhere_else(connect, open_to_others, tokens, where):
+def test_a_login_redirects_to_no_other_site(connect, open_to_others, tokens, where):
     _, secret = tokens.create("writer", (READ, WRITE))
     client = connect(open_to_others)
     answer = client.post("/login", data={"token": secret, "next": where}, follow_redirects=False)
@@ -230,7 +230,7 @@ def test_a_login_leads_nowhere_else(connect, open_to_others, tokens, where):
 
 
 @pytest.mark.parametrize("path", [RUNS, "/runs", "/healthz", "/nothing", "/api/v1/openapi.json"])
-def test_every_answer_carries_the_policy(client, path):
+def test_every_response_has_the_policy(client, path):
     headers = client.get(path).headers
     assert headers["content-security-policy"] == POLICY
     assert "unsafe" not in POLICY
@@ -257,8 +257,8 @@ def test_a_note_and_tags_are_checked_as_by_the_commands(client):
     for wrong in ({"name": "<script>"}, {"tag": ["a b"]}, {"note": "x" * 10_001}, {"name": "../x"}):
         assert client.patch(RUN, json=wrong).status_code in (400, 422)
     said = {"name": "renamed", "tag": ["keep", "a"], "note": "<script>alert(1)</script>"}
-    told = client.patch(RUN, json=said).json()
-    assert (told["name"], told["tags"], told["note"]) == ("renamed", ["a", "keep"], said["note"])
+    labels = client.patch(RUN, json=said).json()
+    assert (labels["name"], labels["tags"], labels["note"]) == ("renamed", ["a", "keep"], said["note"])
     (row,) = client.get(RUNS, params={"filter": "tag:keep"}).json()["runs"]
     assert row["name"] == "renamed"
     back = client.patch(f"{RUNS}/renamed", json={"name": "", "untag": ["a"], "note": ""}).json()
@@ -281,7 +281,7 @@ def test_the_log_is_json_lines_without_secrets(connect, open_to_others, tokens, 
     assert secret[10:] not in text
 
 
-def test_a_log_that_nobody_reads_keeps_nobody_waiting_and_says_what_it_left_out(client):
+def test_an_unread_log_blocks_nothing_and_counts_dropped_lines(client):
     reading, writing = os.pipe()
     with open(reading, "rb") as pipe, open(writing, "w") as stream:  # noqa: PTH123 - of a descriptor
         began = time.monotonic()
@@ -298,12 +298,12 @@ def test_a_log_that_nobody_reads_keeps_nobody_waiting_and_says_what_it_left_out(
         lines = [json.loads(line) for line in read.result(20).splitlines()]
     left_out = [line["lines"] for line in lines if line["event"] == "lines left out"]
     said = sum(line["event"] == "said" for line in lines)
-    assert left_out, "there was no room for all"
+    assert left_out, "the queue was full"
     assert sum(left_out) + said == logs.MAX_WAITING + 3_000
     assert lines[-1]["event"] == "last"
 
 
-def test_a_service_whose_log_is_never_read_answers_and_stops_all_the_same(recordings, tmp_path):
+def test_a_service_with_an_unread_log_responds_and_stops(recordings, tmp_path):
     os.mkfifo(tmp_path / "log")
     unread = os.open(tmp_path / "log", os.O_RDWR)
     with os.fdopen(unread), Served(recordings, "--log", str(tmp_path / "log")) as served:
@@ -313,7 +313,7 @@ def test_a_service_whose_log_is_never_read_answers_and_stops_all_the_same(record
         assert served.stop() == 0
 
 
-def test_no_message_says_where_the_server_keeps_its_files(client, recordings):
+def test_no_message_contains_paths_of_the_server(client, recordings):
     run = find_run("first", recordings)
     run.recording.write_bytes(run.recording.read_bytes()[:100] + bytes(100))
     for address in (f"{RUNS}/first/metrics", f"{RUNS}/first/episodes/train", "/runs/first/evaluations"):
@@ -323,7 +323,7 @@ def test_no_message_says_where_the_server_keeps_its_files(client, recordings):
         assert str(recordings) not in answer.text
 
 
-def test_ready_is_told_with_what_is_missing(client, recordings):
+def test_readiness_names_the_failed_check(client, recordings):
     answer = client.get("/readyz")
     assert (answer.status_code, answer.json()["ready"]) == (200, True)
     recordings.rename(recordings.with_name("gone"))
@@ -332,7 +332,7 @@ def test_ready_is_told_with_what_is_missing(client, recordings):
     assert not answer.json()["checks"]["recordings_can_be_written"]
 
 
-def test_tokens_are_made_listed_and_revoked_by_the_command(monkeypatch, tmp_path):
+def test_the_command_creates_lists_and_revokes_tokens(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
 
     def said(*words):
@@ -351,7 +351,7 @@ def test_tokens_are_made_listed_and_revoked_by_the_command(monkeypatch, tmp_path
     assert kept.find(secret) is None
 
 
-def test_a_proxy_that_is_believed_tells_who_asks_and_how(recordings, tmp_path, monkeypatch):
+def test_headers_of_a_trusted_proxy_are_used(recordings, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     tokens = Tokens(tmp_path / "dualtaxi" / "tokens.json")
     _, secret = tokens.create("laptop", (READ,))

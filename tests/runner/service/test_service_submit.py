@@ -1,4 +1,4 @@
-"""`dualtaxi remote submit` as it is typed."""
+"""The command `dualtaxi remote submit`."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ def file(tmp_path):
     return path
 
 
-def test_a_file_is_done_by_a_server_and_watched(file, tmp_path):
+def test_a_file_is_submitted_and_watched(file, tmp_path):
     with Served(tmp_path / "recordings") as server:
         words = ["remote", "submit", str(file), "--server", server.url]
         result = CliRunner().invoke(cli, [*words, "--watch", "--json"])
         assert result.exit_code == 0, result.output
-        told = json.loads(result.stdout)
-        assert (told["name"], told["state"]) == ("icy", "finished")
+        job = json.loads(result.stdout)
+        assert (job["name"], job["state"]) == ("icy", "finished")
         runs = {str(run.seed): run.run_id for run in list_runs(tmp_path / "recordings")}
-        assert {str(run["seed"]): run["run_id"] for run in told["begun"]} == runs
+        assert {str(run["seed"]): run["run_id"] for run in job["begun"]} == runs
         assert "seed 1: finished" in result.stderr
         file.write_text("episodes: many\n")
         refused = CliRunner().invoke(cli, words)
@@ -40,7 +40,7 @@ def test_a_file_is_done_by_a_server_and_watched(file, tmp_path):
     assert "icy.yaml:1:1: episodes: found 'many'" in refused.stderr
 
 
-def test_a_sweep_whose_base_is_a_file_is_sent_whole(file, tmp_path):
+def test_a_sweep_is_sent_with_its_base(file, tmp_path):
     sweep = tmp_path / "sweep.yaml"
     described = {"base": "icy.yaml", "strategy": "grid", "parameters": {"step_size": [0.1, 0.5]}}
     sweep.write_text(yaml.safe_dump(described))
@@ -49,7 +49,7 @@ def test_a_sweep_whose_base_is_a_file_is_sent_whole(file, tmp_path):
     assert load(file).seeds == (0, 1)
 
 
-def test_without_a_server_it_is_told(file):
+def test_a_missing_server_is_reported(file):
     result = CliRunner().invoke(cli, ["remote", "submit", str(file)], env={"DUALTAXI_SERVER": ""})
     assert result.exit_code == 2
     assert "--server http://localhost:8000" in result.output

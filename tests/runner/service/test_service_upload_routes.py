@@ -1,4 +1,4 @@
-"""Uploads over HTTP: in pieces, by whom they belong to, within limits, and cut off at any place."""
+"""Uploads over HTTP: pieces, owners, limits."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def patch(client, upload, data, offset, **headers):
 
 
 def complete(client, upload, data, **more):
-    told = {"digest": digest(data), "size": len(data)} | more
-    return client.post(f"{UPLOADS}/{upload}/complete", json=told)
+    body = {"digest": digest(data), "size": len(data)} | more
+    return client.post(f"{UPLOADS}/{upload}/complete", json=body)
 
 
 def message(answer):
@@ -75,7 +75,7 @@ def test_a_run_is_sent_in_pieces_and_listed_when_it_is_verified(connect, elsewhe
     assert client.get("/api/v1/runs").json()["total"] == 1
 
 
-def test_a_refused_run_says_why_and_is_not_listed(connect, elsewhere, data):
+def test_a_refused_run_has_a_message_and_is_not_listed(connect, elsewhere, data):
     client = connect(elsewhere)
     wrong = data[:-1] + b"?"
     upload = begin(client, wrong)
@@ -90,7 +90,7 @@ def test_a_refused_run_says_why_and_is_not_listed(connect, elsewhere, data):
     assert client.get("/api/v1/runs").json()["total"] == 0
 
 
-def test_more_than_was_said_is_not_taken(connect, elsewhere, data):
+def test_more_bytes_than_announced_are_refused(connect, elsewhere, data):
     client = connect(replace(elsewhere, limits=Limits(upload_bytes=100_000)))
     too_large = client.post(UPLOADS, json={"size": 100_001})
     assert (too_large.status_code, "100,000" in message(too_large)) == (413, True)
@@ -104,7 +104,7 @@ def test_more_than_was_said_is_not_taken(connect, elsewhere, data):
 
 
 @pytest.mark.parametrize(
-    "told",
+    "body",
     [
         {"digest": "short"},
         {"size": -1},
@@ -114,13 +114,13 @@ def test_more_than_was_said_is_not_taken(connect, elsewhere, data):
         {"digest": ["0" * 64]},
     ],
 )
-def test_what_is_announced_must_make_sense(connect, elsewhere, told):
-    answer = connect(elsewhere).post(UPLOADS, json=told)
+def test_an_invalid_announcement_is_refused(connect, elsewhere, body):
+    answer = connect(elsewhere).post(UPLOADS, json=body)
     assert answer.status_code == 422
     assert answer.json()["error"]["problems"][0]["path"].startswith("body.")
 
 
-def test_ids_and_offsets_from_a_client_lead_nowhere(connect, elsewhere, data):
+def test_invalid_ids_and_offsets_are_refused(connect, elsewhere, data):
     client = connect(elsewhere)
     for odd in ("../../run", "%2e%2e%2fetc", "0" * 32, "0" * 33, "é" * 32):
         assert client.get(f"{UPLOADS}/{odd}").status_code in (404, 422)
@@ -132,20 +132,20 @@ def test_ids_and_offsets_from_a_client_lead_nowhere(connect, elsewhere, data):
     assert odd == upload
 
 
-def test_another_token_has_no_part_in_an_upload(connect, elsewhere, data):
+def test_another_token_has_no_access_to_an_upload(connect, elsewhere, data):
     tokens = Tokens(elsewhere.tokens)
     anna, ben = (tokens.create(name, ("write",))[1] for name in ("anna", "ben"))
     client = connect(elsewhere)
     own = {"Authorization": f"Bearer {anna}"}
     other = {"Authorization": f"Bearer {ben}"}
-    told = {"digest": digest(data), "size": len(data)}
-    upload = client.post(UPLOADS, json=told, headers=own).json()["id"]
+    body = {"digest": digest(data), "size": len(data)}
+    upload = client.post(UPLOADS, json=body, headers=own).json()["id"]
     for headers in (other, {}):
         assert client.get(f"{UPLOADS}/{upload}", headers=headers).status_code == 404
         assert patch(client, upload, data, 0, **headers).status_code == 404
         assert client.delete(f"{UPLOADS}/{upload}", headers=headers).status_code == 404
         assert client.get(UPLOADS, headers=headers).json()["uploads"][0]["id"] == ""
-        assert client.post(UPLOADS, json=told, headers=headers).json()["id"] != upload
+        assert client.post(UPLOADS, json=body, headers=headers).json()["id"] != upload
     assert patch(client, upload, data, 0, **own).status_code == 200
 
 

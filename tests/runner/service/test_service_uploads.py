@@ -1,4 +1,4 @@
-"""An upload becomes a run whole, or nothing at all: in pieces, twice, after a restart, damaged, hostile."""
+"""An upload becomes a complete run or nothing: in pieces, twice, after a restart, damaged, hostile."""
 
 from __future__ import annotations
 
@@ -45,20 +45,20 @@ def uploads(tmp_path):
     made.close()
 
 
-def completion(data: bytes, **told) -> Completion:
-    return Completion(digest=blake3(data).hexdigest(), size=len(data), run=RunDetails(**told))
+def completion(data: bytes, **details) -> Completion:
+    return Completion(digest=blake3(data).hexdigest(), size=len(data), run=RunDetails(**details))
 
 
 def announced(data: bytes, **more) -> Announcement:
     return Announcement(digest=blake3(data).hexdigest(), size=len(data), **more)
 
 
-def send(uploads, data, owner=ANNA, whole=None, **told):
+def send(uploads, data, owner=ANNA, whole=None, **details):
     """Upload bytes in one go, and return the upload when its verification is over."""
     upload, _ = uploads.begin(owner, announced(data))
     with uploads.receive(upload.upload_id, owner, 0, len(data)) as write:
         write(data)
-    return over(uploads, uploads.complete(upload.upload_id, owner, whole or completion(data, **told)))
+    return over(uploads, uploads.complete(upload.upload_id, owner, whole or completion(data, **details)))
 
 
 def over(uploads, upload):
@@ -71,7 +71,7 @@ def visible(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir() if path.name[0] != ".")
 
 
-def test_a_recording_becomes_the_run_it_is(uploads, taxis, tmp_path):
+def test_a_recording_becomes_its_run(uploads, taxis, tmp_path):
     data = taxis.recording.read_bytes()
     upload, new = uploads.begin(ANNA, announced(data))
     assert new
@@ -123,7 +123,7 @@ def test_the_same_bytes_are_the_same_upload_and_the_same_run(uploads, lake, tmp_
     assert (new, fresh.state) == (True, "receiving"), "a run that was removed can be sent again"
 
 
-def test_what_was_received_outlives_the_server(lake, tmp_path):
+def test_received_bytes_outlive_the_server(lake, tmp_path):
     data = lake.recording.read_bytes()
     first = Uploads(tmp_path / "runs")
     upload, _ = first.begin(ANNA, announced(data))
@@ -149,7 +149,7 @@ def test_what_was_received_outlives_the_server(lake, tmp_path):
     third.close()
 
 
-def test_a_verification_that_was_over_when_the_server_died_is_not_done_twice(uploads, lake, tmp_path):
+def test_a_repeated_verification_has_the_same_result(uploads, lake, tmp_path):
     data = lake.recording.read_bytes()
     stored = send(uploads, data)
     folder = tmp_path / "runs" / FOLDER / stored.upload_id
@@ -179,7 +179,7 @@ def altered(data: bytes) -> bytes:
     ],
     ids=["altered", "empty", "a zip", "a magic and nothing", "other names"],
 )
-def test_what_is_no_sound_run_is_refused_and_leaves_nothing(uploads, lake, tmp_path, change):
+def test_an_unsound_recording_is_refused_and_leaves_nothing(uploads, lake, tmp_path, change):
     refused = send(uploads, change(lake.recording.read_bytes()))
     assert refused.state == "refused"
     assert refused.problem.startswith("the upload: ")
@@ -187,11 +187,11 @@ def test_what_is_no_sound_run_is_refused_and_leaves_nothing(uploads, lake, tmp_p
     assert visible(tmp_path / "runs") == []
     assert not (tmp_path / "runs" / FOLDER / refused.upload_id / "body").exists()
     again, new = uploads.begin(ANNA, refused.announced)
-    assert new, "and can be sent anew"
+    assert new, "it can be sent again"
     assert again.upload_id != refused.upload_id
 
 
-def test_bytes_that_changed_on_their_way_are_refused(uploads, lake):
+def test_bytes_changed_in_transit_are_refused(uploads, lake):
     data = lake.recording.read_bytes()
     upload, _ = uploads.begin(ANNA, announced(data))
     with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
@@ -200,7 +200,7 @@ def test_bytes_that_changed_on_their_way_are_refused(uploads, lake):
     assert "another digest" in refused.problem
 
 
-def test_another_run_of_the_same_id_stays_as_it_is(uploads, lake, taxis, tmp_path):
+def test_another_run_of_the_same_id_is_not_replaced(uploads, lake, taxis, tmp_path):
     shutil.copytree(taxis.folder, tmp_path / "runs" / lake.run_id)
     facts = json.loads((tmp_path / "runs" / lake.run_id / "run.json").read_text())
     (tmp_path / "runs" / lake.run_id / "run.json").write_text(json.dumps(facts | {"run_id": lake.run_id}))
@@ -209,7 +209,7 @@ def test_another_run_of_the_same_id_stays_as_it_is(uploads, lake, taxis, tmp_pat
     assert find_run(lake.run_id, tmp_path / "runs").recording.read_bytes() == taxis.recording.read_bytes()
 
 
-def test_a_run_that_was_cut_off_is_taken_as_interrupted(uploads, taxis, tmp_path):
+def test_a_truncated_run_is_stored_as_interrupted(uploads, taxis, tmp_path):
     data = taxis.recording.read_bytes()[:-3_000]
     stored = send(uploads, data, status="interrupted")
     assert stored.run_id == taxis.run_id, stored.problem
@@ -218,7 +218,7 @@ def test_a_run_that_was_cut_off_is_taken_as_interrupted(uploads, taxis, tmp_path
 
 @pytest.fixture(scope="module")
 def stopped(tmp_path_factory):
-    """Return a run that was interrupted, and the same one gone on with to its end."""
+    """Return an interrupted run, and the same one resumed to its end."""
     folder = tmp_path_factory.mktemp("stopped")
     config = experiment(TAXIS, episodes=400)
     run = run_job(Job(config, 0), create_run(folder, config, 0), stop=stopping_after(31))
@@ -227,7 +227,7 @@ def stopped(tmp_path_factory):
     return early, resume(run)
 
 
-def test_a_run_that_was_gone_on_with_takes_the_place_of_its_beginning(uploads, stopped, tmp_path):
+def test_a_resumed_run_replaces_its_beginning(uploads, stopped, tmp_path):
     early, whole = stopped
     assert send(uploads, early.recording.read_bytes(), status="interrupted").state == "stored"
     there = tmp_path / "runs" / early.run_id
@@ -252,7 +252,7 @@ def test_a_run_that_was_gone_on_with_takes_the_place_of_its_beginning(uploads, s
     assert find_run(whole.run_id, tmp_path / "runs").recording.read_bytes() == data
 
 
-def test_what_only_says_that_it_goes_on_does_not_replace_anything(uploads, stopped, tmp_path):
+def test_a_run_that_does_not_continue_another_replaces_nothing(uploads, stopped, tmp_path):
     early, _ = stopped
     cut = early.recording.read_bytes()[:-40_000]
     assert send(uploads, cut, status="finished").state == "stored"
@@ -268,7 +268,7 @@ def test_what_only_says_that_it_goes_on_does_not_replace_anything(uploads, stopp
     assert json.loads((run.folder / "run.json").read_text()) == facts
 
 
-def test_a_replacement_that_was_cut_short_is_completed_when_it_comes_again(uploads, stopped, tmp_path):
+def test_an_interrupted_replacement_is_completed_by_a_second_upload(uploads, stopped, tmp_path):
     early, whole = stopped
     assert send(uploads, early.recording.read_bytes(), status="interrupted").state == "stored"
     there = find_run(early.run_id, tmp_path / "runs")
@@ -277,7 +277,7 @@ def test_a_replacement_that_was_cut_short_is_completed_when_it_comes_again(uploa
     assert find_run(early.run_id, tmp_path / "runs").status == "finished"
 
 
-def test_a_client_that_lies_or_errs_gets_no_further(uploads, lake):
+def test_wrong_requests_of_a_client_are_refused(uploads, lake):
     data = lake.recording.read_bytes()
     upload, _ = uploads.begin(ANNA, announced(data))
     with pytest.raises(RunNotFound):
@@ -307,7 +307,7 @@ def test_a_client_that_lies_or_errs_gets_no_further(uploads, lake):
         uploads.complete(upload.upload_id, ANNA, other)
 
 
-def test_what_is_too_much_is_not_taken(lake, tmp_path):
+def test_uploads_beyond_the_limits_are_refused(lake, tmp_path):
     uploads = Uploads(tmp_path / "runs", UploadLimits(max_bytes=1_000, max_open=2))
     with pytest.raises(UploadTooLarge, match="1,000"):
         uploads.begin(ANNA, Announcement(size=1_001))
@@ -351,7 +351,7 @@ def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
     assert over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data))).state == "stored"
 
 
-def test_what_is_left_free_stays_free_also_of_bytes_whose_number_is_not_said(tmp_path, monkeypatch):
+def test_the_disk_reserve_is_kept_for_uploads_of_unknown_size(tmp_path, monkeypatch):
     uploads = Uploads(tmp_path / "runs", UploadLimits(spare_bytes=5_000))
     upload, _ = uploads.begin(ANNA, Announcement())
     free = iter((7_000, 7_000, 6_000))
@@ -365,7 +365,7 @@ def test_what_is_left_free_stays_free_also_of_bytes_whose_number_is_not_said(tmp
     uploads.close()
 
 
-def test_of_what_is_over_only_so_much_is_remembered(lake, tmp_path):
+def test_a_limited_number_of_results_is_remembered(lake, tmp_path):
     shutil.copytree(lake.folder, tmp_path / "runs" / lake.run_id)
     uploads = Uploads(tmp_path / "runs", UploadLimits(max_open=3))
     for number in range(9):
@@ -377,7 +377,7 @@ def test_of_what_is_over_only_so_much_is_remembered(lake, tmp_path):
     uploads.close()
 
 
-def test_what_is_over_or_abandoned_is_forgotten_in_time(lake, tmp_path):
+def test_old_results_and_abandoned_uploads_are_forgotten(lake, tmp_path):
     uploads = Uploads(tmp_path / "runs")
     stored = send(uploads, lake.recording.read_bytes())
     idle, _ = uploads.begin(ANNA, Announcement(name="idle"))
@@ -399,8 +399,8 @@ def test_what_is_over_or_abandoned_is_forgotten_in_time(lake, tmp_path):
     again.close()
 
 
-def test_removing_an_upload_keeps_no_other_waiting(uploads, lake, monkeypatch):
-    """The event loop of the server asks for uploads: it must not wait for the disk."""
+def test_removing_an_upload_does_not_block_others(uploads, lake, monkeypatch):
+    """The event loop of the server reads uploads: it must not wait for the disk."""
     data, go_on = lake.recording.read_bytes(), threading.Event()
     given_up, _ = uploads.begin(ANNA, Announcement(name="given up"))
     upload, _ = uploads.begin(ANNA, announced(data))

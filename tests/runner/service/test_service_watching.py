@@ -1,4 +1,4 @@
-"""The client's calls for jobs."""
+"""The client's methods for jobs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from runner.runs.run import list_runs
 CONFIG = {"name": "quick", "episodes": 600, "mode": "cooperative", "evaluation": {"every": 50, "trials": 400}}
 
 
-def test_a_watcher_sees_everything_once_though_the_server_is_killed_meanwhile(tmp_path):
+def test_a_watcher_receives_every_event_once_although_the_server_is_killed(tmp_path):
     with Served(tmp_path) as server:
         seen = []
         with Client(server.url) as client:
@@ -39,9 +39,9 @@ def test_a_watcher_sees_everything_once_though_the_server_is_killed_meanwhile(tm
     assert states[0] == "queued"
     assert states.count("finished") == 1
     assert states[-1] == "finished"
-    said = [event.data["text"] for event in seen if event.kind == "log"]
-    told = [text for text in said if text.startswith("evaluation")]
-    assert len(told) == len(set(told)) > 3
+    lines = [event.data["text"] for event in seen if event.kind == "log"]
+    evaluations = [text for text in lines if text.startswith("evaluation")]
+    assert len(evaluations) == len(set(evaluations)) > 3
     places = [int(event.id) for event in seen if event.id]
     assert places == sorted(set(places))
     assert seen[-2].kind == "progress" or seen[-1].kind == "state"
@@ -68,7 +68,7 @@ def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
             list(client.watch(99))
 
 
-def test_events_are_read_and_one_that_was_cut_off_is_left_out():
+def test_events_are_parsed_without_an_incomplete_last_one():
     lines = ["retry: 1000", "", ": still here", "", "id: 7", "event: log", 'data: {"text": "a: b"}', ""]
     cut_off = ["id: 9", "event: state", 'data: {"sta']
     assert list(parse_events([*lines, *cut_off])) == [JobEvent("log", {"text": "a: b"}, "7")]
