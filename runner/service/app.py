@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 import shutil
 from collections.abc import AsyncIterator
@@ -134,7 +135,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             ProcessPool(PROCESSES, limits.work_seconds, limits.work_bytes)
         )
         app.state.sweep_processes = stack.enter_context(
-            ProcessPool(1, limits.work_seconds, limits.work_bytes, is_reused=True)
+            ProcessPool(1, limits.work_seconds, limits.work_bytes, keep_seconds=math.inf)
         )
         if any(sweeps_in(folder) for folder in settings.recordings):
             app.state.sweep_processes.submit(load_sweep_libraries)

@@ -10,7 +10,9 @@ platform.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import forkserver
@@ -44,18 +46,18 @@ class ProcessPool:
         processes: how many run at the same time.
         seconds: the time limit of a call, after which its process is killed.
         memory_bytes: how much a call may allocate; not limited on Windows.
-        is_reused: whether a process serves further calls, until the pool is closed.
+        keep_seconds: how long after a call its process may serve the next one; 0 for a new one each time.
     """
 
-    def __init__(self, processes: int, seconds: float, memory_bytes: int, is_reused: bool = False) -> None:
-        self._seconds, self._memory_bytes, self._is_reused = seconds, memory_bytes, is_reused
+    def __init__(self, processes: int, seconds: float, memory_bytes: int, keep_seconds: float = 0.0) -> None:
+        self._seconds, self._memory_bytes, self._keep_seconds = seconds, memory_bytes, keep_seconds
         self._context = start_method(PRELOADED)
         self._threads = ThreadPoolExecutor(processes, "processes")
         self._places = threading.Semaphore(processes + MAX_WAITING)
         self._lock = threading.Lock()
         self._children: set[ChildProcess] = set()
         self._thread = threading.local()
-        """The reused process of each thread, as `child`."""
+        """The process of each thread, as `child`, and the time of its last call, as `used`."""
         self._closed = threading.Event()
 
     def __enter__(self) -> Self:
@@ -109,15 +111,15 @@ class ProcessPool:
 
     def _call(self, function: Callable[..., Any], args: Any, keywords: Any) -> Any:
         child: ChildProcess | None = self._thread.__dict__.pop("child", None)
-        try:
-            if child is not None:
+        if child is not None and time.monotonic() - self._thread.used < self._keep_seconds:
+            with contextlib.suppress(ProcessDied):  # perhaps while it was idle; a new process shows why
                 return self._call_in(child, function, args, keywords)
-        except ProcessDied:  # perhaps while it was idle: only a new process shows whose fault it was
-            pass
+        elif child is not None:
+            self._end(child)
         return self._call_in(self._start(), function, args, keywords)
 
     def _call_in(self, child: ChildProcess, function: Callable[..., Any], args: Any, keywords: Any) -> Any:
-        is_reusable = self._is_reused
+        is_reusable = self._keep_seconds > 0
         try:
             return child.call(function, self._seconds, *args, **keywords)
         except CallFailed:
@@ -125,7 +127,7 @@ class ProcessPool:
             raise
         finally:
             if is_reusable:
-                self._thread.child = child
+                self._thread.child, self._thread.used = child, time.monotonic()
             else:
                 self._end(child)
 

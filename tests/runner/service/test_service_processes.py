@@ -60,12 +60,12 @@ def test_closing_ends_running_calls():
 
 
 def test_a_process_can_be_reused():
-    with ProcessPool(1, 30, MEMORY, is_reused=True) as pool:
+    with ProcessPool(1, 30, MEMORY, keep_seconds=60) as pool:
         assert pool.submit(os.getpid).result() == pool.submit(os.getpid).result()
 
 
 def test_calls_of_a_reused_process_leak_no_threads():
-    with ProcessPool(1, 30, MEMORY, is_reused=True) as pool:
+    with ProcessPool(1, 30, MEMORY, keep_seconds=60) as pool:
         pool.submit(os.getpid).result()
         before = threading.active_count()
         for _ in range(20):
