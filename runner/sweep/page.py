@@ -27,9 +27,7 @@ class PageSection:
 
 
 @dataclass(frozen=True)
-class SweepView(View):
-    """The page of a sweep."""
-
+class _SweepView(View):
     TEMPLATE: ClassVar = "sweep.html"
     title: str
     lead: list[str]
@@ -57,7 +55,7 @@ def render_sweep(results: Results, recordings: Path) -> str:
     picture = picture_of(results)
     groups, panels = learning(results, recordings)
     ranking, *others = sections(results)
-    view = SweepView(
+    view = _SweepView(
         title=ranking.title,
         lead=ranking.sentences,
         sections=[PageSection("ranking", "Ranking", [], ranking.grids), *map(_section, others)],

@@ -36,9 +36,7 @@ class ComparedMetric:
 
 
 @dataclass(frozen=True)
-class ComparisonView(View):
-    """The page of a comparison."""
-
+class _ComparisonView(View):
     TEMPLATE: ClassVar = "compare.html"
     title: str
     lead: list[str]
@@ -75,7 +73,7 @@ def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
         for run in group.runs
     ]
     return render(
-        ComparisonView(
+        _ComparisonView(
             title=" against ".join(labels) if len(labels) < 4 else f"{len(labels)} groups of runs compared",
             lead=summary(comparison),
             notes=comparison.notes,

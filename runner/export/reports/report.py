@@ -83,9 +83,7 @@ class ReportedRun:
 
 
 @dataclass(frozen=True)
-class ReportView(View):
-    """The page of a report."""
-
+class _ReportView(View):
     TEMPLATE: ClassVar = "report.html"
     title: str
     runs: list[ReportedRun]
@@ -145,7 +143,7 @@ def render_report(
     progress("drawing")
     groups = groups_of(series)
     legend = [LegendEntry("", group.described) for group in groups]
-    page = render(ReportView(_title(runs), runs, plots_of(groups), legend, footnote(groups)))
+    page = render(_ReportView(_title(runs), runs, plots_of(groups), legend, footnote(groups)))
     return page, [*(note for run in runs for note in run.notes), *values_left_out(series)]
 
 

@@ -75,9 +75,7 @@ class CompareView(View):
 
 
 @dataclass(frozen=True)
-class OverviewView(CompareView):
-    """The settings and results of runs, and their curves."""
-
+class _OverviewView(CompareView):
     TEMPLATE: ClassVar = "compare_overview.html"
     differing: Rows
     results: Rows
@@ -86,9 +84,7 @@ class OverviewView(CompareView):
 
 
 @dataclass(frozen=True)
-class DivergenceView(CompareView):
-    """The first step that differs."""
-
+class _DivergenceView(CompareView):
     TEMPLATE: ClassVar = "compare_divergence.html"
     lead: str
     notes: list[str]
@@ -96,17 +92,13 @@ class DivergenceView(CompareView):
 
 
 @dataclass(frozen=True)
-class TablesView(CompareView):
-    """The difference of the Q-tables."""
-
+class _TablesView(CompareView):
     TEMPLATE: ClassVar = "compare_tables.html"
     body: str
 
 
 @dataclass(frozen=True)
-class ReplaysView(CompareView):
-    """An episode of two runs, in step."""
-
+class _ReplaysView(CompareView):
     TEMPLATE: ClassVar = "compare_replay.html"
     sources: list[str]
     scenes: list[str]
@@ -131,7 +123,7 @@ async def overview(request: Request, catalogue: CatalogueOf, run: Names = None) 
             for key in dict.fromkeys(key for each in settings for key in each)
         ]
         digests = {each.summary.content_digest for each in runs}
-        view = OverviewView(
+        view = _OverviewView(
             _compared(runs, ""),
             differing=[(key, values) for key, values in rows if len(set(values)) > 1],
             results=_results(runs),
@@ -150,7 +142,7 @@ async def divergence(
     runs = _two(await _chosen(catalogue, run))
     found = await _difference(runs, cache, processes)
     compared = _compared(runs, "/divergence")
-    view = DivergenceView(compared, found["lead"], found["notes"], found["body"])
+    view = _DivergenceView(compared, found["lead"], found["notes"], found["body"])
     return await run_in_threadpool(page, request, view)
 
 
@@ -161,7 +153,7 @@ async def tables(
     """Show the difference of the Q-tables of two runs."""
     runs = _two(await _chosen(catalogue, run))
     body = (await _difference(runs, cache, processes))["tables"]
-    return await run_in_threadpool(page, request, TablesView(_compared(runs, "/tables"), body))
+    return await run_in_threadpool(page, request, _TablesView(_compared(runs, "/tables"), body))
 
 
 @router.get("/replay")
@@ -186,7 +178,7 @@ async def replay(
         return link("/compare/replay", {"run": names, "at": step_reference(other)}) if other[-2] >= 0 else ""
 
     def show() -> Response:
-        view = ReplaysView(
+        view = _ReplaysView(
             _compared(runs, "/replay"),
             sources=[f"/api/v1/runs/{name}/replay/{episode_path(step)}" for name in names],
             scenes=[_scene(each) for each in runs],

@@ -25,9 +25,7 @@ _HIDDEN: Final = ("episode", "success", "terminated", "truncated", "last_step")
 
 
 @dataclass(frozen=True)
-class EpisodesView(RunView):
-    """A page of episodes."""
-
+class _EpisodesView(RunView):
     TEMPLATE: ClassVar = "run_episodes.html"
     phase: str
     total: int
@@ -65,7 +63,7 @@ def episodes(
     headings = ("episode" if phase == "train" else "trial", "end", *map(_heading, names))
     links = [f"/runs/{run.run_id}/replay/{path}" for path in paths] if recording.is_job else []
     paging = Paging(number, total, ROWS, link(f"/runs/{run.run_id}/episodes", {"phase": phase}))
-    view = EpisodesView(head_of(run), "episodes", phase, total, paging, Grid(headings, rows), links)
+    view = _EpisodesView(head_of(run), "episodes", phase, total, paging, Grid(headings, rows), links)
     return page(request, view)
 
 

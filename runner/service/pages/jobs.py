@@ -42,9 +42,7 @@ class ShownJob:
 
 
 @dataclass(frozen=True)
-class QueueRowsView(View):
-    """The part of the queue's page that changes."""
-
+class _QueueRowsView(View):
     TEMPLATE: ClassVar = "queue_rows.html"
     jobs: list[ShownJob]
     status: QueueStatus
@@ -54,17 +52,13 @@ class QueueRowsView(View):
 
 
 @dataclass(frozen=True)
-class QueueView(QueueRowsView):
-    """The queue."""
-
+class _QueueView(_QueueRowsView):
     TEMPLATE: ClassVar = "queue.html"
     uploads: list[Any]
 
 
 @dataclass(frozen=True)
-class JobView(View):
-    """A job."""
-
+class _JobView(View):
     TEMPLATE: ClassVar = "job.html"
     job: ShownJob
     log: list[Mapping[str, Any]]
@@ -81,13 +75,13 @@ def queue(
 ) -> Response:
     """Show the jobs, the newest first, and the uploads that are not yet runs."""
     pending = [upload for upload in list_uploads(uploads, owner).uploads if upload.state != "stored"]
-    return page(request, QueueView(*_rows(jobs, number), pending[:ROWS]))
+    return page(request, _QueueView(*_rows(jobs, number), pending[:ROWS]))
 
 
 @router.get("/status")
 def queue_status(request: Request, jobs: JobsOf, number: PageNumber = 1) -> Response:
     """Return the jobs as a part of their page; 204 if all are over."""
-    view = QueueRowsView(*_rows(jobs, number))
+    view = _QueueRowsView(*_rows(jobs, number))
     return page(request, view) if view.is_active else Response(status_code=HTTPStatus.NO_CONTENT)
 
 
@@ -96,7 +90,7 @@ def job(request: Request, jobs: JobsOf, number: Number) -> Response:
     """Show a job: its progress, its log, its runs."""
     events, place = jobs.store.last_events(number, MAX_LINES)
     found = jobs.store.job(number)  # read after its log: the script of the page receives later events
-    view = JobView(
+    view = _JobView(
         job=shown_job(found, jobs),
         log=[{"kind": event.kind, **event.data} for event in events],
         place=place,
@@ -136,7 +130,7 @@ def shown_job(job: Job, jobs: JobPool) -> ShownJob:
 
 
 def _rows(jobs: JobPool, number: int) -> tuple[list[ShownJob], QueueStatus, bool, Paging]:
-    """Return the fields of `QueueRowsView`."""
+    """Return the fields of `_QueueRowsView`."""
     newest_first = list(reversed(jobs.store.jobs()))
     shown = [shown_job(job, jobs) for job in newest_first[(number - 1) * ROWS : number * ROWS]]
     is_active = any(job.state in ("queued", "running") for job in newest_first)

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from http import HTTPStatus
 from importlib.resources import files
 from typing import Annotated, Any, ClassVar, Final
-from urllib.parse import parse_qsl, urlencode
+from urllib.parse import parse_qsl
 
 import jinja2
 from fastapi import Depends, FastAPI, Request, Response
@@ -20,6 +20,7 @@ from runner.errors import RunnerError
 from runner.export.reports.rendering import TEMPLATES as REPORT_TEMPLATES
 from runner.export.reports.rendering import View, code, environment_of, fill
 from runner.service import problems
+from runner.service.addresses import link
 from runner.service.pages import static
 from runner.util import humanize
 
@@ -45,9 +46,7 @@ class Viewer:
 
 
 @dataclass(frozen=True)
-class ProblemView(View):
-    """The page of an error."""
-
+class _ProblemView(View):
     TEMPLATE: ClassVar = "problem.html"
     title: str
     message: str
@@ -81,11 +80,8 @@ def templates() -> jinja2.Environment:
         "duration": humanize.duration,
         "age": _age,
         "problem": _problem,
-        "with_name": lambda value, name: (name, value),
-        "with_prefix": lambda value, prefix: f"{prefix}{value}",
-        "query": lambda values: urlencode(list(values), doseq=True),
     }
-    environment.globals |= {"static": static.address, "sections": SECTIONS}
+    environment.globals |= {"static": static.address, "sections": SECTIONS, "link": link}
     return environment
 
 
@@ -151,7 +147,7 @@ def _error_page(request: Request, response: Response) -> Response:
         return response
     status = HTTPStatus(response.status_code)
     message = json.loads(bytes(response.body))["error"]["message"]
-    found = page(request, ProblemView(status.phrase.capitalize(), message), status)
+    found = page(request, _ProblemView(status.phrase.capitalize(), message), status)
     headers = {key: value for key, value in response.headers.items() if not key.startswith("content-")}
     found.headers.update(headers)
     return found

@@ -59,9 +59,7 @@ class Evaluation(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ReplayView(RunView):
-    """The page of a step, or of the error of its episode."""
-
+class _ReplayView(RunView):
     TEMPLATE: ClassVar = "run_replay.html"
     which: tuple[int, ...]
     """(episode,) of training, or (training episodes before, trial) of an evaluation."""
@@ -141,7 +139,7 @@ async def _replay(
     return await run_in_threadpool(show)
 
 
-def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str = "") -> ReplayView:
+def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str = "") -> _ReplayView:
     with open_recording(run.recording) as recording:
         episodes = recording.count(recording.topic("/train/episode"))
         evaluations = [
@@ -158,7 +156,7 @@ def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str
         path = episode_path((*which[:-1], other, 0))
         return f"/runs/{run.run_id}/replay/{path}" if 0 <= other < max(count, number) else ""
 
-    return ReplayView(
+    return _ReplayView(
         run=head_of(run),
         here="replay",
         which=which,

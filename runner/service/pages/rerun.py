@@ -45,9 +45,7 @@ _SECONDS: Final = 60
 
 
 @dataclass(frozen=True)
-class RerunView(RunView):
-    """The viewer in the page of a run."""
-
+class _RerunView(RunView):
     TEMPLATE: ClassVar = "run_rerun.html"
     content: str
     back: str
@@ -56,9 +54,7 @@ class RerunView(RunView):
 
 
 @dataclass(frozen=True)
-class FrameView(View):
-    """The viewer alone."""
-
+class _FrameView(View):
     TEMPLATE: ClassVar = "rerun_frame.html"
     title: str
     files: str
@@ -75,7 +71,7 @@ def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_leng
     content = f"{episode_in_words(step)}, step {step[-1]}." if step else OVERVIEW
     back = replay_address(run.run_id, step) if step else ""
     frame = link(f"/runs/{run.run_id}/rerun/frame", {"at": at})
-    return page(request, RerunView(head_of(run), "rerun", content, back, frame))
+    return page(request, _RerunView(head_of(run), "rerun", content, back, frame))
 
 
 @router.get("/runs/{run}/rerun/frame")
@@ -91,7 +87,7 @@ async def frame(
     key = ("timeline step", recording_state(run), step)
     time = await cache.get_or_await(key, lambda: processes(fragments.timeline_step, run, step), LONG)
     query: dict[str, Any] = {"episodes": step[0]} if len(step) == 2 else {"evaluations": list(step[:1])}
-    view = FrameView(
+    view = _FrameView(
         title=f"{run.name}, {run.run_id}",
         files=f"/static/rerun/{version()}",
         recording=link(f"/api/v1/runs/{run.run_id}/replay.rrd", query),

@@ -74,9 +74,7 @@ class Status:
 
 
 @dataclass(frozen=True)
-class OverviewView(RunView):
-    """The first page of a run."""
-
+class _OverviewView(RunView):
     TEMPLATE: ClassVar = "run_overview.html"
     status: Status
     random_policy: str
@@ -86,17 +84,13 @@ class OverviewView(RunView):
 
 
 @dataclass(frozen=True)
-class StatusView(View):
-    """The part of the first page that changes."""
-
+class _StatusView(View):
     TEMPLATE: ClassVar = "run_status.html"
     status: Status
 
 
 @dataclass(frozen=True)
-class EvaluationsView(RunView):
-    """The last evaluations."""
-
+class _EvaluationsView(RunView):
     TEMPLATE: ClassVar = "run_evaluations.html"
     table: EvaluationTable | None
     links: list[str]
@@ -105,9 +99,7 @@ class EvaluationsView(RunView):
 
 
 @dataclass(frozen=True)
-class LearnedView(RunView):
-    """Policy and values at stages of learning."""
-
+class _LearnedView(RunView):
     TEMPLATE: ClassVar = "run_learned.html"
     maps: str
 
@@ -121,9 +113,7 @@ class LogLine(NamedTuple):
 
 
 @dataclass(frozen=True)
-class ConfigView(RunView):
-    """Configuration, provenance and log."""
-
+class _ConfigView(RunView):
     TEMPLATE: ClassVar = "run_config.html"
     yaml: str
     facts: Mapping[str, str]
@@ -181,7 +171,7 @@ def status(
     now = _status(run, jobs, settings)
     if run.status != status or not now.is_live:
         return Response(status_code=HTTPStatus.NO_CONTENT)
-    return page(request, StatusView(now))
+    return page(request, _StatusView(now))
 
 
 @router.get("/evaluations")
@@ -197,7 +187,7 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
         every = evaluation_records(recording)
         records, total, links = every[-MAX_EVALUATIONS:], len(every), []
     table = evaluation_table(records, agents, events, recording.is_job) if records else None
-    return page(request, EvaluationsView(head_of(run), "evaluations", table, links, total))
+    return page(request, _EvaluationsView(head_of(run), "evaluations", table, links, total))
 
 
 @router.get("/learned")
@@ -205,7 +195,7 @@ async def learned(request: Request, run: RecordedRun, cache: CacheOf, processes:
     """Show policy and values at stages of learning."""
     key = ("maps", recording_state(run))
     maps = await cache.get_or_await(key, lambda: processes(fragments.maps, run.recording), LONG)
-    return await run_in_threadpool(page, request, LearnedView(head_of(run), "learned", maps.decode()))
+    return await run_in_threadpool(page, request, _LearnedView(head_of(run), "learned", maps.decode()))
 
 
 @router.get("/config")
@@ -227,7 +217,7 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
     except RecordingError as error:
         facts["Recording"] = settings.without_folders(str(error))
     return page(
-        request, ConfigView(head_of(run), "config", write_yaml(run.file.config), facts, provenance, log)
+        request, _ConfigView(head_of(run), "config", write_yaml(run.file.config), facts, provenance, log)
     )
 
 
@@ -245,8 +235,8 @@ async def _random_policy(run: Run, cache: ResponseCache, processes: ProcessPool)
 
 def _overview(
     run: Run, jobs: JobPool, settings: Settings, random_policy: str = "", problem: str = ""
-) -> OverviewView:
-    return OverviewView(head_of(run), "", _status(run, jobs, settings), random_policy, problem)
+) -> _OverviewView:
+    return _OverviewView(head_of(run), "", _status(run, jobs, settings), random_policy, problem)
 
 
 def _status(run: Run, jobs: JobPool, settings: Settings) -> Status:

@@ -93,9 +93,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class RunsView(View):
-    """The table of runs with its search form."""
-
+class _RunsView(View):
     TEMPLATE: ClassVar = "runs.html"
     filter: str
     sort: str
@@ -112,9 +110,7 @@ class RunsView(View):
 
 
 @dataclass(frozen=True)
-class DiskView(View):
-    """The use of the disk."""
-
+class _DiskView(View):
     TEMPLATE: ClassVar = "disk.html"
     total: Mapping[str, int]
     free: int
@@ -163,7 +159,7 @@ def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: J
     """Show the use of the disk, and what could be freed."""
     largest, sums = usage_of(catalogue.read, Filter(None), ROWS)
     freeable = sums.freeable(settings.recordings)
-    view = DiskView(
+    view = _DiskView(
         total=sums.by_kind(),
         free=jobs.status().free_bytes,
         freeable=[(*FREED_BY[kind], size) for kind, size in freeable.items() if size],
@@ -173,7 +169,7 @@ def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: J
     return page(request, view)
 
 
-def _view(catalogue: Catalogue, text: str, sort: str, columns: str, number: int) -> RunsView:
+def _view(catalogue: Catalogue, text: str, sort: str, columns: str, number: int) -> _RunsView:
     chosen, order = parse(text), order_of(sort)
     shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
     is_usual = list(shown) == list(USUAL)
@@ -199,11 +195,11 @@ def _view(catalogue: Catalogue, text: str, sort: str, columns: str, number: int)
 
 def _search(
     text: str, sort: str, shown: Sequence[str], query: str, table: Table | None, problem: str = ""
-) -> RunsView:
+) -> _RunsView:
     names = dict.fromkeys([*(column for column in shown if column in FIELDS), *FIELDS])
     fields = [(name, HEADINGS.get(name, name).replace("_", " "), FIELDS[name].meaning) for name in names]
     settings = [column for column in shown if column.startswith(SETTING)]
-    return RunsView(text, sort, shown, query, table, problem, fields, settings)
+    return _RunsView(text, sort, shown, query, table, problem, fields, settings)
 
 
 def _heading(column: str, query: Mapping[str, str], folded: bool) -> Heading:

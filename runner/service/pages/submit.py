@@ -86,9 +86,7 @@ class Key(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SubmitView(View):
-    """The form with a text."""
-
+class _SubmitView(View):
     TEMPLATE: ClassVar = "submit.html"
     text: str
     problems: list[Problem]
@@ -140,9 +138,9 @@ def _problems(request: Request, text: str, error: RunnerError) -> list[Problem]:
     return problems or [Problem(None, None, body.message, "")]
 
 
-def _view(text: str, problems: Sequence[Problem] = (), checked: CheckedJob | None = None) -> SubmitView:
+def _view(text: str, problems: Sequence[Problem] = (), checked: CheckedJob | None = None) -> _SubmitView:
     is_sweep = any(line.startswith(f"{key}:") for line in text.splitlines() for key in SWEEP_KEYS)
-    return SubmitView(text, list(problems), checked, config_keys(), sweep_keys() if is_sweep else [])
+    return _SubmitView(text, list(problems), checked, config_keys(), sweep_keys() if is_sweep else [])
 
 
 @functools.cache

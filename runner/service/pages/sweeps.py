@@ -19,6 +19,7 @@ from runner.errors import RunnerError, RunNotFound
 from runner.export.reports.rendering import View
 from runner.runs.catalogue.filters import parse
 from runner.service import fragments
+from runner.service.addresses import link
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
 from runner.service.pages.jobs import ShownJob, shown_job
@@ -52,22 +53,17 @@ class ListedSweep:
 
 
 @dataclass(frozen=True)
-class SweepsView(View):
-    """The list of sweeps."""
-
+class _SweepsView(View):
     TEMPLATE: ClassVar = "sweeps.html"
     sweeps: list[ListedSweep]
 
 
 @dataclass(frozen=True)
-class SweepPageView(View):
-    """The page of a sweep."""
-
+class _SweepPageView(View):
     TEMPLATE: ClassVar = "sweep_page.html"
     name: str
-    tag: str
     runs: int
-    parameters: list[str]
+    runs_address: str
     job: ShownJob | None
     """The newest job of the sweep."""
     parts: Mapping[str, str | None]
@@ -90,7 +86,7 @@ def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
             found.append(
                 ListedSweep(name, "", sweep.file.strategy, parameters, sweep.objective.description, runs)
             )
-    return page(request, SweepsView(found))
+    return page(request, _SweepsView(found))
 
 
 @router.get("/{name}")
@@ -113,11 +109,13 @@ async def sweep(
 
     def show() -> Response:
         own = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
-        view = SweepPageView(
+        parameters = [f"config.{path}" for path in read_sweep(name, state.folder).file.parameters]
+        columns = ",".join(["id", "seed", "status", "success_percent", "mean_length", *parameters])
+        query = {"filter": f'tag:"{tag_of(name)}"', "columns": columns}
+        view = _SweepPageView(
             name=name,
-            tag=tag_of(name),
             runs=state.runs,
-            parameters=list(read_sweep(name, state.folder).file.parameters),
+            runs_address=link("/runs", query),
             job=shown_job(own[-1], jobs) if own else None,
             parts=parts,
         )
