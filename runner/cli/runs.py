@@ -116,7 +116,7 @@ def command_for(run: Run, verb: str, *options: str) -> str:
 @contextlib.contextmanager
 def compilation_notice() -> Iterator[None]:
     """Print a notice when a kernel is compiled, which takes seconds the first time."""
-    from runner.learning.compilation import MESSAGE, announced
+    from runner.learning.numba_cache import MESSAGE, announced
 
     with announced(lambda: say(MESSAGE)):
         yield

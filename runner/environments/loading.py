@@ -1,9 +1,9 @@
-"""A tabular Gymnasium environment made, and read into arrays.
+"""Make a tabular Gymnasium environment, and read it into arrays.
 
-It offers them as documented attributes of `env.unwrapped` (`transitions`, `agents`,
+The environment offers them as documented attributes of `env.unwrapped` (`transitions`, `agents`,
 `agent_action_counts`, `event_names`, `success_events`, `penalty_below`, `scene`, `scene_cells`,
 `scene_carriers`), or only Gymnasium's customary `P` and `initial_state_distrib`; for Gymnasium's own grid
-worlds `runner.environments.toy_text` says the rest. What it does not offer is left out, not invented.
+worlds `runner.environments.toy_text` adds the rest. An attribute that is missing stays unknown.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
     Args:
         env_id: a Gymnasium id; the part before a colon is a module to import first.
         kwargs: arguments of the environment.
-        rewards: `team`, or `individual` for a reward an agent (the environment's `competitive=True`).
+        rewards: `team`, or `individual` for a reward of each agent (the environment's `competitive=True`).
 
     Raises:
         EnvironmentNotUsable: it is unknown, cannot be made, or has no transition table.
@@ -43,8 +43,8 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
         raise
     except Exception as error:  # its attributes may raise anything
         raise EnvironmentNotUsable(
-            f"environment {env_id!r}: what it tells of itself cannot be read "
-            f"({type(error).__name__}: {error}); docs/architecture.md says what is expected."
+            f"environment {env_id!r}: its attributes cannot be read "
+            f"({type(error).__name__}: {error}); docs/architecture.md lists what is expected."
         ) from error
     check_mdp(mdp)
     if rewards == "individual" and mdp.rewards.shape[-1] != len(mdp.agents):
@@ -53,10 +53,10 @@ def load_mdp(env_id: str, kwargs: Mapping[str, Any], rewards: str = "team") -> M
 
 
 def mdp_of(env: Any, kwargs: Mapping[str, Any]) -> Mdp:
-    """Return the arrays of an environment that is made already, with `kwargs`; its agents share the reward.
+    """Return the arrays of an environment made with `kwargs`, whose agents share the reward.
 
     Raises:
-        EnvironmentNotUsable: it has no transition table, or one that makes no sense.
+        EnvironmentNotUsable: it has no transition table, or one that is invalid.
     """
     spec = env.spec
     env_id = spec.id if spec is not None else type(env.unwrapped).__qualname__
@@ -64,14 +64,14 @@ def mdp_of(env: Any, kwargs: Mapping[str, Any]) -> Mdp:
         mdp = _read(env_id, kwargs, env, "team")
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise EnvironmentNotUsable(
-            f"environment {env_id!r}: what it tells of itself makes no sense."
+            f"environment {env_id!r}: its attributes contradict each other."
         ) from error
     check_mdp(mdp)
     return mdp
 
 
 def _read(env_id: str, kwargs: Mapping[str, Any], env: Any, rewards: str) -> Mdp:
-    """Return what an environment tells of itself, not yet checked; a team shares the summed reward."""
+    """Return the attributes of an environment, not yet checked; a team shares the summed reward."""
     from runner.config.values import plain  # reading a recording needs none of it
 
     base = env.unwrapped
@@ -79,7 +79,7 @@ def _read(env_id: str, kwargs: Mapping[str, Any], env: Any, rewards: str) -> Mdp
     transitions = _transitions(env_id, base)
     joint = transitions["next_state"].shape[1]
     described = grid_world(env_id, base, transitions)
-    said: Any = described or base
+    source: Any = described or base
     if described is not None:
         transitions["events"] = described.events
     if rewards == "team":
@@ -90,20 +90,20 @@ def _read(env_id: str, kwargs: Mapping[str, Any], env: Any, rewards: str) -> Mdp
         **transitions,
         start=np.ascontiguousarray(base.initial_state_distrib, dtype=np.float64),
         step_limit=int(limit or 0),
-        agents=tuple(getattr(said, "agents", ("agent",))),
+        agents=tuple(getattr(source, "agents", ("agent",))),
         action_counts=tuple(int(n) for n in getattr(base, "agent_action_counts", (joint,))),
-        event_names=tuple(getattr(said, "event_names", ())),
-        success_events=tuple(getattr(said, "success_events", ())),
-        penalty_below=float(getattr(said, "penalty_below", -np.inf)),
-        scene=getattr(said, "scene", None),
-        scene_cells=getattr(said, "scene_cells", None),
-        scene_carriers=getattr(said, "scene_carriers", None),
+        event_names=tuple(getattr(source, "event_names", ())),
+        success_events=tuple(getattr(source, "success_events", ())),
+        penalty_below=float(getattr(source, "penalty_below", -np.inf)),
+        scene=getattr(source, "scene", None),
+        scene_cells=getattr(source, "scene_cells", None),
+        scene_carriers=getattr(source, "scene_carriers", None),
     )
 
 
 def _one_reward_only(env_id: str) -> EnvironmentNotUsable:
     return EnvironmentNotUsable(
-        f"environment {env_id!r} does not pay its agents one by one: set `rewards: team` "
+        f"environment {env_id!r} does not reward its agents individually: set `rewards: team` "
         "(`mode: competitive` means individual rewards)."
     )
 
@@ -119,7 +119,7 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
         except ModuleNotFoundError as error:
             raise EnvironmentNotUsable(
                 f"environment {env_id!r}: there is no module {error.name!r}; "
-                "install the package that brings it, set PYTHONPATH to the folder it is in, or mend `env.id`."
+                "install its package, set PYTHONPATH to its folder, or correct `env.id`."
             ) from error
         except Exception as error:  # a module may raise anything
             raise EnvironmentNotUsable(
@@ -146,7 +146,7 @@ def _make(env_id: str, kwargs: dict[str, Any]) -> Any:
 
 
 def _raised(error: Exception) -> str:
-    """Return what somebody's code raised, and where: `KeyError: 'goal' (corridor.py, line 12)`."""
+    """Return the error and its place in other code: `KeyError: 'goal' (corridor.py, line 12)`."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     at = "" if isinstance(error, SyntaxError) else f" ({Path(place.filename).name}, line {place.lineno})"
     return f"{type(error).__name__}: {error}{at}"

@@ -1,4 +1,4 @@
-"""A tabular environment as arrays: all that the runner ever learns of it, whichever it was."""
+"""A tabular environment as arrays: all that the runner knows of it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from runner.util.values import is_text, is_whole
 MAX_EVENTS = 31
 MAX_AGENTS = 31
 MAX_ARRAYS_BYTES = 128 << 20
-"""What all arrays of an environment may take, so that a recording of it can be read again."""
+"""Limit of all arrays of an environment, within which a recording of it can be read."""
 _BATCH_OUTCOMES = 1 << 20
 """Outcomes that are compared at a time, so that memory grows with neither steps nor outcomes."""
 _DTYPES = {
@@ -40,9 +40,9 @@ class Mdp:
     next_state: NDArray[np.int32]
     """[S, J, K]."""
     probability: NDArray[np.float64]
-    """[S, J, K]; 0 where a pair has fewer outcomes, those come last."""
+    """[S, J, K]; 0 where a pair has fewer outcomes; these come last."""
     rewards: NDArray[np.float64]
-    """[S, J, K, R]; R is 1 (all agents share it), or the number of agents."""
+    """[S, J, K, R]; R is 1 if all agents share the reward, or the number of agents."""
     terminated: NDArray[np.bool_]
     """[S, J, K]."""
     events: NDArray[np.uint32]
@@ -53,7 +53,7 @@ class Mdp:
     """Steps after which an episode is truncated; 0 for never."""
     agents: tuple[str, ...]
     action_counts: tuple[int, ...]
-    """Actions of each agent; a joint action counts them up like digits, the first agent's foremost."""
+    """Actions of each agent; a joint action has them as digits, the first agent's the most significant."""
     event_names: tuple[str, ...] = ()
     success_events: tuple[str, ...] = ()
     penalty_below: float = -np.inf
@@ -62,7 +62,7 @@ class Mdp:
     scene_cells: NDArray[np.int16] | None = None
     """[S, things]: the cell of each thing, row * columns + column."""
     scene_carriers: NDArray[np.int8] | None = None
-    """[S, things]: which thing carries it, or -1."""
+    """[S, things]: the thing that carries it, or -1."""
 
     @property
     def states(self) -> int:
@@ -98,12 +98,12 @@ class Mdp:
         if self.rewards.shape[-1] in (learners, 1):
             return np.broadcast_to(self.rewards, (*self.rewards.shape[:-1], learners))
         raise EnvironmentNotUsable(
-            f"{self.env_id} pays {self.rewards.shape[-1]} agents one by one, but one table for all is to "
-            "learn from the reward: set `rewards: team`, or `tables: per_agent`."
+            f"{self.env_id} rewards {self.rewards.shape[-1]} agents individually, but there is one table for "
+            "all: set `rewards: team`, or `tables: per_agent`."
         )
 
     def description(self) -> dict[str, Any]:
-        """Return all that is not an array, as JSON can hold it."""
+        """Return all fields that are not arrays, as JSON can hold them."""
         return {
             "env_id": self.env_id,
             "kwargs": dict(self.kwargs),
@@ -200,14 +200,14 @@ def from_parts(description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]
         )
         check_mdp(mdp)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError, RecursionError) as error:
-        raise EnvironmentNotUsable(f"what is said of the environment makes no sense: {error!r}") from error
+        raise EnvironmentNotUsable(f"the description of the environment is invalid: {error!r}") from error
     return mdp
 
 
 def check_mdp(mdp: Mdp) -> None:
-    """Refuse parts that contradict each other: an environment, or a recording, may bring anything.
+    """Refuse parts that contradict each other: neither environments nor recordings can be trusted.
 
-    One expectation relies on those before it.
+    Each expectation relies on those before it.
     """
     with np.errstate(all="ignore"):
         for expectations in (_descriptions_right(mdp), _arrays_right(mdp)):
@@ -222,7 +222,7 @@ def check_mdp(mdp: Mdp) -> None:
 
 
 def _descriptions_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
-    """Yield what must hold of all but the arrays, whether it does, and what was found."""
+    """Yield expectations of all fields but the arrays: their text, whether they hold, and the value found."""
     agents, counts, events = mdp.agents, mdp.action_counts, mdp.event_names
     yield "an id must be text", is_text(mdp.env_id), mdp.env_id
     yield "kwargs must be a mapping", isinstance(mdp.kwargs, Mapping), mdp.kwargs
@@ -242,7 +242,7 @@ def _descriptions_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
 
 
 def _arrays_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
-    """Yield what must hold of the arrays, whether it does, and what was found."""
+    """Yield expectations of the arrays: their text, whether they hold, and the value found."""
     for name, kind in _DTYPES.items():
         array = getattr(mdp, name)
         yield f"{name} must be an array of {np.dtype(kind)}", _is_array(array, kind), array
@@ -279,7 +279,7 @@ def _arrays_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
 
 
 def _in_words(found: Any) -> str:
-    """Return what was found, or what a function gives, as a message can hold it: arrays by type and shape."""
+    """Return a value, or the result of a function, for a message: arrays by type and shape."""
     if callable(found):
         found = found()
     if isinstance(found, np.ndarray):
@@ -294,7 +294,7 @@ def _range(values: NDArray[Any]) -> str:
 
 
 def _sums(probability: NDArray[np.float64]) -> str:
-    """Return the lowest value, and the sums along the last axis, in words."""
+    """Return a text of the lowest value and the sums along the last axis."""
     if not probability.size:
         return "none"
     return f"values from {probability.min():g} on, sums {_range(probability.sum(axis=-1))}"

@@ -1,11 +1,11 @@
-"""States, joint actions, events and trials, said in words.
+"""Names of states, joint actions, events and trials for people.
 
-The words come from the scene that the environment, or the recording, brings along:
+They are derived from the scene that the environment, or the recording, includes:
 
     taxi 1 (0,0), taxi 2 (3,2), passenger at R, destination B        a state
     south + pickup                                                   a joint action
 
-Without a scene they are `state 17` and `action 3`.
+Without a scene the names are `state 17` and `action 3`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from runner.environments.mdp import Mdp
 
 
 def states_in_words(mdp: Mdp) -> NDArray[np.object_]:
-    """Return the words of every state, [S] of str: index it by a state, or by an array of states."""
+    """Return the name of every state, [S] of str: index it by a state, or by an array of states."""
     scene, cells, carriers = mdp.scene, mdp.scene_cells, mdp.scene_carriers
     if scene is None or cells is None:
         return _texts([f"state {state}" for state in range(mdp.states)])
@@ -34,7 +34,7 @@ def states_in_words(mdp: Mdp) -> NDArray[np.object_]:
 
 
 def actions_in_words(mdp: Mdp) -> NDArray[np.object_]:
-    """Return the words of every joint action, [J] of str: `south + pickup`."""
+    """Return the name of every joint action, [J] of str: `south + pickup`."""
     named = action_names(mdp)
     if named is None:
         return _texts([f"action {action}" for action in range(mdp.joint_actions)])
@@ -42,7 +42,7 @@ def actions_in_words(mdp: Mdp) -> NDArray[np.object_]:
 
 
 def action_names(mdp: Mdp) -> list[list[str]] | None:
-    """Return the words of each agent's actions; None where the scene does not name them."""
+    """Return the names of each agent's actions; None where the scene does not name them."""
     actions = [] if mdp.scene is None else mdp.scene.get("actions", [])
     if any(count != len(actions) for count in mdp.action_counts):
         return None
@@ -51,7 +51,7 @@ def action_names(mdp: Mdp) -> list[list[str]] | None:
 
 
 def numbered_actions(mdp: Mdp) -> list[list[str]]:
-    """Return the words of each agent's actions; `action 3` where the scene does not name them."""
+    """Return the names of each agent's actions; `action 3` where the scene does not name them."""
     return action_names(mdp) or [[f"action {i}" for i in range(count)] for count in mdp.action_counts]
 
 
@@ -61,7 +61,7 @@ def agent_actions(mdp: Mdp, action: int) -> tuple[int, ...]:
 
 
 def exploration_in_words(mask: int, learners: Sequence[str]) -> str:
-    """Return who explored in a step: `explored` if all learners did, `taxi 1 explored`, or nothing.
+    """Return which learners explored in a step: `explored` if all did, `taxi 1 explored`, or nothing.
 
     Args:
         mask: the step's `explored`: bit i is learner i.
@@ -74,13 +74,13 @@ def exploration_in_words(mask: int, learners: Sequence[str]) -> str:
 
 
 def event_in_words(name: str) -> str:
-    """Return an event's name as people say it: `taxi_1.drop_off` is `taxi 1 drop-off`."""
+    """Return an event's name as people write it: `taxi_1.drop_off` is `taxi 1 drop-off`."""
     agent, _, event = name.rpartition(".")
     return f"{agent.replace('_', ' ')} {spoken(event)}".strip()
 
 
 def events_in_words(mdp: Mdp, mask: int) -> str:
-    """Return the events of a bit mask in words, parted by commas."""
+    """Return the names of the events of a bit mask, separated by commas."""
     return ", ".join(event_in_words(name) for bit, name in enumerate(mdp.event_names) if mask >> bit & 1)
 
 
@@ -90,16 +90,16 @@ def spoken(name: str) -> str:
 
 
 def trial_in_words(after: int, number: int) -> str:
-    """Return what a trial, counted from 0, is called: that of the evaluation after so many episodes."""
+    """Return the name of a trial, counted from 0, of the evaluation after a number of episodes."""
     return f"trial {number:,} of the evaluation after {after:,} episodes"
 
 
 def _thing_in_words(
     scene: Mapping[str, Any], thing: Mapping[str, Any], cells: NDArray[Any], carriers: NDArray[Any]
 ) -> list[str]:
-    """Return what is said of one thing in every state.
+    """Return the place of one thing in every state.
 
-    A mover is at a cell; anything else in what carries it, at a landmark if there is one, or at a cell.
+    A mover is at a cell; any other thing is in its carrier, at a landmark if there is one, or at a cell.
     """
     label = thing["label"]
     columns = scene["columns"]

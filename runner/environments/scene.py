@@ -1,7 +1,7 @@
-"""What a scene must be, so that whoever draws it, or says it in words, need not look again.
+"""Checks of a scene, so that code that draws or describes it need not check again.
 
-An environment, or the recording of one, brings the scene along as plain data (see
-`runner.environments.mdp`); either may be anyone's.
+An environment, or the recording of one, includes the scene as plain data (see `runner.environments.mdp`);
+neither can be trusted.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _KEYS: Final = {"rows", "columns", "walls", "landmarks", "things", "actions"}
 def scene_mistake(
     scene: Any, cells: NDArray[Any] | None, carriers: NDArray[Any] | None, states: int
 ) -> str | None:
-    """Return what is wrong with a scene and its arrays; None if nothing is.
+    """Return the first mistake of a scene and its arrays; None if there is none.
 
     Args:
         scene: `rows` and `columns`; `walls` (pairs of [row, column]); `landmarks` (`name`, `cell`, `colour`);

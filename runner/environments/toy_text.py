@@ -1,9 +1,9 @@
-"""What Gymnasium's own grid worlds do not say of themselves: scene, events, success; as data.
+"""Scene, events and success of Gymnasium's own grid worlds, which do not define them.
 
 Taxi-v4, FrozenLake-v1 and CliffWalking-v1 offer a transition table and no more. A `GridWorld` here adds
-to it what an environment of this project offers by itself (see `runner.environments.loading`): which
-cells there are, what stands where in each state, and which outcomes are events. It is worked out from
-the environment that was made, so that maps, rewards and slipperiness given as arguments are followed.
+the attributes that an environment of this project offers itself (see `runner.environments.loading`): the
+cells, the place of each thing in each state, and which outcomes are events. They are computed from the
+environment as made, so maps, rewards and slipperiness given as arguments are respected.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from runner.errors import EnvironmentNotUsable
 
-# Okabe and Ito (2008): told apart with any common colour blindness.
+# Okabe and Ito (2008): distinguishable with any common colour blindness.
 _VERMILLION, _GREEN, _YELLOW, _BLUE = "#D55E00", "#009E73", "#F0E442", "#0072B2"
 _GREY, _SKY_BLUE = "#777777", "#56B4E9"
 
@@ -27,7 +27,7 @@ Events = Mapping[str, NDArray[np.bool_]]
 
 @dataclass(frozen=True, eq=False)
 class GridWorld:
-    """What is added to an environment's transition table."""
+    """What an adapter adds to an environment's transition table."""
 
     scene: Mapping[str, Any]
     scene_cells: NDArray[np.int16]
@@ -35,7 +35,7 @@ class GridWorld:
     scene_carriers: NDArray[np.int8]
     """[S, things]."""
     happens: Events
-    """Event -> the outcomes [S, J, K] that are it."""
+    """Event to the outcomes [S, J, K] in which it happens."""
     success_events: tuple[str, ...]
     penalty_below: float = -np.inf
     agents: tuple[str, ...] = field(default=("agent",))
@@ -53,7 +53,7 @@ class GridWorld:
 
 
 def grid_world(env_id: str, base: Any, arrays: Arrays) -> GridWorld | None:
-    """Return what is known of one of Gymnasium's grid worlds; None for any other environment.
+    """Return the additions to one of Gymnasium's grid worlds; None for any other environment.
 
     Args:
         env_id: its id, for messages.
@@ -61,7 +61,7 @@ def grid_world(env_id: str, base: Any, arrays: Arrays) -> GridWorld | None:
         arrays: its transition arrays, as `runner.environments.mdp` has them.
 
     Raises:
-        EnvironmentNotUsable: it is a variant whose table does not tell the whole truth.
+        EnvironmentNotUsable: it is a variant that its transition table does not describe.
     """
     adapt = _ADAPTERS.get(f"{type(base).__module__}.{type(base).__qualname__}")
     return None if adapt is None else adapt(env_id, base, arrays)
@@ -207,7 +207,7 @@ def _scene(
 
 
 def _tiles(tiles: NDArray[np.bytes_], kinds: Mapping[bytes, dict[str, str]]) -> list[dict[str, Any]]:
-    """Return a landmark for each tile that means something."""
+    """Return a landmark for each tile that has a meaning."""
     return [
         kinds[bytes(tile)] | {"cell": [int(row), int(column)]}
         for (row, column), tile in np.ndenumerate(tiles)
@@ -216,7 +216,7 @@ def _tiles(tiles: NDArray[np.bytes_], kinds: Mapping[bytes, dict[str, str]]) -> 
 
 
 def _one_player(cells: int) -> dict[str, Any]:
-    """Return the places where the state is the player's cell."""
+    """Return the scene's arrays where the state is the player's cell."""
     return {
         "scene_cells": np.arange(cells, dtype=np.int16)[:, np.newaxis],
         "scene_carriers": np.full((cells, 1), -1, np.int8),

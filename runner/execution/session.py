@@ -19,7 +19,7 @@ from runner.environments.mdp import Mdp
 from runner.errors import Diverged, RunnerError, StorageError, truncated_message
 from runner.execution.initial_tables import configured_tables, resolve_job
 from runner.learning.learner import Learner
-from runner.planning import Yardstick
+from runner.planning import ExactEvaluator
 from runner.recording import schema
 from runner.recording.messages import QTable, encode, encode_log, encode_q_table
 from runner.recording.metadata import (
@@ -274,15 +274,15 @@ class Session:
 
     def _measure_exactly(self, metrics: dict[str, Any]) -> None:
         """Record what the evaluated policy gets from every start state, and the optimum."""
-        exact = self._yardstick.measure(self._learner.policy, metrics["discount"])
+        exact = self._exact_evaluator.measure(self._learner.policy, metrics["discount"])
         position = {name: metrics[name] for name in ("step", "episode", "evaluation")}
         topic = schema.OPTIMALITY_TOPIC
         self.recorder.message(topic, encode(topic.message, position | exact))
         self._progress.evaluations[-1] = metrics | {"optimality": exact}
 
     @cached_property
-    def _yardstick(self) -> Yardstick:
-        return Yardstick(self._learner.mdp, len(self._learner.agents))
+    def _exact_evaluator(self) -> ExactEvaluator:
+        return ExactEvaluator(self._learner.mdp, len(self._learner.agents))
 
     def _snapshot_is_due(self, episode: int) -> bool:
         every = self._config.snapshots.every

@@ -1,16 +1,16 @@
-"""What each algorithm does at a step: how it acts, and what it learns.
+"""The formulas of each algorithm: how it acts at a step, and what it learns from it.
 
-`choose` and `learn` are compiled into the loops of `kernel`, which train and replay by them. Which
-algorithm they are is known when they are compiled (`Rules.algorithm`), so each has a kernel of its own and
-none pays for another. docs/algorithms.md has all of them side by side; the formulas are from
+`choose` and `learn` are compiled into the loops of `kernel`, which train and replay with them. The algorithm
+is known when they are compiled (`Rules.algorithm`), so each has a kernel of its own and none slows down
+another. docs/algorithms.md has all of them side by side; the formulas are from
 
 - Sutton and Barto, "Reinforcement Learning", 2nd edition: SARSA (section 6.4), Q-learning (6.5), Expected
   SARSA (6.6), Double Q-learning (6.7; van Hasselt, "Double Q-learning", 2010);
 - Matignon, Laurent and Le Fort-Piat, "Hysteretic Q-learning", 2007;
 - Bowling and Veloso, "Multiagent learning using a variable learning rate", 2002: WoLF-PHC.
 
-The greedy action and the value of each state are kept beside the tables and mended at each update, so a
-step does not scan a row unless the row's best value fell. Ties go to the lowest action.
+The greedy action and the value of each state are stored next to the tables and updated with them, so a step
+does not scan a row unless the row's best value fell. Ties go to the lowest action.
 """
 
 from __future__ import annotations
@@ -41,51 +41,54 @@ NUMBERS: Final = {
     "hysteretic_q_learning": HYSTERETIC_Q_LEARNING,
     "wolf_phc": WOLF_PHC,
 }
-"""By the configuration's `algorithm`; random agents learn nothing (`Rules.learns`)."""
+"""The configuration's `algorithm` to its number; random agents learn nothing (`Rules.learns`)."""
 
-KEPT: Final = {
+EXTRA_TABLES: Final = {
     "double_q_learning": ("q_1", "q_2"),
     "wolf_phc": ("policy", "average_policy", "visits"),
 }
-"""What an algorithm keeps besides the Q-table that is shown."""
+"""The tables of an algorithm besides the Q-table that is shown."""
 
 FIRST, SECOND = 0, 1
-"""Rows of `Tables.kept` of Double Q-learning: its two Q-tables."""
+"""Rows of `Tables.extra` of Double Q-learning: its two Q-tables."""
 POLICY, AVERAGE_POLICY = 0, 1
-"""Rows of `Tables.kept` of WoLF-PHC."""
+"""Rows of `Tables.extra` of WoLF-PHC."""
+DECREASE: Final = 0
+"""Place in `Rules.parameters` of Hysteretic Q-learning: the step size of updates that lower a value."""
+WIN, LOSE = 0, 1
+"""Places in `Rules.parameters` of WoLF-PHC: how far the policy moves in one update."""
+MAX_PARAMETERS: Final = 2
 
 
 class Tables(NamedTuple):
-    """The learners' tables, those of one kind one after the other, and what is kept beside them."""
+    """The learners' tables, those of one kind one after the other, and values derived from them."""
 
     q: NDArray[np.float64]
-    """[sum of S * width]: table i starts at offset[i], row-major. The values that are shown, and that greedy
-    actions follow; of Double Q-learning the mean of both tables."""
+    """[sum of S * width]: table i starts at offset[i], row-major. These values are shown, and greedy actions
+    follow them; of Double Q-learning the mean of both tables."""
     offset: tuple[int, ...]
     """[L]; a tuple, as `Model.width`: their length is known when the kernel is compiled."""
     greedy: NDArray[np.int32]
     """[L, S]: the lowest action of the highest value."""
     value: NDArray[np.float64]
     """[L, S]: the highest value."""
-    kept: NDArray[np.float64]
+    extra: NDArray[np.float64]
     """[2, sum of S * width], each row laid out as `q`; without rows if the algorithm has no such tables."""
     visits: NDArray[np.float64]
-    """[L, S]: how often WoLF-PHC updated a state's policy; without rows for the others."""
+    """[L, S]: updates of a state's policy by WoLF-PHC; without rows for the others."""
 
 
 class Rules(NamedTuple):
-    """How to learn: schedules (see `schedules`) and the switches of the configuration."""
+    """The schedules (see `schedules`) and switches of the configuration."""
 
     algorithm: tuple[int, ...]
-    """A tuple of as many numbers as the algorithm's number: its length is known when a kernel is compiled."""
+    """A tuple whose length is the algorithm's number: lengths are known when a kernel is compiled."""
     step_size: NDArray[np.float64]
     discount: NDArray[np.float64]
     epsilon: NDArray[np.float64]
-    decrease: NDArray[np.float64]
-    """Hysteretic Q-learning: the step size of updates that lower a value."""
-    win: NDArray[np.float64]
-    lose: NDArray[np.float64]
-    """WoLF-PHC: how far the policy moves in one update."""
+    parameters: tuple[NDArray[np.float64], ...]
+    """Schedules of the algorithm's own parameters, in the order of its section of the configuration, then
+    constants of 0: there are `MAX_PARAMETERS` of them for every algorithm."""
     by_step: bool
     """Whether step size, discount or epsilon counts steps, not episodes."""
     learns: bool
@@ -97,7 +100,7 @@ class Rules(NamedTuple):
 
 
 class Moment(NamedTuple):
-    """When a step is taken, and what the schedules say then."""
+    """The time of a step, and the values of the schedules at it."""
 
     episode: int
     step: int
@@ -107,11 +110,11 @@ class Moment(NamedTuple):
     step_size: float
     discount: float
     next_epsilon: float
-    """The probability of exploring at the next step; only Expected SARSA asks for it."""
+    """The probability of exploring at the next step; only Expected SARSA needs it."""
 
 
 Index = np.uint64
-"""What the hot loops index with: numba leaves out the arithmetic for negative indices."""
+"""The type of indices in hot loops: for it Numba leaves out the arithmetic of negative indices."""
 
 
 # --- acting -------------------------------------------------------------------------------------------
@@ -166,7 +169,7 @@ def choose(
 def _own_choice(
     seed: np.uint64, model: Model, tables: Tables, rules: Rules, episode: int, t: int, i: int, state: int
 ) -> int:
-    """Return what learner i does when it does not explore: greedy, or as its policy draws."""
+    """Return learner i's action when it does not explore: the greedy one, or one drawn from its policy."""
     if len(rules.algorithm) == WOLF_PHC:
         bits = draws.draw(draws.key(seed, draws.POLICY, episode), t * len(model.width) + i)
         return drawn(model, tables, i, state, draws.uniform(bits))
@@ -175,12 +178,12 @@ def _own_choice(
 
 @numba.njit
 def drawn(model: Model, tables: Tables, i: int, state: int, u: float) -> int:
-    """Return the action that falls to u in [0, 1) by learner i's policy; never one of probability 0."""
+    """Return the action of learner i's policy that u in [0, 1) selects; never one of probability 0."""
     row = tables.offset[i] + state * model.width[i]
     chosen = 0
     total = 0.0
     for action in range(model.width[i]):
-        probability = tables.kept[POLICY, row + action]
+        probability = tables.extra[POLICY, row + action]
         if probability > 0.0:
             chosen = action
             total += probability
@@ -207,20 +210,20 @@ def learn(
     next_action: int,
     bootstraps: bool,
 ) -> None:
-    """Learner i learns from one step.
+    """Update learner i's tables by one step.
 
     Args:
         seed: of the run.
         model: the environment.
-        tables: what is changed.
-        rules: how.
-        now: when.
+        tables: the tables to update.
+        rules: of the run.
+        now: the time of the step.
         i: the learner.
-        state: where it was.
-        action: what it did: its own action.
-        reward: what it got.
-        next_state: where it came to.
-        next_action: its own action of the next step; only SARSA asks for it.
+        state: of the step.
+        action: the learner's own action.
+        reward: of the learner.
+        next_state: of the step.
+        next_action: its own action of the next step; only SARSA needs it.
         bootstraps: whether the next state counts: it does unless the episode was terminated.
     """
     algorithm = len(rules.algorithm)
@@ -232,11 +235,11 @@ def learn(
         bits = draws.draw(draws.key(seed, draws.UPDATE, now.episode), now.t * len(model.width) + i)
         learned, other = (FIRST, SECOND) if draws.coin(bits) < 0.5 else (SECOND, FIRST)
         if bootstraps:
-            best = _best(tables.kept[learned], next_row, width)
-            td_target += now.discount * tables.kept[other, next_row + best]
-        old = tables.kept[learned, row + action]
-        tables.kept[learned, row + action] = old + now.step_size * (td_target - old)
-        mean = 0.5 * (tables.kept[FIRST, row + action] + tables.kept[SECOND, row + action])
+            best = _best(tables.extra[learned], next_row, width)
+            td_target += now.discount * tables.extra[other, next_row + best]
+        old = tables.extra[learned, row + action]
+        tables.extra[learned, row + action] = old + now.step_size * (td_target - old)
+        mean = 0.5 * (tables.extra[FIRST, row + action] + tables.extra[SECOND, row + action])
         _set(tables, i, state, action, row, width, mean)
     else:
         if bootstraps:
@@ -251,11 +254,11 @@ def learn(
         old = tables.q[row + action]
         rate = now.step_size
         if algorithm == HYSTERETIC_Q_LEARNING and td_target < old:
-            rate = schedule_value(rules.decrease, now.episode, now.step)
+            rate = schedule_value(rules.parameters[DECREASE], now.episode, now.step)
         _set(tables, i, state, action, row, width, old + rate * (td_target - old))
     if algorithm == WOLF_PHC:
-        win = schedule_value(rules.win, now.episode, now.step)
-        lose = schedule_value(rules.lose, now.episode, now.step)
+        win = schedule_value(rules.parameters[WIN], now.episode, now.step)
+        lose = schedule_value(rules.parameters[LOSE], now.episode, now.step)
         _improve_policy(tables, i, state, row, width, win, lose)
 
 
@@ -263,7 +266,7 @@ def learn(
 def _expected(tables: Tables, i: int, state: int, row: int, width: int, epsilon: float) -> float:
     """Return a state's expected value under the epsilon-greedy policy.
 
-    All actions share epsilon alike; the rest falls to the greedy action, the lowest of the best.
+    All actions share epsilon equally; the greedy action, the lowest of the best, has the rest.
     """
     total = 0.0
     for action in range(Index(width)):
@@ -275,11 +278,11 @@ def _expected(tables: Tables, i: int, state: int, row: int, width: int, epsilon:
 def _improve_policy(
     tables: Tables, i: int, state: int, row: int, width: int, win: float, lose: float
 ) -> None:
-    """Average the policy of a state, then move it towards the greedy action: little if it wins.
+    """Average the policy of a state, then move it towards the greedy action, by less if it wins.
 
-    It wins if, by the values as they are, it is worth more than the average policy.
+    It wins if, by the present values, it is worth more than the average policy.
     """
-    policy, average = tables.kept[POLICY], tables.kept[AVERAGE_POLICY]
+    policy, average = tables.extra[POLICY], tables.extra[AVERAGE_POLICY]
     visits = tables.visits[i, state] + 1.0
     tables.visits[i, state] = visits
     worth = usual = 0.0
@@ -301,7 +304,7 @@ def _improve_policy(
 
 @numba.njit(inline="always")
 def _set(tables: Tables, i: int, state: int, action: int, row: int, width: int, new: float) -> None:
-    """Set Q_i(state, action); keep the state's greedy action and value true."""
+    """Set Q_i(state, action), and update the state's greedy action and value."""
     old = tables.q[row + action]
     tables.q[row + action] = new
     if action == Index(tables.greedy[i, state]):

@@ -1,7 +1,7 @@
-"""The compiled learning and evaluation loops; they fill blocks of step records and know nothing else.
+"""The compiled learning and evaluation loops, which fill blocks of step records.
 
-What is special to an algorithm, acting and learning, is in `algorithms`; both loops that learn, `train` and
-`replay`, learn by the same function.
+The formulas of algorithms are in `algorithms`; both loops that learn, `train` and `replay`, call the same
+function.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from runner.learning.schedules import schedule_value
 
 
 class Tally(NamedTuple):
-    """What is counted while an episode runs, and over the last steps and episodes."""
+    """Counts within an episode, and over the last steps and episodes."""
 
     returns: NDArray[np.float64]
     """[L]: rewards of the current episode so far."""
@@ -43,8 +43,8 @@ class Tally(NamedTuple):
 
 
 _loop = numba.njit(cache=True, nogil=True, _nrt=False)
-"""Compiles a loop. It allocates nothing, so it need not count references to its arrays (`_nrt`): what is
-inlined into a loop would count them at every step, atomically, and take four times as long."""
+"""Compiles a loop. It allocates nothing, so it need not count references to its arrays (`_nrt`): inlined
+functions would count them at every step, atomically, and take four times as long."""
 
 START_RANDOM, START_EACH = -1, -2
 
@@ -54,13 +54,13 @@ DRAWN = -2
 CURSOR = np.dtype(
     [(name, "<i8") for name in ("step", "episode", "t", "state", "next_action", "next_explored")]
 )
-"""Where a phase stands: steps taken, current episode, steps in it; if t > 0 the current state, and of SARSA
-the joint action that is to be taken there, and who explores by it."""
+"""The position in a phase: steps taken, current episode, steps in it; if t > 0 the current state, and of
+SARSA the joint action to take there, and which learners explore by it."""
 
 
 @numba.njit(inline="always")
 def _start_state(model: Model, bits: np.uint64) -> int:
-    """Return the start state that falls to these bits."""
+    """Return the start state that these bits select."""
     return Index(
         model.start_states[np.searchsorted(model.start_cumulative, draws.uniform(bits), side="right")]
     )
@@ -130,8 +130,8 @@ def train(
 ) -> tuple[int, int]:
     """Train until a block is full, or an episode or a step is reached; return (steps, episodes) filled.
 
-    `steps` and `episodes` are record arrays with the fields of the recording's messages; whatever else
-    they have is left alone. Everything that a later call needs is in the cursor, tables and tally.
+    `steps` and `episodes` are record arrays with the fields of the recording's messages; other fields are not
+    touched. All that a later call needs is in the cursor, tables and tally.
     """
     at = cursor[0]
     step, episode, t, state = at.step, at.episode, at.t, Index(at.state)
@@ -295,9 +295,9 @@ def replay(
 ) -> None:
     """Apply the updates of recorded training steps, in order, to the tables.
 
-    A recorded step and the run's draws hold all that its update took in, so the replayed update is
-    `train`'s own, to the last bit. Where `rows` ([steps, L, widest], or empty) has room, row k gets each
-    learner's values of the state before step k's update: what it saw when it chose.
+    A recorded step and the run's draws hold all inputs of its update, so the replayed update is equal to
+    `train`'s, to the last bit. As far as `rows` ([steps, L, widest], or empty) goes, row k gets each
+    learner's values of the state before step k's update: those it chose by.
     """
     algorithm = len(rules.algorithm)
     learners = len(model.width)
@@ -330,6 +330,44 @@ def replay(
             next_own = Index(model.own_action[next_action, i])
             reward = record.rewards[i]
             learn(seed, model, tables, rules, now, i, state, own, reward, next_state, next_own, bootstraps)
+
+
+@numba.njit(cache=True, nogil=True)
+def read_states(
+    tables: Tables, states: NDArray[np.int32], value: NDArray[np.float64], greedy: NDArray[np.int32]
+) -> None:
+    """Read the highest value and the greedy action of states, [n], into [L, n]; nan and -1 for state -1."""
+    for i in range(value.shape[0]):
+        for k in range(value.shape[1]):
+            state = states[k]
+            if state < 0:
+                value[i, k] = np.nan
+                greedy[i, k] = -1
+            else:
+                value[i, k] = tables.value[i, state]
+                greedy[i, k] = tables.greedy[i, state]
+
+
+@numba.njit(cache=True, nogil=True)
+def replay_probed(
+    seed: np.uint64,
+    model: Model,
+    tables: Tables,
+    rules: Rules,
+    steps: NDArray[np.void],
+    rows: NDArray[np.float64],
+    before: NDArray[np.int64],
+    states: NDArray[np.int32],
+    value: NDArray[np.float64],
+    greedy: NDArray[np.int32],
+) -> None:
+    """Replay steps, and read the states of row k of `states` before step `before[k]`."""
+    at = 0
+    for k in range(len(before)):
+        replay(seed, model, tables, rules, steps[at : before[k]], rows[at : before[k]])
+        at = before[k]
+        read_states(tables, states[k], value[k], greedy[k])
+    replay(seed, model, tables, rules, steps[at:], rows[at:])
 
 
 @numba.njit(cache=True)

@@ -1,4 +1,4 @@
-"""One run's learner: the kernel with its arrays, and what can be said of them at any moment."""
+"""One run's learner: the kernel with its arrays, and measures of them at any moment."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig
+from runner.config.model import SECTION_OF
 from runner.config.sections import RandomTable
 from runner.environments.mdp import Mdp
 from runner.errors import ConfigError, EnvironmentNotUsable
@@ -19,7 +20,7 @@ from runner.learning.model import Model, build_model
 from runner.learning.schedules import compile_schedule, schedule_value
 
 Held = Mapping[str, NDArray[np.float64]]
-"""What one learner holds: its Q-table as `q` and, by name, whatever else its algorithm keeps (`KEPT`)."""
+"""The tables of one learner: its Q-table as `q`, and its algorithm's `EXTRA_TABLES` by name."""
 
 
 class Learner:
@@ -29,7 +30,7 @@ class Learner:
         config: the experiment.
         mdp: its environment.
         seed: fixes every draw.
-        initial: what to start from instead of `config.initial_q`, as `held` returns it, for each learner.
+        initial: tables to start from instead of `config.initial_q`, as `held` returns them, for each learner.
     """
 
     def __init__(
@@ -72,13 +73,13 @@ class Learner:
         return self._of(i, self.tables.q)
 
     def held(self, i: int) -> Held:
-        """Return all that learner i holds now, [S, width] each and visits [S, 1]: views."""
-        kept: dict[str, NDArray[np.float64]] = {"q": self.table(i)}
-        for name, array in zip(self.kinds[1:], self.tables.kept, strict=False):
-            kept[name] = self._of(i, array)
+        """Return all tables of learner i as they are now, [S, width] each and visits [S, 1]: views."""
+        tables: dict[str, NDArray[np.float64]] = {"q": self.table(i)}
+        for name, array in zip(self.kinds[1:], self.tables.extra, strict=False):
+            tables[name] = self._of(i, array)
         if "visits" in self.kinds:
-            kept["visits"] = self.tables.visits[i][:, np.newaxis]
-        return kept
+            tables["visits"] = self.tables.visits[i][:, np.newaxis]
+        return tables
 
     def snapshot(self) -> list[NDArray[np.float64]]:
         """Return all tables as a snapshot numbers them, those of one kind together: views."""
@@ -108,7 +109,7 @@ class Learner:
         return filled, ended
 
     def begin_evaluation(self) -> None:
-        """Fix the policy to be evaluated: greedy in the tables as they are, or as learned, or random."""
+        """Fix the policy to evaluate: greedy in the present tables, the learned one, or random."""
         if not self.rules.learns or len(self.rules.algorithm) == algorithms.WOLF_PHC:
             self._policy.fill(kernel.DRAWN if self.rules.learns else -1)
             return
@@ -116,7 +117,7 @@ class Learner:
 
     @property
     def policy(self) -> NDArray[np.int32] | list[NDArray[np.float64]]:
-        """The policy of the evaluation that was begun.
+        """The policy of the present evaluation.
 
         The joint action of each state, [S]; of an algorithm that draws its actions one array a learner,
         [S, width]: the probability of each of its own actions.
@@ -190,14 +191,14 @@ class Learner:
             episodes["success"] = episodes["events"][:, self._success].any(axis=1)
 
     def set_held(self, initial: Sequence[Held] | None) -> None:
-        """Set what each learner holds; None for what the configuration begins with.
+        """Set the tables of each learner; None for those that the configuration begins with.
 
-        What `initial` leaves out follows from its `q`: both tables of Double Q-learning are that one, and a
-        policy of WoLF-PHC is uniform.
+        What `initial` leaves out follows from its `q`: both tables of Double Q-learning are equal to it, and
+        a policy of WoLF-PHC is uniform.
         """
         double = len(self.rules.algorithm) == algorithms.DOUBLE_Q_LEARNING
         if initial is None:
-            self._fill(self.tables.kept.reshape(-1) if double else self.tables.q)
+            self._fill(self.tables.extra.reshape(-1) if double else self.tables.q)
         for i in range(len(self.agents)):
             given = {} if initial is None else initial[i]
             for name, array in self.held(i).items():
@@ -210,13 +211,13 @@ class Learner:
                 elif "q" in given:
                     array[:] = given["q"]
         if double:
-            self.tables.q[:] = 0.5 * (self.tables.kept[0] + self.tables.kept[1])
+            self.tables.q[:] = 0.5 * (self.tables.extra[0] + self.tables.extra[1])
         for i in range(len(self.model.width)):
             self.tables.greedy[i] = self.table(i).argmax(axis=1)
             self.tables.value[i] = self.table(i).max(axis=1)
 
     def _fill(self, cells: NDArray[np.float64]) -> None:
-        """Fill cells as the configuration says; 0 where it names another run's tables."""
+        """Fill cells with the configured initial values; 0 where it names another run's tables."""
         start = self.config.initial_q
         if isinstance(start, RandomTable):
             kernel.fill_random(cells, self.seed, start.random.low, start.random.high)
@@ -225,7 +226,7 @@ class Learner:
 
 
 def _trial_start(config: ExperimentConfig, mdp: Mdp) -> int:
-    """Return where trials start, as the kernel wants it."""
+    """Return the kernel's code of where trials start."""
     start = config.evaluation.start if config.evaluation else "random"
     if isinstance(start, str):
         return kernel.START_EACH if start == "each" else kernel.START_RANDOM
@@ -239,15 +240,17 @@ def rules_of(config: ExperimentConfig) -> Rules:
     learns = config.algorithm != "random"
     step_size, discount = compile_schedule(config.step_size), compile_schedule(config.discount)
     epsilon = compile_schedule(config.epsilon if learns else 1.0)
-    hysteretic, wolf = config.hysteretic, config.wolf_phc
+    sections = (
+        getattr(config, key) for key, each in SECTION_OF.items() if each.algorithm == config.algorithm
+    )
+    own = [compile_schedule(value) for section in sections if section for _, value in section]
+    padding = [compile_schedule(0.0)] * (algorithms.MAX_PARAMETERS - len(own))
     return Rules(
         algorithm=(0,) * algorithms.NUMBERS[config.algorithm],
-        decrease=compile_schedule(hysteretic.decrease if hysteretic else 0.0),
-        win=compile_schedule(wolf.win if wolf else 0.0),
-        lose=compile_schedule(wolf.lose if wolf else 0.0),
         step_size=step_size,
         discount=discount,
         epsilon=epsilon,
+        parameters=(*own, *padding),
         by_step=any(bool(schedule[1]) for schedule in (step_size, discount, epsilon)),
         learns=learns,
         independent=config.exploration == "independent",
@@ -258,8 +261,8 @@ def rules_of(config: ExperimentConfig) -> Rules:
 
 
 def kinds_of(config: ExperimentConfig) -> tuple[str, ...]:
-    """Return the names of what each learner of an experiment holds, in the order of a snapshot."""
-    return ("q", *algorithms.KEPT.get(config.algorithm, ()))
+    """Return the names of each learner's tables in an experiment, in the order of a snapshot."""
+    return ("q", *algorithms.EXTRA_TABLES.get(config.algorithm, ()))
 
 
 def held_of(tables: Sequence[NDArray[np.float64]], kinds: tuple[str, ...]) -> list[Held]:
@@ -269,7 +272,7 @@ def held_of(tables: Sequence[NDArray[np.float64]], kinds: tuple[str, ...]) -> li
 
 
 def _check_fit(config: ExperimentConfig, mdp: Mdp, model: Model) -> None:
-    """Refuse an experiment that this environment would make go wrong, or go on for ever."""
+    """Refuse an experiment that would fail, or never end, in this environment."""
     if config.quirks.second_table_uses_first_action and len(set(model.width)) > 1:
         # The kernel would write outside a row.
         raise EnvironmentNotUsable(
@@ -291,7 +294,7 @@ def _tables(model: Model, states: int, kinds: tuple[str, ...]) -> Tables:
         offset=tuple(sum(sizes[:i]) for i in range(learners)),
         greedy=np.zeros((learners, states), np.int32),
         value=np.zeros((learners, states)),
-        kept=np.zeros((2 if len(kinds) > 1 else 0, sum(sizes))),
+        extra=np.zeros((2 if len(kinds) > 1 else 0, sum(sizes))),
         visits=np.zeros((learners if "visits" in kinds else 0, states)),
     )
 

@@ -1,8 +1,8 @@
-"""A tabular environment as the kernel wants it: small arrays that stay in the processor's caches.
+"""A tabular environment for the kernel: small arrays that stay in the processor's caches.
 
 An outcome of a (state, joint action) is two 32-bit integers: the next state and an *outcome class*.
-Outcomes of one class agree in rewards, termination and events, so whatever else a step needs is looked
-up in arrays of a few dozen entries.
+Outcomes of one class agree in rewards, termination and events, so all else that a step needs is looked up
+in arrays of a few dozen entries.
 """
 
 from __future__ import annotations

@@ -1,29 +1,32 @@
-"""Numba's cache of compiled functions, made to notice a change in any file beside the function's own.
+"""Numba's compilation: a notice before it begins, and a cache that notices a change in any file of a package.
 
-Numba looks at the file of a function alone. A function that calls, or compiles in, functions of other
-files would be taken from the cache as it was before those were edited.
+Numba compares only the file of a function. A function that calls, or inlines, functions of other files would
+be taken from the cache as it was before those were edited.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from numba.core import caching
+from numba.core import caching, event
+
+MESSAGE: Final = "Compiling a kernel for this algorithm and number of agents: a few seconds, the first time."
 
 
 def watch(module: str) -> None:
-    """Have functions compiled anew when any Python file of their folder changed.
+    """Recompile the functions of a package when any Python file of its folder has changed.
 
     Args:
-        module: the file of the package whose functions they are; to be called before they are decorated.
+        module: the package's file; call this before its functions are decorated.
     """
     folder = Path(module).resolve().parent
 
     class Locator:
-        """Numba's own choice of a place; what it compares is the whole folder."""
+        """Numba's own choice of a cache folder, with a stamp of the whole package."""
 
         @classmethod
         def from_function(cls, function: Any, file: str) -> Any:
@@ -44,3 +47,24 @@ def stamp(folder: Path) -> str:
     """Return a hash of a folder's Python files, their names and contents."""
     files = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in folder.glob("*.py")}
     return hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()
+
+
+class _FirstStart(event.Listener):  # type: ignore[misc]  # Numba has no types
+    def __init__(self, notify: Callable[[], None]) -> None:
+        self._notify: Callable[[], None] | None = notify
+
+    def on_start(self, _event: Any) -> None:
+        if self._notify is not None:
+            notify, self._notify = self._notify, None
+            notify()
+
+    def on_end(self, _event: Any) -> None:
+        pass
+
+
+def announced(notify: Callable[[], None]) -> Any:
+    """Return a context in which `notify` is called once, just before Numba begins to compile anything.
+
+    Numba sends the event after it has not found the signature in its cache, so a compilation does follow.
+    """
+    return event.install_listener("numba:compile", _FirstStart(notify))

@@ -1,8 +1,8 @@
-"""What is known because the environment is: exact evaluation, the optimum, best responses.
+"""Exact measures from an environment's transition table: policy evaluation, the optimum, best responses.
 
-optimum = optimal_values(mdp, discount)                 the most that all agents together can get
-outcome = evaluate_policy(mdp, policy, learners, 0.9)   what a policy gets, from every start, without sampling
-best_response(mdp, policy, learner, learners, 0.9)      the most that one agent gets while the others stay
+optimum = optimal_values(mdp, discount)                 the highest value of all agents together
+outcome = evaluate_policy(mdp, policy, learners, 0.9)   a policy's results from every start, without sampling
+best_response(mdp, policy, learner, learners, 0.9)      one agent's highest value against the others' policies
 """
 
 from runner.planning.baseline import RandomBaseline, random_baseline
@@ -13,7 +13,7 @@ from runner.planning.evaluation import (
     evaluate_stochastic_policy,
     random_policy,
 )
-from runner.planning.optimality import Yardstick
+from runner.planning.optimality import ExactEvaluator
 from runner.planning.optimum import (
     best_response,
     best_response_to_stochastic,
@@ -23,9 +23,9 @@ from runner.planning.optimum import (
 
 __all__ = [
     "Cycle",
+    "ExactEvaluator",
     "Outcome",
     "RandomBaseline",
-    "Yardstick",
     "best_response",
     "best_response_to_stochastic",
     "evaluate_policy",

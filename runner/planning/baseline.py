@@ -1,4 +1,4 @@
-"""What acting at random achieves: the least that a learned policy is to be compared with."""
+"""The results of acting at random: the baseline of a learned policy."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ MAX_WORK: Final = 1_000_000_000
 _MAX_REMEMBERED: Final = 32
 _MAX_BYTES: Final = 4096
 _VERSION: Final = 2
-"""Of the computation; results of another version are not read from the cache."""
+"""Version of the computation; cached results of another version are not used."""
 _remembered: OrderedDict[bytes, RandomBaseline] = OrderedDict()
 
 
 @dataclass(frozen=True)
 class RandomBaseline:
-    """What the policy gets that takes every joint action with the same probability."""
+    """The results of the policy that takes every joint action with the same probability."""
 
     success_percent: float
     """Episodes with a success; nan if the environment does not define success."""
@@ -53,9 +53,9 @@ class RandomBaseline:
 
 
 def random_baseline(mdp: Mdp) -> RandomBaseline | None:
-    """Return what a random policy gets, exactly; None where that is unknown or takes too long to compute.
+    """Return the exact results of a random policy; None if they take too long to compute.
 
-    It is unknown without a step limit: some episodes might never end.
+    They are None too without a step limit: some episodes might never end.
     """
     if not mdp.step_limit or mdp.next_state.size * mdp.step_limit > MAX_WORK:
         return None
@@ -71,7 +71,7 @@ def random_baseline(mdp: Mdp) -> RandomBaseline | None:
 
 
 def _cached(path: Path, mdp: Mdp) -> RandomBaseline:
-    """Return the baseline from a file of the user's cache; computed, and written there, if it is missing."""
+    """Return the baseline from a file of the user's cache, which is written if it is missing."""
     with contextlib.suppress(OSError, ValueError):
         stored = read_object(path, _MAX_BYTES)
         length, returned, finish = (

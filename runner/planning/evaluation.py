@@ -1,4 +1,4 @@
-"""What a policy gets, from every state that an episode can start in, without playing one."""
+"""The exact return, length and success of a policy from every start state, without playing episodes."""
 
 from __future__ import annotations
 
@@ -20,45 +20,45 @@ from runner.planning.optimum import sweep_tolerance
 
 @dataclass(frozen=True)
 class Cycle:
-    """States that a policy goes round for ever, so that its episodes time out."""
+    """States that a policy repeats for ever, so that its episodes time out."""
 
     states: tuple[int, ...]
-    """In the order they are passed, from the lowest on."""
+    """In the order they are visited, from the lowest on."""
     percent: float
-    """How many episodes end up here."""
+    """Percentage of episodes that end up here."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a policy gets on average over the start states, weighted by how often an episode starts there."""
+    """Means of a policy's episodes over the start states, weighted by their probability."""
 
     starts: int
     """Number of start states."""
     success_percent: float
-    """Episodes with a success; nan if the environment does not know any."""
+    """Percentage of episodes with a success; nan if the environment does not define success."""
     timeout_percent: float
-    """Episodes that the step limit cuts off."""
+    """Percentage of episodes that the step limit truncates."""
     mean_length: float
     mean_penalties: float
     mean_returns: tuple[float, ...]
-    """Undiscounted, until the step limit; one a learner."""
+    """Undiscounted, up to the step limit, for each learner."""
     values: tuple[float, ...]
-    """Discounted, without a step limit; one a learner; nan where nothing is discounted."""
+    """Discounted, without a step limit, for each learner; nan for a discount of 1."""
     cycles: tuple[Cycle, ...]
-    """Where time-outs are stuck, the most frequent first; empty if the environment is not deterministic."""
+    """The cycles of time-outs, the most frequent first; empty if the environment is not deterministic."""
 
 
 def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount: float) -> Outcome:
-    """Return what a deterministic policy gets, exactly.
+    """Return the exact outcome of a deterministic policy.
 
     In a deterministic environment every state has one successor, and each path ends, or closes a cycle;
-    else the chances are followed step by step up to the limit.
+    otherwise the probabilities are propagated step by step up to the limit.
 
     Args:
         mdp: the environment.
         policy: [S]: the joint action of each state.
         learners: 1, or the number of agents; each has its own return.
-        discount: of the values; 1 for none.
+        discount: of the values; 1 if undiscounted.
 
     Raises:
         EnvironmentNotUsable: it has no step limit.
@@ -79,14 +79,14 @@ def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount
 def evaluate_stochastic_policy(
     mdp: Mdp, policies: Sequence[NDArray[np.float64]], learners: int, discount: float
 ) -> Outcome:
-    """Return what learners that draw their actions get, exactly: in expectation over all draws.
+    """Return the exact outcome of learners that draw their actions, in expectation over all draws.
 
     Args:
         mdp: the environment.
-        policies: one a learner, [S, n]: the probability of each of its own n actions. Learners draw
+        policies: for each learner [S, n]: the probability of each of its own n actions. Learners draw
             independently of each other.
         learners: 1, whose actions are the joint ones, or the number of agents.
-        discount: of the values; 1 for none.
+        discount: of the values; 1 if undiscounted.
 
     Raises:
         EnvironmentNotUsable: it has no step limit.
@@ -119,7 +119,7 @@ def _require_step_limit(mdp: Mdp) -> None:
 
 
 def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
-    """Return what the outcomes of chosen actions come to."""
+    """Return the outcome of the chosen actions."""
     starts = np.flatnonzero(mdp.start > 0)
     weights = mdp.start[starts]
     certain = ((chosen.probability > 0).sum(axis=1) == 1).all()
@@ -139,14 +139,14 @@ class _Chosen:
     terminated: NDArray[np.bool_]
     success: NDArray[np.bool_]
     penalty: NDArray[np.bool_] | NDArray[np.float64]
-    """Whether a step is a penalty; of merged outcomes the probability of it."""
+    """Whether a step is a penalty; of merged outcomes its probability."""
 
 
 def _merged(mdp: Mdp, probability: NDArray[np.float64], learners: int) -> _Chosen:
     """Return the outcomes of each state under a policy that draws, [S, J, K] as [S, K'].
 
-    Outcomes that go on alike are one, with the mean of their rewards: of 36 joint actions of two taxis many
-    lead to the same state, and the chances are followed outcome by outcome for every step of an episode.
+    Outcomes that lead to the same state are merged, with the mean of their rewards: of 36 joint actions of
+    two taxis many do, and every outcome takes time at every step of an episode.
     """
     state, action, outcome = np.nonzero(probability)
     at = state, action, outcome
@@ -218,7 +218,7 @@ def _nearest_first(paths: Paths) -> NDArray[np.int64]:
 
 
 def _cycles(paths: Paths, starts: NDArray[np.int64], weights: NDArray[np.float64]) -> tuple[Cycle, ...]:
-    """Return the cycles that some start leads into."""
+    """Return the cycles that start states lead into."""
     stuck = paths.cycle[starts]
     shares = np.bincount(stuck[stuck >= 0], weights[stuck >= 0], minlength=len(paths.offsets) - 1)
     percents = (100 * shares / math.fsum(weights)).tolist()

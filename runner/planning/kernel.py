@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 class Chain(NamedTuple):
-    """What a deterministic policy does in a deterministic environment: one step a state, [S] each."""
+    """The steps of a deterministic policy in a deterministic environment, one for each state, [S] each."""
 
     next_state: NDArray[np.int64]
     rewards: NDArray[np.float64]
@@ -22,20 +22,20 @@ class Chain(NamedTuple):
 
 
 class Paths(NamedTuple):
-    """Where every state of a chain leads."""
+    """The path from every state of a chain."""
 
     length: NDArray[np.int64]
     """[S]: steps to the end of the episode; 0 where there is none."""
     cycle: NDArray[np.int64]
-    """[S]: number of the cycle it ends up in; -1 where the episode ends."""
+    """[S]: number of the cycle that the path enters; -1 where the episode ends."""
     away: NDArray[np.int64]
-    """[S]: steps until it is in the cycle; 0 for its members."""
+    """[S]: steps until the cycle; 0 for its members."""
     entry: NDArray[np.int64]
-    """[S]: where in `members` it comes in."""
+    """[S]: index in `members` of the state by which the path enters its cycle."""
     members: NDArray[np.int64]
-    """States of all cycles, cycle by cycle, in the order they are passed."""
+    """States of all cycles, cycle by cycle, in the order they are visited."""
     offsets: NDArray[np.int64]
-    """[cycles + 1]: where each cycle begins in `members`."""
+    """[cycles + 1]: index in `members` at which each cycle begins."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -50,10 +50,10 @@ def iterate_values(
 
     Args:
         next_state: [S, A, K].
-        weight: [S, A, K]: discounted probability that the outcome comes and the episode goes on.
+        weight: [S, A, K]: discounted probability that the outcome occurs and the episode continues.
         reward: [S, A]: expected.
         values: [S].
-        tolerance: of a sweep.
+        tolerance: largest change of the last sweep.
 
     Returns:
         The number of sweeps.
@@ -79,7 +79,7 @@ def iterate_values(
 
 @numba.njit(cache=True, nogil=True)
 def find_paths(chain: Chain) -> Paths:
-    """Follow every state to the end of its episode, or into a cycle; each state is looked at once."""
+    """Follow every state to the end of its episode, or into a cycle; each state is visited once."""
     states = len(chain.next_state)
     length = np.zeros(states, np.int64)
     cycle = np.full(states, -1, np.int64)
@@ -87,7 +87,7 @@ def find_paths(chain: Chain) -> Paths:
     entry = np.zeros(states, np.int64)
     members = np.empty(states, np.int64)
     offsets = np.zeros(states + 1, np.int64)
-    place = np.full(states, -1, np.int64)  # on the way that is followed now
+    place = np.full(states, -1, np.int64)  # on the present path
     seen = np.zeros(states, np.bool_)
     way = np.empty(states, np.int64)
     cycles = 0
@@ -133,15 +133,15 @@ def find_paths(chain: Chain) -> Paths:
 def walk(
     chain: Chain, state: int, steps: int, returns: NDArray[np.float64], counts: NDArray[np.int64], times: int
 ) -> int:
-    """Add what so many steps from a state give, `times` over; return the state after them.
+    """Add up rewards and counts of some steps from a state, `times` over; return the state after them.
 
     Args:
-        chain: what is walked.
-        state: where from.
-        steps: how many.
-        returns: [L], to be added to.
-        counts: [2]: successes and penalties, to be added to.
-        times: how often the same way is walked.
+        chain: the steps.
+        state: the first state.
+        steps: number of steps.
+        returns: [L]: the sums to add to.
+        counts: [2]: successes and penalties, to add to.
+        times: number of times that the path is repeated.
     """
     for _ in range(steps):
         for i in range(len(returns)):
@@ -158,7 +158,7 @@ def play_all(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
     """Return length [N], returns [N, L] and counts [N, (successes, penalties)] of an episode from each start.
 
-    An episode is truncated after `limit` steps. Once round a cycle counts for every further round.
+    An episode is truncated after `limit` steps. One round of a cycle counts for every further round.
     """
     learners = chain.rewards.shape[1]
     lengths = np.empty(len(starts), np.int64)
@@ -190,14 +190,14 @@ def expect(
     gains: NDArray[np.float64],
     limit: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the chances of success and termination [S, 2], and expected sums [S, G], of an episode.
+    """Return the probabilities of success and termination [S, 2], and expected sums [S, G], of an episode.
 
     Args:
         next_state: [S, K].
         probability: [S, K].
         terminated: [S, K].
         success: [S, K].
-        gains: [S, G]: what a step from each state is expected to add.
+        gains: [S, G]: the expected addition of a step from each state.
         limit: steps of an episode.
     """
     states, outcomes = next_state.shape
@@ -231,10 +231,10 @@ def discounted(
 
     Args:
         next_state: [S, K].
-        weight: [S, K]: discounted probability that the outcome comes and the episode goes on.
+        weight: [S, K]: discounted probability that the outcome occurs and the episode continues.
         rewards: [S, L]: expected.
         values: [S, L].
-        tolerance: of a sweep.
+        tolerance: largest change of the last sweep.
     """
     states, outcomes = next_state.shape
     change = np.inf
@@ -259,11 +259,11 @@ def discounted_paths(
     """Fill the discounted values [S, L] of a chain: cycles in closed form, the rest backwards.
 
     Args:
-        chain: with its paths.
-        paths: where its states lead.
+        chain: the steps.
+        paths: of the chain.
         order: states outside cycles, those nearer to the end or the cycle first.
         discount: below 1.
-        values: [S, L], to be filled.
+        values: [S, L], filled.
     """
     for number in range(len(paths.offsets) - 1):
         begin, end = paths.offsets[number], paths.offsets[number + 1]

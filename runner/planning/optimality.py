@@ -1,4 +1,4 @@
-"""A policy held against what is possible, as the recording keeps it."""
+"""The exact measures of a policy next to those of the optimum, named as in the recording."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from runner.planning.optimum import (
 )
 
 Policy = NDArray[np.int32] | Sequence[NDArray[np.float64]]
-"""The joint action of each state, or for each learner the probabilities of its own actions."""
+"""The joint action of each state; or for each learner the probabilities of its own actions."""
 
 
-class Yardstick:
-    """Measures policies in one environment; what does not depend on the policy is computed once.
+class ExactEvaluator:
+    """Evaluates policies exactly in one environment; the optimum is computed once for each discount.
 
     Args:
         mdp: the environment; it must have a step limit.
@@ -42,12 +42,12 @@ class Yardstick:
     def measure(self, policy: Policy, discount: float) -> dict[str, Any]:
         """Return the exact measures of a policy, named as in the recording.
 
-        Where nothing is discounted there are no values of a process without end: they are nan.
+        With a discount of 1 the values are nan: those of a process without end are not defined.
 
         Args:
-            policy: [S]: the joint action of each state; or, for learners that draw, one array a learner,
+            policy: [S]: the joint action of each state; or, for learners that draw, an array for each,
                 [S, n]: the probability of each of its own actions.
-            discount: of values; 1 for none.
+            discount: of values; 1 if undiscounted.
         """
         if isinstance(policy, np.ndarray):
             outcome = evaluate_policy(self._mdp, policy, self._learners, discount)
@@ -83,7 +83,7 @@ class Yardstick:
         return start_mean(self._mdp, values)
 
     def _optimum(self, discount: float) -> tuple[float, Outcome]:
-        """Return the value of the best that all agents together can do, and how it goes."""
+        """Return the value of the optimal joint policy, and its outcome."""
         if discount not in self._best:
             values = optimal_values(self._mdp, discount)
             policy = greedy_policy(self._mdp, discount, values)

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -136,7 +135,7 @@ class StepReplay:
             kernel.replay(*self._state, records, rows)
         else:
             _check_probe(probe, self._mdp)
-            _replay_probed(*self._state, records, rows, *probe)
+            kernel.replay_probed(*self._state, records, rows, *probe)
         self.step = last + 1
 
     def values_in(self, states: NDArray[Any]) -> NDArray[np.float64]:
@@ -150,7 +149,7 @@ class StepReplay:
         """Fill a probe with the values and greedy actions as they are now, for all of its rows."""
         _check_probe(probe, self._mdp)
         for k in range(len(probe.states)):
-            _read_states(self._learner.tables, probe.states[k], probe.value[k], probe.greedy[k])
+            kernel.read_states(self._learner.tables, probe.states[k], probe.value[k], probe.greedy[k])
 
     @property
     def _state(self) -> tuple[Any, ...]:
@@ -275,42 +274,6 @@ class TableReplay(StepReplay):
             f"{stop:,}; `dualtaxi rerecord` records them. The nearest Q-tables are those after {self.step:,}"
             + (f" and {later:,} steps." if later is not None else " steps.")
         )
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
-def _read_states(tables: Any, states: Any, value: Any, greedy: Any) -> None:
-    """Read the highest value and the greedy action of states, [n], into [learners, n]."""
-    for i in range(value.shape[0]):
-        for k in range(value.shape[1]):
-            state = states[k]
-            if state < 0:
-                value[i, k] = np.nan
-                greedy[i, k] = -1
-            else:
-                value[i, k] = tables.value[i, state]
-                greedy[i, k] = tables.greedy[i, state]
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
-def _replay_probed(
-    seed: Any,
-    model: Any,
-    tables: Any,
-    rules: Any,
-    steps: Any,
-    rows: Any,
-    before: Any,
-    states: Any,
-    value: Any,
-    greedy: Any,
-) -> None:
-    """Replay steps, and read the probed states before each of those in `before`."""
-    at = 0
-    for k in range(len(before)):
-        kernel.replay(seed, model, tables, rules, steps[at : before[k]], rows[at : before[k]])
-        at = before[k]
-        _read_states(tables, states[k], value[k], greedy[k])
-    kernel.replay(seed, model, tables, rules, steps[at:], rows[at:])
 
 
 def _check_probe(probe: StateProbe, mdp: Mdp) -> None:

@@ -15,7 +15,7 @@ from runner.config.job import Job
 from runner.errors import RunnerError
 from runner.execution.resume import resume
 from runner.execution.session import Progress, evaluation_brief, run_job
-from runner.learning.compilation import MESSAGE, announced
+from runner.learning.numba_cache import MESSAGE, announced
 from runner.runs.run import Run, create_run, run_at
 from runner.service.jobs.channel import (
     REPORT_SECONDS,

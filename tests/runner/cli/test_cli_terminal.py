@@ -9,8 +9,8 @@ import numba
 import pytest
 
 from runner.environments.loading import load_mdp
-from runner.learning.compilation import announced
 from runner.learning.model import build_model
+from runner.learning.numba_cache import announced
 from runner.recording.reader import open_recording
 
 pty = pytest.importorskip("pty", reason="a POSIX terminal", exc_type=ImportError)

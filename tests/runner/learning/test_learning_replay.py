@@ -19,8 +19,8 @@ def replayed(config, mdp, seed, steps, tables=None):
 
 def same(left, right):
     """Compare all that two learners' tables hold, bit for bit."""
-    for kept in ("q", "greedy", "value", "kept", "visits"):
-        assert getattr(left, kept).tobytes() == getattr(right, kept).tobytes(), kept
+    for name in ("q", "greedy", "value", "extra", "visits"):
+        assert getattr(left, name).tobytes() == getattr(right, name).tobytes(), name
 
 
 @pytest.mark.parametrize("rules", RULES | ALGORITHMS)
