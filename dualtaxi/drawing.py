@@ -101,11 +101,11 @@ class Canvas:
         x, y = self._window(*(corners.min(axis=0) - reach), *(corners.max(axis=0) + reach))
         self._blend(x, y, _edge(_distance(x, y, corners) - reach), colour)
 
-    def text(self, place: Point, words: str, height: float, colour: str) -> None:
-        """Write `words` (A to Z, 1, 2, - and space) with the upper left corner at `place`."""
+    def text(self, place: Point, letters: str, height: float, colour: str) -> None:
+        """Write `letters` (A to Z, 1, 2, - and space) with the upper left corner at `place`."""
         unit = height / GLYPH_HEIGHT
         left, top = place
-        for letter in words:
+        for letter in letters:
             for stroke in _STROKES.get(letter, "").split():
                 digits = [int(digit) for digit in stroke]
                 points = [

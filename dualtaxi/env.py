@@ -118,14 +118,14 @@ class DualTaxiEnv(gymnasium.Env[Any, Any]):
     - `transitions`: arrays of all outcomes; see `dualtaxi.Transitions`. R = 1 (the sum) in the cooperative
       game, 2 in the competitive one.
     - `P[state][action] = [(probability, next_state, reward, terminated), ...]`; the reward is a pair in the
-      competitive game. Built when first asked for.
+      competitive game. Built at its first use.
     - `initial_state_distrib`: float64 [S].
     - `agents`, `agent_action_counts`: names of the agents, and how many actions each has; the first agent
       is the most significant in a joint action.
     - `event_names`: names of the bits in `transitions.events`, `<agent>.<event>` or `collision`: `pickup`;
       `drop_off` (delivered); `wrong_stop` (put out at another landmark); `illegal_pickup`;
-      `illegal_drop_off`. Events tell what the step was paid for: a collision undoes everything else, so
-      its bit stands alone, and no attempt, legal or not, is told beside it.
+      `illegal_drop_off`. Events are what the step was rewarded for: a collision undoes everything else, so
+      its bit is the only one, and no attempt, legal or not, is among the events.
     - `success_events`: the events that mean success.
     - `penalty_below`: the published statistics call a step whose summed reward is below it a penalty.
     - `scene`, `scene_cells` (int16 [S, things]), `scene_carriers` (int8 [S, things]): how to draw a state;

@@ -29,15 +29,15 @@ def draw_text(grid: Grid, state: State, actions: tuple[int, int] | None) -> str:
 
     `NO_COLOR` follows https://no-color.org: it counts when it is not empty.
     """
-    said = ""
+    taken = ""
     if actions is not None:
-        said = f"taxi 1: {_ACTION_WORDS[actions[0]]}, taxi 2: {_ACTION_WORDS[actions[1]]}"
+        taken = f"taxi 1: {_ACTION_WORDS[actions[0]]}, taxi 2: {_ACTION_WORDS[actions[1]]}"
     if os.environ.get("NO_COLOR"):
         goal = grid.landmarks[state.destination].name
-        told = f"passenger: {_passenger_words(grid, state)}, destination: {goal}"
-        lines = [*_lettered_map(grid, state), told, said, LEGEND]
+        passenger = f"passenger: {_passenger_words(grid, state)}, destination: {goal}"
+        lines = [*_lettered_map(grid, state), passenger, taken, LEGEND]
     else:
-        lines = [*_coloured_map(grid, state), said]
+        lines = [*_coloured_map(grid, state), taken]
     return "\n".join(lines) + "\n"
 
 
@@ -109,7 +109,7 @@ def _passenger_words(grid: Grid, state: State) -> str:
 class Picture:
     """Draws states of one map; the map itself is drawn once.
 
-    Colours are from the palette of Okabe and Ito, and nothing is told by colour alone: landmarks have
+    Colours are from the palette of Okabe and Ito, and no information is in colour alone: landmarks have
     letters, taxis numbers, the destination a flag.
     """
 
@@ -180,7 +180,7 @@ class Picture:
 
 
 def _write(canvas: Canvas, x: float, y: float, words: str) -> None:
-    """Write the words of the panel, beside the sign that stands at x."""
+    """Write the text of the panel, next to the sign at x."""
     canvas.text((x + 40, y), words.upper(), _LETTER, _INK)
 
 

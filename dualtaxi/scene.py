@@ -14,7 +14,7 @@ from dualtaxi.grid import ACTIONS, MOVES, Grid
 THINGS = (*AGENTS, "passenger", "destination")
 """What has a place in every state, in the order of `scene_cells` and `scene_carriers`."""
 
-# Okabe and Ito (2008), "Color Universal Design": told apart with any common colour blindness.
+# Okabe and Ito (2008), "Color Universal Design": distinguishable with any common colour blindness.
 BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 

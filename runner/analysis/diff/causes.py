@@ -44,7 +44,7 @@ class Update:
     rewards_a: list[float]
     rewards_b: list[float]
     reasons: list[str] = field(default_factory=list)
-    """The inputs of the update that differ, in words."""
+    """Descriptions of the inputs of the update that differ."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Row:
 
     agent: str
     actions: list[str]
-    """The action of each value, in words."""
+    """The name of each value's action."""
     a: list[float]
     b: list[float]
 
@@ -154,8 +154,8 @@ def _exploration_text(left: np.void, right: np.void, a: Recording, b: Recording)
         explorer, other = ("A", "B") if words[0] else ("B", "A")
         acted = "an action of its learned policy" if _draws_actions(a, b) else "its greedy action"
         return f"{explorer} explored there, {other} took {acted}"
-    words = ["all learners explored" if word == "explored" else word or "none explored" for word in words]
-    return f"other learners explored: {words[0]} in A, {words[1]} in B"
+    shown = ["all learners explored" if text == "explored" else text or "none explored" for text in words]
+    return f"other learners explored: {shown[0]} in A, {shown[1]} in B"
 
 
 def _draws_actions(a: Recording, b: Recording) -> bool:
@@ -173,7 +173,7 @@ def _differ_by_exploration(left: np.void, right: np.void, a: Recording, b: Recor
 
 
 def _outcome_text(divergence: Divergence, *recordings: Recording) -> str:
-    """Return what differs in words: `reward -10 in A, -7 in B`."""
+    """Return a text of what differs: `reward -10 in A, -7 in B`."""
     values, name = [divergence.a, divergence.b], divergence.field.replace("_", " ")
     if divergence.field in ("state", "next_state") and recordings:
         values = [states_in_words(r.mdp)[v] for r, v in zip(recordings, values, strict=True)]
@@ -302,7 +302,7 @@ def _describe_update(a: Recording, b: Recording, step: int, replays: Sequence[Ta
 
 
 def _reasons(a: Recording, b: Recording, records: Sequence[np.void]) -> list[str]:
-    """Return the inputs of an update that differ, in words."""
+    """Return descriptions of the inputs of an update that differ."""
     from runner.config import from_mapping
     from runner.learning.schedules import compile_schedule, schedule_value
 

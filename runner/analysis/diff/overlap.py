@@ -46,7 +46,7 @@ class Overlap:
 
 @dataclass(frozen=True)
 class StateVisits:
-    """How often two runs acted in a state, which is described in words."""
+    """How often two runs acted in a state, given by its name."""
 
     state: str
     a: int

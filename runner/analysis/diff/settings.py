@@ -29,7 +29,7 @@ class Change:
 
 @dataclass(frozen=True)
 class TransitionChange:
-    """A (state, joint action) whose outcomes differ, in words."""
+    """The names of a state and a joint action whose outcomes differ, and descriptions of the outcomes."""
 
     state: str
     action: str

@@ -1,9 +1,10 @@
-"""How far apart two runs' Q-tables are, at the moments of which both have a snapshot."""
+"""Differences of two runs' Q-tables at the steps of which both have a snapshot."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +15,13 @@ from runner.errors import RecordingError
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
 
-LARGEST = 5
-"""How many cells with the largest differences are named."""
+_MAX_CELLS: Final = 5
+"""Cells with the largest differences that are listed."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell of a table, in words, and its value in both runs."""
+    """One cell of a table, by the names of state and action, and its value in both runs."""
 
     state: str
     action: str
@@ -104,9 +105,9 @@ def _table_diff(mdp: Mdp, a: QTable, b: QTable, visits: NDArray[np.int64] | None
 
 def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: NDArray[np.float64]) -> list[Cell]:
     flat = apart.reshape(-1)
-    least = np.partition(flat, -LARGEST)[-LARGEST] if flat.size > LARGEST else 0.0
+    least = np.partition(flat, -_MAX_CELLS)[-_MAX_CELLS] if flat.size > _MAX_CELLS else 0.0
     candidates = np.flatnonzero(flat >= least)
-    order = candidates[np.argsort(-flat[candidates], kind="stable")][:LARGEST]
+    order = candidates[np.argsort(-flat[candidates], kind="stable")][:_MAX_CELLS]
     states, actions = states_in_words(mdp), own_actions_in_words(mdp, a.table, apart.shape[1])
     cells = []
     for cell in order.tolist():

@@ -305,10 +305,10 @@ def command(folder):
 
 
 def test_the_command_prints_text_json_and_markdown(command):
-    told = command("near", "far")
-    assert told.exit_code == 0, told.output
-    assert "near - far" in told.stdout
-    assert "fewer than 10 seeds" in told.stdout
+    result = command("near", "far")
+    assert result.exit_code == 0, result.output
+    assert "near - far" in result.stdout
+    assert "fewer than 10 seeds" in result.stdout
     as_json = json.loads(command("near", "far", "--json", "--metric", "mean_return").stdout)
     assert [metric["line"] for metric in as_json["metrics"]] == ["taxi_1", "taxi_2"]
     assert as_json["metrics"][0]["groups"][0]["seeds"] == [0, 1, 2]
@@ -337,7 +337,7 @@ def test_what_cannot_be_compared_is_said_and_ends_with_2(command, words, expecte
 
 
 def loop(seed, curve, *, every=100, name="a", metric="mean_return", training=False, **config):
-    """Return somebody's own loop, whose metric takes the values of a curve, every so many episodes."""
+    """Return a loop whose metric takes the values of a curve, one every `every` episodes."""
     made = run(seed, [], name=name, made_by="runner.record", **config)
     points = [(every * k, {metric: {"": float(value)}}) for k, value in enumerate(curve, 1)]
     return replace(made, **{"training" if training else "evaluation": points})
@@ -348,7 +348,9 @@ def test_a_longer_episode_is_not_worse_in_a_loop_whose_environment_has_no_goal()
     both = [
         replace(
             one,
-            evaluation=[(at, {**told, "mean_length": told["mean_return"]}) for at, told in one.evaluation],
+            evaluation=[
+                (at, {**result, "mean_length": result["mean_return"]}) for at, result in one.evaluation
+            ],
         )
         for one in runs
     ]

@@ -1,4 +1,4 @@
-"""The difference of two runs names its true cause."""
+"""`diff` names the true cause of a difference."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_another_seed_starts_elsewhere(compare):
     assert difference.overlap.equal_episodes == 0
 
 
-def test_another_discount_shows_in_the_first_update_that_used_it(compare, record):
+def test_another_discount_is_found_in_the_first_update_that_used_it(compare, record):
     difference = compare("discount=0.9")
     assert difference.cause.kind == "greedy_action"
     update = difference.cause.update
@@ -106,7 +106,7 @@ def test_another_discount_shows_in_the_first_update_that_used_it(compare, record
     assert update.step < difference.divergence.step
 
 
-def test_the_first_difference_alone_is_what_the_whole_tells_first(compare, record):
+def test_the_first_difference_alone_equals_that_of_the_whole(compare, record):
     whole = compare("discount=0.9")
     with open_recording(record()) as a, open_recording(record("discount=0.9")) as b:
         difference = diff(a, b, first=True)
@@ -124,7 +124,7 @@ def test_the_second_tables_quirk_shows_in_the_second_table(compare):
     assert {table.agent for table in difference.tables if table.largest > 0} == {"taxi_1", "taxi_2"}
 
 
-def test_another_reward_is_an_other_environment(compare):
+def test_another_reward_is_another_environment(compare):
     difference = compare("env.kwargs.rewards.illegal_action=-7")
     assert difference.environment.transitions > 1000
     assert "reward -7" in " ".join(change.b for change in difference.environment.examples)
@@ -141,7 +141,7 @@ def test_other_modes_are_compared_as_far_as_they_can_be(compare):
     assert difference.metrics
 
 
-def test_more_episodes_go_on_from_where_fewer_end(compare):
+def test_a_longer_run_continues_where_the_shorter_ends(compare):
     difference = compare("episodes=150", "snapshots.every=30")
     assert difference.cause.kind == "end"
     assert difference.overlap.equal_episodes == 120
@@ -166,7 +166,7 @@ def test_visits_to_states_are_those_of_the_steps(compare, record):
     assert (most.state, most.a, most.b) == (words[first], counts[0][first], counts[1][first])
 
 
-def test_a_mapping_that_one_leaves_empty_is_told_by_what_is_in_the_other():
+def test_a_mapping_empty_in_one_run_is_listed_by_the_entries_of_the_other():
     a, b = {"kwargs": {}, "epsilon": 0.2}, {"kwargs": {"rewards": {"step": -3}}, "epsilon": {"start": 1.0}}
     assert changes_in(a, b) == [
         Change("epsilon", 0.2, None),
@@ -176,24 +176,24 @@ def test_a_mapping_that_one_leaves_empty_is_told_by_what_is_in_the_other():
     assert changes_in({"a": 1, "kwargs": {}}, {"a": 1}) == [Change("kwargs", {}, None)]
 
 
-def test_what_is_left_out_as_asked_is_named(record, folder):
+def test_ignored_paths_are_listed(record, folder):
     ids = [record(*overrides).parent.name for overrides in ((), ("discount=0.9",))]
-    told = CliRunner().invoke(cli, ["diff", *ids, "--recordings", str(folder), "--ignore", "disc*"])
-    assert "Note: ignored, though it differs: discount." in told.stdout
-    assert "No other setting that determines the content differs." in told.stdout
+    result = CliRunner().invoke(cli, ["diff", *ids, "--recordings", str(folder), "--ignore", "disc*"])
+    assert "Note: ignored, though it differs: discount." in result.stdout
+    assert "No other setting that determines the content differs." in result.stdout
 
 
 def test_a_page_and_markdown_are_given_together(record, folder, tmp_path):
     ids, page = [record(*overrides).parent.name for overrides in ((), ("discount=0.9",))], tmp_path / "d.html"
-    asked = ["diff", *ids, "--recordings", str(folder), "--markdown", "--html", str(page)]
-    told = CliRunner().invoke(cli, asked)
-    assert "## Training" in told.stdout
-    assert str(page) in told.stderr
+    words = ["diff", *ids, "--recordings", str(folder), "--markdown", "--html", str(page)]
+    result = CliRunner().invoke(cli, words)
+    assert "## Training" in result.stdout
+    assert str(page) in result.stderr
     assert "where the shares differ most" in page.read_text("utf-8")
-    assert "| seconds |" in told.stdout
+    assert "| seconds |" in result.stdout
 
 
-def test_what_an_interrupted_run_has_is_compared(record, folder):
+def test_the_steps_of_an_interrupted_run_are_compared(record, folder):
     config = from_mapping(BASE)
     run = runs.create_run(folder, config, 0)
     run = run_job(Job(config, 0), run, stop=stopping_after(21))
@@ -212,7 +212,7 @@ def test_without_steps_only_the_rest_is_compared(compare):
     assert difference.tables
 
 
-def test_what_never_trained_is_not_to_be_recorded_again(compare):
+def test_a_run_without_training_steps_gets_no_hint_to_rerecord_it(compare):
     notes = " ".join(compare("episodes=0").notes)
     assert "B has no training steps" in notes
     assert "rerecord" not in notes
@@ -248,7 +248,7 @@ def small(folder):
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_the_diff_of_an_altered_copy_names_the_step_and_what_was_altered(small, tmp_path, data):
+def test_the_diff_of_an_altered_copy_names_step_and_field(small, tmp_path, data):
     with open_recording(small) as recording:
         at = data.draw(st.integers(0, recording.count(schema.TRAIN_STEP) - 1))
         bounds = {"state": recording.mdp.states, "next_state": recording.mdp.states, "action": 36}
@@ -270,7 +270,7 @@ def test_the_diff_of_an_altered_copy_names_the_step_and_what_was_altered(small, 
 
 
 def without_digest(entries):
-    """Return a result as of a run whose digest nobody knows, or else the two would be equal by it."""
+    """Return a result with another digest; otherwise the two would be equal by it."""
     return {"json": json.dumps(json.loads(entries["json"]) | {"content_digest": "altered"})}
 
 
@@ -290,14 +290,14 @@ def test_markdown_tables_have_as_many_cells_as_headings(compare):
             assert above.count(" | ") == line.count(" | ")
 
 
-def test_the_command_says_what_differs_and_ends_with_1(record, folder):
+def test_the_command_prints_what_differs_and_exits_with_1(record, folder):
     ids = [record(*overrides).parent.name for overrides in ((), ("discount=0.9",), ("name=other",))]
     run = CliRunner().invoke
-    told = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder)])
-    assert told.exit_code == 1
-    assert "They diverge in training episode" in told.stdout
-    assert "discount (0.8 in A, 0.9 in B) differs" in told.stdout
-    assert "Why that update differs: the discount was 0.8 in A, 0.9 in B." in told.stdout
+    result = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder)])
+    assert result.exit_code == 1
+    assert "They diverge in training episode" in result.stdout
+    assert "discount (0.8 in A, 0.9 in B) differs" in result.stdout
+    assert "Why that update differs: the discount was 0.8 in A, 0.9 in B." in result.stdout
     as_json = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--json", "--ignore", "disc*"])
     assert json.loads(as_json.stdout)["config"] == []
     assert json.loads(as_json.stdout)["cause"]["kind"] == "greedy_action"
@@ -308,7 +308,7 @@ def test_the_command_says_what_differs_and_ends_with_1(record, folder):
     assert "env.id" not in alike["config"], "it is to be ignored"
     assert (alike["config"]["step_size"], alike["provenance"]["python"]) == (0.1, platform.python_version())
     assert "step_size" in run(cli, words).stdout
-    assert "step_size" not in told.stdout
+    assert "step_size" not in result.stdout
     same = run(cli, ["diff", ids[0], ids[2], "--recordings", str(folder)])
     assert same.exit_code == 0, same.output
     unknown = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--target", "sucess_percent=80"])
@@ -319,12 +319,12 @@ def test_the_command_says_what_differs_and_ends_with_1(record, folder):
 
 
 class TestIndependentExploration:
-    """Each learner explores by a draw of its own: `explored` says who did."""
+    """Each learner explores by its own draw: `explored` has a bit for each."""
 
     FIRST_OF_TWO = 0b01
 
     @pytest.fixture
-    def told(self, record, tmp_path):
+    def cause_after(self, record, tmp_path):
         """Return the cause of a difference, after a change to a step in which taxi 1 alone explored."""
 
         def cause_of_change(change):
@@ -347,24 +347,24 @@ class TestIndependentExploration:
 
         return cause_of_change
 
-    def test_another_action_of_who_explored_is_random(self, told):
-        cause = told(lambda step: np.copyto(step["action"], (step["action"] + 6) % 36))
+    def test_another_action_of_an_exploring_learner_is_random(self, cause_after):
+        cause = cause_after(lambda step: np.copyto(step["action"], (step["action"] + 6) % 36))
         assert cause.kind == "random_action"
         assert cause.text.startswith("the same learners explored")
 
-    def test_another_action_of_who_did_not_explore_is_greedy(self, told):
-        cause = told(
+    def test_another_action_of_a_learner_that_did_not_explore_is_greedy(self, cause_after):
+        cause = cause_after(
             lambda step: np.copyto(step["action"], step["action"] // 6 * 6 + (step["action"] + 1) % 6)
         )
         assert cause.kind == "greedy_action"
 
-    def test_that_another_learner_explored_is_said(self, told):
-        cause = told(lambda step: step["explored"].fill(0b10))
+    def test_another_exploring_learner_is_reported(self, cause_after):
+        cause = cause_after(lambda step: step["explored"].fill(0b10))
         assert cause.kind == "exploration"
         assert cause.text == "other learners explored: taxi 1 explored in A, taxi 2 explored in B"
 
-    def test_that_both_learners_explored_is_said(self, told):
-        cause = told(lambda step: step["explored"].fill(0b11))
+    def test_exploration_of_both_learners_is_reported(self, cause_after):
+        cause = cause_after(lambda step: step["explored"].fill(0b11))
         assert cause.text == "other learners explored: taxi 1 explored in A, all learners explored in B"
 
     def test_the_cause_of_a_real_difference_is_in_the_tables(self, record):

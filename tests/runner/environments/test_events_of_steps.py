@@ -1,4 +1,4 @@
-"""The events of recorded steps, as the environment's table tells them, against what the kernel counted."""
+"""The events of recorded steps, by the environment's table, against the kernel's counts."""
 
 from __future__ import annotations
 

@@ -162,7 +162,7 @@ RAISING = {
         "import gymnasium\ngymnasium.register('Town-v0', lambda: 1 / 0)",
         r"cannot be made with no arguments: ZeroDivisionError",
     ),
-    "as it is asked": (
+    "as configured": (
         "import gymnasium\nfrom gymnasium.envs.toy_text import FrozenLakeEnv\n"
         "class Town(FrozenLakeEnv):\n    @property\n    def agents(self):\n        raise OSError('shut')\n"
         "gymnasium.register('Town-v0', Town)",

@@ -1,4 +1,4 @@
-"""States and actions in words."""
+"""Names of states and actions for people."""
 
 import dataclasses
 

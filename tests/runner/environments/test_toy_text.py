@@ -40,7 +40,7 @@ def happened(mdp, state, action, successor, reward, over):
 
 
 def walk(world, steps=2000):
-    """Yield what a random walk in the real environment sees, beside the events that the adapter names."""
+    """Yield the steps of a random walk in the real environment with the events that the adapter names."""
     env_id, kwargs = WORLDS[world]
     mdp, env = load_mdp(env_id, kwargs), gymnasium.make(env_id, **kwargs)
     state, _ = env.reset(seed=7)

@@ -1,4 +1,4 @@
-"""Random draws in plain Python: SplitMix64 in integers, and what is made of its bits."""
+"""Random draws in plain Python: SplitMix64 in integers, and the numbers derived from its bits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every algorithm's run can be gone back in, gone on with, verified and played, as Q-learning's can."""
+"""Every algorithm's run can be rewound, resumed, verified and played, as Q-learning's can."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def run(algorithm, tmp_path_factory):
 
 
 def live(run, step):
-    """Return a learner of the run's job that has taken so many steps."""
+    """Return a learner of the run's job after a number of steps."""
     config = experiment(run.facts["config"])
     mdp = load_mdp(config.env.id, config.env.kwargs, config.rewards)
     learner = Learner(config, mdp, 3)

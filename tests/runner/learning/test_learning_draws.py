@@ -26,7 +26,7 @@ STREAMS = range(9)
 
 @numba.njit
 def drawn(seed, stream, episode, n):
-    """Return the first n draws of a stream in an episode: their bits, and what is made of them."""
+    """Return the first n draws of a stream in an episode: their bits, and the numbers derived from them."""
     bits = np.empty(n, np.uint64)
     floats = np.empty((n, 2))
     small = np.empty(n, np.int64)
