@@ -1,0 +1,245 @@
+"""`dualtaxi label`, `du` and `index`: labels, disk usage and the index of runs."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import click
+
+from runner.cli import Command, Group
+from runner.cli.options import (
+    filter_argument,
+    folders_option,
+    json_option,
+    limit_option,
+    recordings_option,
+    run_argument,
+)
+from runner.cli.output import draw, facts, print_json, say, table, title
+from runner.cli.runs import find
+from runner.errors import ExitCode, RunnerError
+from runner.util.humanize import UNKNOWN, duration, size
+
+if TYPE_CHECKING:
+    from runner.runs.catalogue.index import Index
+    from runner.runs.catalogue.usage import Sums, Usage
+
+
+@click.command("label", cls=Command)
+@run_argument
+@click.option("--name", metavar="NAME", help="Rename the run; an empty NAME restores the original name.")
+@click.option(
+    "--note", metavar="TEXT", help="Replace the note; - reads it from stdin, an empty one removes it."
+)
+@click.option("--tag", "tags", multiple=True, metavar="TAG", help="Add a tag; may be repeated.")
+@click.option("--untag", "untags", multiple=True, metavar="TAG", help="Remove a tag; may be repeated.")
+@recordings_option
+@json_option
+def label_command(
+    run_name: str,
+    name: str | None,
+    note: str | None,
+    tags: tuple[str, ...],
+    untags: tuple[str, ...],
+    recordings: Path | None,
+    as_json: bool,
+) -> None:
+    """Change the name, note and tags of RUN, and show them.
+
+    They are stored in labels.json next to the recording, which stays as it is. A run tagged `keep` is never
+    removed by rm or prune. `dualtaxi ls tag:TAG` and `dualtaxi ls note:WORD` find labelled runs.
+
+    Examples:
+      dualtaxi label @latest --name patient --tag keep --tag figure-3
+      dualtaxi label patient --note 'the step size of the paper'
+      dualtaxi label k3v9m2xq --note - < observations.txt
+      dualtaxi ls --quiet name:quick | xargs -I{} dualtaxi label {} --tag first-try
+    """
+    from runner.runs.run import label
+
+    run = find(run_name, recordings)
+    missing = sorted(set(untags) - set(run.tags))
+    labels = run.labels
+    if name is not None or note is not None or tags or untags:
+        labels = label(run, name, _from_stdin() if note == "-" else note, tags, untags)
+    shown_name = labels.name or run.file.name
+    if as_json:
+        print_json({"run_id": run.run_id, "name": shown_name, "tags": list(labels.tags), "note": labels.note})
+    else:
+        tag_list = " ".join(labels.tags) or UNKNOWN
+        draw(facts({"run": run.run_id, "name": shown_name, "tags": tag_list, "note": labels.note or UNKNOWN}))
+    if missing:
+        say(f"Run {run.run_id} had no tag {', '.join(missing)}.")
+
+
+def _from_stdin() -> str:
+    try:
+        return sys.stdin.read()
+    except UnicodeDecodeError as error:
+        raise RunnerError(f"stdin: found bytes that are not UTF-8 ({error}), expected text.") from error
+
+
+_FREED_BY: Final = {
+    "same_content": (
+        "recorded before",
+        "the same content is there already: `dualtaxi rm` those with `same as`",
+    ),
+    "unfinished": (
+        "unfinished",
+        "`dualtaxi prune --status interrupted --status failed`, if they are not to be resumed",
+    ),
+    "left_over": ("left over", "damaged originals kept by repairs, and files of interrupted commands"),
+    "cached": ("cached", "made again when needed; remove the folder dualtaxi in your cache"),
+    "half_removed": ("half removed", "the next `dualtaxi rm` or `prune` removes the rest"),
+}
+"""Reason why bytes can be freed -> its name, and how to free them."""
+
+
+@click.command("du", cls=Command)
+@filter_argument
+@folders_option
+@limit_option(20)
+@json_option
+def du_command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as_json: bool) -> None:
+    """Show the disk usage of the runs that match FILTER (as in `dualtaxi ls`), or of all, largest first.
+
+    It counts recordings; exports made by `view` and recordings restored from archives, both kept in the
+    user's cache and made again when needed; and other files in the folders of runs. The totals and what could
+    be freed come last.
+
+    Examples:
+      dualtaxi du
+      dualtaxi du status:finished age:>30d --limit 5
+    """
+    from runner.runs.catalogue.filters import parse
+    from runner.runs.catalogue.index import look
+    from runner.runs.catalogue.usage import sizes, usage_of
+
+    chosen = parse(" ".join(words))
+    largest, sums = usage_of(
+        lambda work: look(recordings, work, say), chosen, None if as_json or not limit else limit
+    )
+    freeable = sums.freeable(recordings)
+    if as_json:
+        runs = [
+            {
+                "run_id": usage.row["id"],
+                **{key: usage.row[key] for key in ("name", "status", "same_as")},
+                "path": str(Path(usage.row["root"], usage.row["entry"])),
+                **sizes([usage]),
+            }
+            for usage in largest
+        ]
+        print_json({"runs": runs, "total": sums.by_kind(), "freeable": freeable})
+    elif sums.runs:
+        _draw(largest, sums, freeable)
+    else:
+        say(f"No run in {', '.join(map(str, recordings))} matches." if words else "No runs yet.")
+
+
+def _draw(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> None:
+    from runner.runs.catalogue.usage import sizes
+
+    total, shown = sums.by_kind(), sizes(largest)
+    kinds = [kind for kind, count in total.items() if count or kind == "total"]
+
+    def cells(counts: dict[str, int]) -> list[str]:
+        return [size(counts[kind]) if counts[kind] else UNKNOWN for kind in kinds]
+
+    same_as = ["same as"] if any(usage.row["same_as"] for usage in largest) else []
+    left = ("id", "name", "status", "same as")
+    grid = table("id", "name", "status", *kinds, *same_as, left=left, shrinking=("name",))
+    for usage in largest:
+        row = usage.row
+        originals = [row["same_as"] or ""] if same_as else []
+        grid.add_row(row["id"], row["name"], row["status"], *cells(sizes([usage])), *originals)
+    if sums.runs > len(largest):
+        rest = {kind: count - shown[kind] for kind, count in total.items()}
+        grid.add_row(f"{sums.runs - len(largest):,} more", "", "", *cells(rest))
+    grid.add_row("all", "", "", *cells(total), style="bold")
+    draw(grid)
+    reasons = {
+        _FREED_BY[kind][0]: f"{size(count)}  {_FREED_BY[kind][1]}"
+        for kind, count in freeable.items()
+        if count
+    }
+    if reasons:
+        draw(title("Could be freed"), facts(reasons))
+
+
+class _Contents(NamedTuple):
+    """What the index holds."""
+
+    statuses: Counter[str]
+    copies: int
+    problems: list[str]
+
+
+@click.group("index", cls=Group)
+def index_command() -> None:
+    """Manage the index of runs, which makes listing them quick.
+
+    Example:
+      dualtaxi index rebuild
+    """
+
+
+@index_command.command("rebuild")
+@folders_option
+@json_option
+@click.pass_context
+def rebuild(ctx: click.Context, recordings: tuple[Path, ...], as_json: bool) -> None:
+    """Rebuild the index from the runs in the recordings folder.
+
+    This is never required: commands notice changes by themselves, and the index holds nothing of its own.
+    Exit code 1 if there are folders with files of a run that cannot be read.
+
+    Examples:
+      dualtaxi index rebuild
+      dualtaxi index rebuild --recordings /data/runs --recordings recordings
+    """
+    from runner.runs.catalogue.database import index_path
+    from runner.runs.catalogue.index import look
+
+    began = time.monotonic()
+    statuses, copies, problems = look(recordings, _contents, say, rebuild=True)
+    took, runs = time.monotonic() - began, statuses.total()
+    counts = dict(sorted(statuses.items()))
+    if as_json:
+        print_json(
+            {
+                "runs": runs,
+                "same_content": copies,
+                "statuses": counts,
+                "problems": problems,
+                "seconds": round(took, 3),
+                "index": str(index_path()),
+            }
+        )
+    else:
+        listed = ", ".join(f"{count:,} {status}" for status, count in counts.items())
+        rows = {"runs": f"{runs:,}" + (f": {listed}" if listed else "")}
+        if copies:
+            rows["same"] = f"{copies:,} of them recorded the same content as an earlier run"
+        draw(facts(rows | {"took": duration(took), "index": str(index_path())}))
+        for problem in problems:
+            say(problem)
+    ctx.exit(ExitCode.DIFFERENT if problems else ExitCode.OK)
+
+
+def _contents(index: Index) -> _Contents:
+    from runner.runs.catalogue.columns import with_same_as
+    from runner.runs.catalogue.filters import Filter
+
+    rows = index.rows(Filter(None), columns=("root", "entry", "status", "digest"))
+    statuses: Counter[str] = Counter()
+    copies = 0
+    for row in with_same_as(rows, index.originals()):
+        statuses[row["status"]] += 1
+        copies += row["same_as"] is not None
+    return _Contents(statuses, copies, index.problems())
