@@ -1,1 +1,1 @@
-"""Archives: a run as columns of Parquet, which others read, and from which it is restored losslessly."""
+"""Archives: a run as Parquet tables that other tools read, and from which it is restored losslessly."""

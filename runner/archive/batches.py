@@ -1,4 +1,4 @@
-"""A recording's messages as columns, some thousands at a time; what they turn back into is compared."""
+"""A recording's messages as batches of columns, each checked to turn back into the same messages."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _BYTES_AT_ONCE: Final = 4 << 20
 
 
 class Batches:
-    """The messages of a recording as Arrow columns; it counts and hashes what it gave.
+    """The messages of a recording as Arrow columns; counts and hashes the messages that it yielded.
 
     Args:
-        recording: whose.
+        recording: the recording.
 
     Raises:
         RecordingError: its parts contradict each other.
@@ -42,7 +42,7 @@ class Batches:
 
     @property
     def entries(self) -> dict[str, Entry]:
-        """How many messages were given of each topic, and their hash; those that have any."""
+        """Number and hash of the messages that were yielded, by topic."""
         return {
             name: Entry(count, self._hashes[name].hexdigest())
             for name, count in self._counts.items()
@@ -51,14 +51,14 @@ class Batches:
 
     @property
     def steps(self) -> int:
-        """How many steps were given."""
+        """The number of steps that were yielded."""
         return self._counts["/train/step"] + self._counts["/eval/step"]
 
     def of(self, table: Table) -> Iterator[pa.RecordBatch]:
-        """Yield the rows of a table, in the order in which things happened.
+        """Yield the rows of a table in the order in which they were recorded.
 
         Raises:
-            RecordingError: a message is damaged, or holds what no recorder writes.
+            RecordingError: a message is damaged, or has what no recorder writes.
         """
         if table.topics[0] in self.shape.sizes:
             yield from (batch for _, _, batch in self.blocks(table))
@@ -75,7 +75,7 @@ class Batches:
             yield pa.RecordBatch.from_pylist(rows, table.columns)
 
     def blocks(self, table: Table) -> Iterator[tuple[Topic, Records, pa.RecordBatch]]:
-        """Yield the messages of a table of fixed width: whose they are, as records and as columns."""
+        """Yield the messages of a fixed-width table: their topic, as records and as columns."""
         train, evaluation = table.topics
         for topic, records in merged(self._recording, (train, evaluation)):
             batch = checked_batch(topic, records, self.shape, self._where)
@@ -92,7 +92,7 @@ class Batches:
             yield position, payload
 
     def same(self, topic: Topic, position: int, made: bytes, payload: bytes) -> None:
-        """Compare a payload with what was made of its columns.
+        """Compare a payload with the one restored from its columns.
 
         Raises:
             RecordingError: they differ.
@@ -101,10 +101,10 @@ class Batches:
             raise self.foreign(topic, f"after {position} steps")
 
     def foreign(self, topic: Topic, place: str, why: str = "") -> RecordingError:
-        """Return the error that tells of a message that columns cannot hold."""
+        """Return the error for a message that columns cannot represent."""
         return RecordingError(
-            f"{self._where}: {topic.name} {place}: found a message that no recorder writes, so that columns "
-            f"cannot hold it{why}; `dualtaxi verify` tells more."
+            f"{self._where}: {topic.name} {place}: found a message that no recorder writes, so that it "
+            f"cannot be archived{why}; `dualtaxi verify` names the damage."
         )
 
     def _rows(self, topic: Topic) -> Iterator[tuple[dict[str, Any], int]]:

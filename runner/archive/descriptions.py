@@ -1,4 +1,4 @@
-"""The tables that describe: what a run is, and what its environment's numbers mean. For readers alone."""
+"""The descriptive tables: the run, and the meaning of its environment's numbers; for readers only."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from runner.recording.reader import Recording
 
 
 def run_table(recording: Recording) -> pa.Table:
-    """Return the one row that says what a run is."""
+    """Return the table with one row that describes a run."""
     facts, config = recording.run_facts(), recording.config
     summary = facts["summary"]
     try:
         created = datetime.fromisoformat(facts["created"]).astimezone(UTC)
     except (ValueError, OverflowError) as error:
-        raise RecordingError(f"{recording.path}: was created at {facts['created']!r}, no time.") from error
+        raise RecordingError(f"{recording.path}: was created at {facts['created']!r}, not a time.") from error
     columns: dict[str, tuple[pa.DataType, Any]] = {
         "run_id": (pa.string(), facts["run_id"]),
         "name": (pa.string(), recording.name),
@@ -47,7 +47,7 @@ def run_table(recording: Recording) -> pa.Table:
     try:
         return pa.table({name: pa.array([value], kind) for name, (kind, value) in columns.items()})
     except (pa.ArrowException, OverflowError) as error:
-        raise RecordingError(f"{recording.path}: its result makes no sense ({error}).") from error
+        raise RecordingError(f"{recording.path}: its result is invalid ({error}).") from error
 
 
 def description_tables(mdp: Mdp, shape: Shape) -> dict[str, pa.Table]:
@@ -60,7 +60,7 @@ def description_tables(mdp: Mdp, shape: Shape) -> dict[str, pa.Table]:
 
 
 def _transitions(mdp: Mdp, shape: Shape) -> pa.Table:
-    """Return a row an outcome: of which state and action, how likely, and what comes of it."""
+    """Return a row for each possible outcome of a state and an action."""
     possible = mdp.probability > 0
     state, action, _ = np.nonzero(possible)
     columns: dict[str, Any] = {
@@ -78,7 +78,7 @@ def _transitions(mdp: Mdp, shape: Shape) -> pa.Table:
 
 
 def _states(mdp: Mdp, shape: Shape) -> pa.Table:
-    """Return a row a state: in words, how likely an episode starts there, and where each thing is."""
+    """Return a row for each state: description, start probability, and positions of the things."""
     columns: dict[str, Any] = {
         "state": np.arange(mdp.states, dtype=np.int32),
         "words": states_in_words(mdp).tolist(),
@@ -95,7 +95,7 @@ def _states(mdp: Mdp, shape: Shape) -> pa.Table:
 
 
 def _actions(mdp: Mdp, shape: Shape) -> pa.Table:
-    """Return a row a joint action: in words, and each agent's own."""
+    """Return a row for each joint action: description, and each agent's own action."""
     action = np.arange(mdp.joint_actions, dtype=np.int32)
     own = np.unravel_index(action, mdp.action_counts)
     columns: dict[str, Any] = {"action": action, "words": actions_in_words(mdp).tolist()}

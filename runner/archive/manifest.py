@@ -1,4 +1,4 @@
-"""The manifest of an archive, written last: without it there is none, and by it each byte is checked."""
+"""The manifest of an archive: written last, with size and hash of every file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MOST: Final = 2**53
 
 @dataclass(frozen=True)
 class Entry:
-    """A file of an archive, or the messages of a topic: how many, and their BLAKE3."""
+    """A file of an archive, or the messages of a topic: size or number, and BLAKE3."""
 
     size: int
     blake3: str
@@ -31,12 +31,12 @@ class Entry:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What an archive is."""
+    """The description of an archive."""
 
     run: Mapping[str, Any]
     """Id, name, seed, creation and status of the run, and the content digest that its result states."""
     topics: Mapping[str, Entry]
-    """What the archive holds of each topic that has messages."""
+    """The messages in the archive, by topic."""
     files: Mapping[str, Entry] = field(default_factory=dict)
     """Every other file, by its path in the archive's folder."""
     format: str = FORMAT
@@ -49,8 +49,9 @@ class Manifest:
 
     @property
     def digest(self) -> str:
-        """The content digest of what the archive holds; without steps, another than the run's own."""
-        return content_digest({name: entry.blake3 for name, entry in self.topics.items()})
+        """The content digest of the messages in the archive; without steps, it is not that of the run."""
+        digested = self.topics.keys() & schema.DIGESTED
+        return combine({name: self.topics[name].blake3 for name in digested})
 
     @property
     def size(self) -> int:
@@ -58,50 +59,45 @@ class Manifest:
         return sum(entry.size for entry in self.files.values())
 
     def to_json(self) -> bytes:
-        """Return the manifest as it is written: with a seal, the BLAKE3 of the rest."""
-        said = asdict(self)
-        return _json(said | {"seal": blake3(_json(said)).hexdigest()})
+        """Return the manifest as a file: JSON with a seal, the BLAKE3 of the rest."""
+        values = asdict(self)
+        return _json(values | {"seal": blake3(_json(values)).hexdigest()})
 
 
-def _json(said: Mapping[str, Any]) -> bytes:
-    return json.dumps(said, indent=1, sort_keys=True).encode() + b"\n"
-
-
-def content_digest(topics: Mapping[str, str]) -> str:
-    """Return the content digest made of the hashes of topics; those that it does not cover are left out."""
-    return combine({name: topics[name] for name in topics.keys() & schema.DIGESTED})
+def _json(values: Mapping[str, Any]) -> bytes:
+    return json.dumps(values, indent=1, sort_keys=True).encode() + b"\n"
 
 
 def read_manifest(data: bytes, where: str) -> Manifest:
-    """Return the manifest in these bytes.
+    """Return the manifest in a file's bytes.
 
     Raises:
-        RecordingError: they are none of ours.
+        RecordingError: they are not a manifest of a dualtaxi archive.
     """
     try:
-        said = json.loads(data[:MAX_MANIFEST_BYTES])
-        if said["format"] != FORMAT:
-            raise ValueError(f"found format {said['format']!r}")
-        if said["version"] != VERSION:
+        values = json.loads(data[:MAX_MANIFEST_BYTES])
+        if values["format"] != FORMAT:
+            raise ValueError(f"found format {values['format']!r}")
+        if values["version"] != VERSION:
             raise RecordingError(
-                f"{where}: found an archive of version {said['version']!r}, expected {VERSION}: it takes "
+                f"{where}: found an archive of version {values['version']!r}, expected {VERSION}: it takes "
                 "another version of dualtaxi to restore it; its tables can be read all the same."
             )
-        manifest = Manifest(dict(said["run"]), _entries(said["topics"]), _entries(said["files"]))
+        manifest = Manifest(dict(values["run"]), _entries(values["topics"]), _entries(values["files"]))
         _check(manifest)
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        raise RecordingError(f"{where}: is no manifest of an archive ({error}).") from error
+        raise RecordingError(f"{where}: is not the manifest of an archive ({error}).") from error
     if manifest.to_json() != data:
         raise RecordingError(f"{where}: does not match its seal: it was changed, and the archive is damaged.")
     return manifest
 
 
-def _entries(said: Mapping[str, Any]) -> dict[str, Entry]:
-    entries = {name: Entry(entry["size"], entry["blake3"]) for name, entry in said.items()}
+def _entries(values: Mapping[str, Any]) -> dict[str, Entry]:
+    entries = {name: Entry(entry["size"], entry["blake3"]) for name, entry in values.items()}
     for name, entry in entries.items():
         sound = is_whole(entry.size, 0, _MOST) and isinstance(entry.blake3, str) and len(entry.blake3) == 64
         if not sound or int(entry.blake3, 16) < 0:
-            raise ValueError(f"what it says of {name!r} makes no sense")
+            raise ValueError(f"its entry of {name!r} is invalid")
     return entries
 
 
@@ -110,7 +106,7 @@ def _check(manifest: Manifest) -> None:
         raise ValueError(f"the file {strange[0]!r} would leave the archive")
     for name in ("run_id", "name", "created", "status"):
         if not isinstance(manifest.run[name], str):
-            raise ValueError(f"of its run it says that {name} is {manifest.run[name]!r}")
+            raise ValueError(f"the {name} of its run is {manifest.run[name]!r}")
     if unknown := set(manifest.topics) - {topic.name for topic in schema.ALL_TOPICS}:
         raise ValueError(f"it has topics {sorted(unknown)}")
 

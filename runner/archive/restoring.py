@@ -1,4 +1,4 @@
-"""Restores a recording from an archive, written by the recorder's own pipeline and proven by its hashes."""
+"""Restore a recording from an archive, through the recorder's own pipeline, checked by its hashes."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ from runner.util.packing import Packing
 
 _ROWS_AT_ONCE: Final = 1024
 _MOST_STEPS: Final = 2**63 // STEP_NANOSECONDS
-_UNDER_WAY: Final = 8
-"""Blocks on their way to the file: as many as the recorder has of a topic."""
+_MAX_PENDING: Final = 8
+"""Blocks in the pipeline: as many as the recorder has of a topic."""
 
 
 def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: None) -> Manifest:
@@ -48,11 +48,11 @@ def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: 
 
     Args:
         folder: the archive.
-        path: the file; there is none yet. What goes wrong leaves none.
+        path: the file, which does not exist yet; nor does it after an error.
         report: called with the steps restored so far.
 
     Raises:
-        RecordingError: the archive is damaged, or does not give the content it is said to hold.
+        RecordingError: the archive is damaged, or does not have the content in its manifest.
         StorageError: the file cannot be written.
     """
     archive = Archive(folder)
@@ -60,7 +60,7 @@ def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: 
     try:
         with storage_errors(path), RecordingFile(path, archive.topics) as file:
             _Restoring(archive, file, report).restore()
-        with open_recording(path):  # what cannot be read is not restored
+        with open_recording(path):  # raises if it cannot be read
             pass
     except BaseException:
         path.unlink(missing_ok=True)
@@ -69,7 +69,7 @@ def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: 
 
 
 def check(folder: Path, report: Callable[[int], None] = lambda _: None) -> Manifest:
-    """Restore an archive in memory alone, and return its manifest; errors as for `restore`."""
+    """Restore an archive in memory only, and return its manifest; errors as for `restore`."""
     archive = Archive(folder)
     archive.check_files()
     _Restoring(archive, None, report).restore()
@@ -85,7 +85,7 @@ class _Row:
 
 
 class _Restoring:
-    """One archive on its way into a file, or into hashes alone."""
+    """The restoring of one archive into a file, or into hashes only."""
 
     def __init__(self, archive: Archive, file: RecordingFile | None, report: Callable[[int], None]) -> None:
         self._archive = archive
@@ -97,14 +97,14 @@ class _Restoring:
         self._chunk_steps = packing.chunk_steps
         self._pipeline = Pipeline(file, packing, lambda: None)
         self._batches = MessageBatches(self._send)
-        self._room = threading.Semaphore(_UNDER_WAY)
+        self._pending = threading.Semaphore(_MAX_PENDING)
         topics = archive.topics
         self._undigested = {topic: blake3() for topic in topics if not topic.digested}
         self._counts = {topic.name: 0 for topic in topics}
         self._steps_done = 0
 
     def restore(self) -> None:
-        """Restore everything, and compare its hashes with those in the manifest."""
+        """Restore everything, and compare its hashes with those of the manifest."""
         try:
             self._describe()
             for table in self._shape.tables:
@@ -149,7 +149,7 @@ class _Restoring:
         visitor.finish()
 
     def _records(self, table: Table) -> Iterator[tuple[Topic, Records]]:
-        """Yield the rows of a table as records, at most so many as a chunk has."""
+        """Yield the rows of a table as records, at most as many as a chunk has."""
         archive, rows = self._archive, self._most(table.topics[0])
         for batch in archive.batches(table.name, table.columns, archive.count(*table.topics), rows):
             for topic in table.topics:
@@ -197,8 +197,8 @@ class _Restoring:
     def _send(self, topic: Topic, records: memoryview, times: Any, offsets: Any) -> None:
         self._pipeline.raise_failure()
         self._counts[topic.name] += len(times)
-        self._room.acquire()
-        self._pipeline.send(topic, records, times, offsets, done=self._room.release)
+        self._pending.acquire()
+        self._pipeline.send(topic, records, times, offsets, done=self._pending.release)
 
     def _rows(self, table: Table) -> Iterator[dict[str, Any]]:
         """Yield the rows of a table."""
@@ -212,7 +212,7 @@ class _Restoring:
             return message_payload(topic, row["position"], row, self._shape)
         except (TypeError, ValueError, OverflowError) as error:
             raise RecordingError(
-                f"{self._where}: {topic.name} after {row['position']} steps: makes no sense ({error})."
+                f"{self._where}: {topic.name} after {row['position']} steps: is invalid ({error})."
             ) from error
 
     def _snapshots(self) -> Iterator[_Row]:
@@ -220,17 +220,17 @@ class _Restoring:
         return (_Row(row["step"], row) for row in self._rows(table))
 
     def _restore_snapshot(self, tables: DerivedTables, snapshot: _Row) -> None:
-        """Send a snapshot, from its values or as the steps before it make it."""
+        """Send a snapshot: its values, or those that the steps before it give."""
         row = snapshot.row
         where = f"{self._where}: the Q-table of {row['agent']!r} after {row['step']} steps"
         if row["data"] is None:
             values = tables.at(row["step"], row["table"])
             if values is None:
-                raise RecordingError(f"{where}: neither its values are there, nor all steps before it.")
+                raise RecordingError(f"{where}: found neither its values nor all steps before it.")
             if blake3(values.tobytes()).hexdigest() != row["blake3"]:
                 raise RecordingError(
-                    f"{where}: the steps before it make other values here than where it was archived: "
-                    "another processor, or version of this software; `dualtaxi show` tells which made it."
+                    f"{where}: the steps before it give other values here than where it was archived: "
+                    "another processor, or version of this software; `dualtaxi show` names the first."
                 )
         else:
             shape = row["states"], row["actions"]
@@ -247,18 +247,18 @@ class _Restoring:
         hashes |= {topic.name: digest.hexdigest() for topic, digest in self._undigested.items()}
         found = {name: Entry(count, hashes[name]) for name, count in self._counts.items() if count}
         for name in sorted(found.keys() | self._archive.manifest.topics.keys()):
-            told, expected = found.get(name), self._archive.manifest.topics.get(name)
-            if told != expected:
+            restored, expected = found.get(name), self._archive.manifest.topics.get(name)
+            if restored != expected:
                 raise RecordingError(
-                    f"{self._where}: {name}: restored {_in_words(told)}, expected {_in_words(expected)}."
+                    f"{self._where}: {name}: restored {_count(restored)}, expected {_count(expected)}."
                 )
 
 
 def _packing_of(archive: Archive) -> Packing:
-    """Return how the recording was packed.
+    """Return the packing of the recording.
 
     Raises:
-        RunnerError: its configuration makes no sense of it.
+        RunnerError: it is invalid in the configuration.
     """
     config = archive.config
     if archive.is_job:
@@ -269,5 +269,5 @@ def _packing_of(archive: Archive) -> Packing:
     return packing_from(parts).packing
 
 
-def _in_words(entry: Entry | None) -> str:
+def _count(entry: Entry | None) -> str:
     return "nothing" if entry is None else f"{entry.size:,} messages of BLAKE3 {entry.blake3[:16]}…"

@@ -1,4 +1,4 @@
-"""Messages of variable size to rows and back: metrics, log lines, snapshots, what only loops record."""
+"""Messages of variable size as rows: metrics, log lines, snapshots, and what only loops record."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from runner.recording.messages import QTable, decode, encode, encode_image, enco
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 
 _OF_SPACES: Final = (schema.TRANSITION, schema.RESET)
-"""The messages that hold values of spaces, whose columns differ from run to run."""
+"""The messages with values of spaces, whose columns differ between runs."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedTable:
-    """A snapshot and its position: environment steps executed before it."""
+    """A snapshot and its position: the number of environment steps before it."""
 
     position: int
     table: QTable
 
     @property
     def step(self) -> int:
-        """Training steps taken."""
+        """The number of training steps before it."""
         return self.table.step
 
 
@@ -34,8 +34,8 @@ def message_row(topic: Topic, payload: bytes, shape: Shape) -> dict[str, Any]:
     """Return a message as the values of its columns, but run and position.
 
     Raises:
-        RecordingError: the payload is no such message.
-        ValueError: it holds no value of its space.
+        RecordingError: the payload is not such a message.
+        ValueError: it has a value outside its space.
     """
     values = decode(topic.message, payload)
     if topic.message is schema.LOG:
@@ -60,7 +60,7 @@ def message_row(topic: Topic, payload: bytes, shape: Shape) -> dict[str, Any]:
 
 
 def message_payload(topic: Topic, position: int, row: Mapping[str, Any], shape: Shape) -> bytes:
-    """Return the message that a row came from."""
+    """Return the message of a row."""
     if topic.message is schema.LOG:
         return encode_log(row["message"], position * STEP_NANOSECONDS / 1e9, row["level"], row["name"])
     if topic.message is schema.IMAGE:
@@ -80,7 +80,7 @@ def message_payload(topic: Topic, position: int, row: Mapping[str, Any], shape: 
 
 
 def snapshot_row(run_id: str, snapshot: PlacedTable, with_values: bool) -> dict[str, Any]:
-    """Return the row of a snapshot; without its values, their hash says whether they were made again."""
+    """Return the row of a snapshot; without its values, their hash checks the ones a replay gives."""
     table = snapshot.table
     data = table.values.tobytes()
     return {

@@ -21,7 +21,8 @@ from runner.recording.integrity import may_be_cut, survey
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
 from runner.runs.locking import locked
-from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, run_of_id
+from runner.runs.resolve import run_of_id
+from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
-"""Writes a recording as an archive: tables of Parquet, its metadata and attachments, and a manifest.
+"""Write a recording as an archive: tables of Parquet, its metadata and attachments, and a manifest.
 
-Memory does not grow with the run: blocks of records become batches of columns, which are packed and
-written in groups of rows, beside the reading.
+Memory does not grow with the run: blocks of records become batches of columns, which a thread compresses and
+writes in row groups.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ ROWS_A_GROUP: Final = 1 << 18
 BYTES_A_GROUP: Final = 32 << 20
 PAGE_BYTES: Final = 1 << 18
 LEVEL: Final = 9
-"""Of zstd: beyond it a step takes a tenth of a byte less, and packing three times as long."""
+"""The zstd level: a higher one saves a tenth of a byte per step, and takes three times as long."""
 
 
 def write_archive(
@@ -42,12 +42,12 @@ def write_archive(
     """Write a recording into a folder as an archive, the manifest last; return the manifest.
 
     Args:
-        recording: finished or not; what is there is written.
-        folder: an empty one, made for it.
+        recording: the recording, finished or not.
+        folder: an empty folder.
         report: called with the steps written so far.
 
     Raises:
-        RecordingError: the recording is damaged, or holds what no recorder writes.
+        RecordingError: the recording is damaged, or has what no recorder writes.
         OSError: the folder cannot be written.
     """
     manifest = _Writing(recording, folder, report).write()
@@ -56,7 +56,7 @@ def write_archive(
 
 
 class TableWriter:
-    """A Parquet file on its way to disk; batches are packed beside the caller, a group of rows at a time."""
+    """A Parquet file that is being written; a thread compresses batches, a row group at a time."""
 
     def __init__(self, path: Path, columns: pa.Schema, level: int = LEVEL) -> None:
         encodings = layout.encodings_of(columns)
@@ -112,7 +112,7 @@ class TableWriter:
 
 
 class _Writing:
-    """One recording being written as an archive."""
+    """The writing of one recording as an archive."""
 
     def __init__(self, recording: Recording, folder: Path, report: Callable[[int], None]) -> None:
         self._recording = recording
@@ -143,7 +143,7 @@ class _Writing:
         return Manifest(run, topics, entries_of(self._folder))
 
     def _compare(self, topics: dict[str, Entry]) -> None:
-        """Compare what was read with what the recording says it holds."""
+        """Compare the messages with the digests in the recording's result."""
         result = self._recording.result
         stated = result.topic_digests
         left_out = set() if result.steps_recorded else {"/train/step", "/eval/step"}
@@ -161,15 +161,15 @@ class _Writing:
         for name, media_type, data in recording.attachments():
             if not is_inside(name):
                 raise RecordingError(
-                    f"{self._where}: found an attachment {name!r}, whose name is no path within."
+                    f"{self._where}: found an attachment {name!r}, whose name is not a relative path."
                 )
             attachments.append([name, media_type])
             path = self._folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
         metadata = [[name, recording.metadata(name)] for name in recording.metadata_names]
-        said = {"metadata": metadata, "attachments": attachments}
-        (self._folder / layout.METADATA).write_text(json.dumps(said, indent=1), encoding="utf-8")
+        description = {"metadata": metadata, "attachments": attachments}
+        (self._folder / layout.METADATA).write_text(json.dumps(description, indent=1), encoding="utf-8")
         tables = {layout.RUN: run_table(recording)}
         if recording.tabular:
             tables |= description_tables(recording.mdp, self._batches.shape)
@@ -177,7 +177,7 @@ class _Writing:
             pq.write_table(table, self._folder / name, compression="zstd", compression_level=LEVEL)
 
     def _write_learning(self, table: Table, steps: TableWriter) -> None:
-        """Write the steps of a job, and beside them its snapshots, which they make."""
+        """Write the steps of a job, and its snapshots, which follow from them."""
         recording = self._recording
         seed = recording.seed or 0
         tables = DerivedTables(StepReplay(recording.config, recording.mdp, seed, self._where))
@@ -201,11 +201,11 @@ class _Writing:
             yield PlacedTable(position, table)
 
     def _snapshot_row(self, tables: DerivedTables, snapshot: PlacedTable) -> pa.RecordBatch:
-        """Return the row of a snapshot: without its values if the steps before it tell them."""
+        """Return the row of a snapshot: without its values if the steps before it give them."""
         table = snapshot.table
-        made = tables.at(table.step, table.table)
-        told = made is not None and made.tobytes() == table.values.tobytes()
-        if not told:
+        derived = tables.at(table.step, table.table)
+        is_derived = derived is not None and derived.tobytes() == table.values.tobytes()
+        if not is_derived:
             tables.give(table.step, table.table, table.values)
-        row = snapshot_row(self._batches.shape.run_id, snapshot, with_values=not told)
+        row = snapshot_row(self._batches.shape.run_id, snapshot, with_values=not is_derived)
         return pa.RecordBatch.from_pylist([row], layout.SCHEMAS[layout.Q_TABLES])

@@ -8,10 +8,11 @@ installed environment, whether the run can be reproduced here and now.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -45,8 +46,7 @@ LOOP_NOT_COMPARED: Final = (
 )
 NAMES_NOT_COMPARED: Final = f"{LOOP_NOT_COMPARED}; --rerun compares them with the installed environment"
 """What a verification leaves out: the messages do not depend on it."""
-CIRCUMSTANCES: Final = ("command", "directory", "host", "user")
-"""Provenance that cannot explain a difference."""
+CIRCUMSTANCES: Final = ("command", "directory", "host", "user")  # they cannot explain a difference
 _NOT_COMPLETE: Final = "the run did not end; verified as far as it got"
 
 
@@ -56,7 +56,7 @@ class Verification:
 
     path: Path
     finding: str = ""
-    """The first thing that is wrong; empty if nothing is."""
+    """The first thing that is wrong, or empty."""
     difference: Diverged | None = None
     """The finding as an error with attributes, if a message or a value differs."""
     train_steps: int = 0
@@ -122,11 +122,8 @@ def verify(
         if damage and _is_empty(path):
             return Verification(path, nothing_yet=True)
         finding = damage or str(error)
-        try:
-            with open_recording(path) as recording:
-                finding += _first_unreadable(recording)
-        except RecordingError:
-            pass
+        with contextlib.suppress(RecordingError), open_recording(path) as recording:
+            finding += _first_unreadable(recording)
         return Verification(path, finding=finding)
     if not damage:
         return found
@@ -217,9 +214,8 @@ def _with_difference(found: Verification, error: Diverged) -> Verification:
 
 
 def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> Verification:
-    env = job.config.env
+    env, complete = job.config.env, recording.status == "finished"
     mdp = load_mdp(env.id, env.kwargs, job.config.rewards) if rerun else recording.mdp
-    complete = recording.status == "finished"
     reference = Reference(recording, complete, without_steps=job.config.recording.steps == "none")
     learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))
     recorder = recorder_for(job, learner, None, reference)
@@ -230,12 +226,13 @@ def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> 
         return reference.exhausted and all(recorder.counts[name] >= n for name, n in recorded.items())
 
     session = Session(job, learner, recorder, report, stop=lambda: not complete and all_compared())
-    found = Verification(
-        recording.path,
-        not_compared="" if rerun else NAMES_NOT_COMPARED,
-        notes=() if complete else (_NOT_COMPLETE,),
-        provenance=_explanations(recording, mdp) if rerun else {},
-    )
+    found = Verification(recording.path, notes=() if complete else (_NOT_COMPLETE,))
+    if rerun:  # what may explain a difference
+        changes = differing_provenance(recording.provenance) | differing_environment(recording, mdp)
+        changes = {key: values for key, values in changes.items() if key not in CIRCUMSTANCES}
+        found = replace(found, provenance=changes)
+    else:
+        found = replace(found, not_compared=NAMES_NOT_COMPARED)
     try:
         _compare_names(recording, list(session.learners))
         ended = session.run()
@@ -253,9 +250,9 @@ def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> 
     result = recording.result
     # an interrupted run that stated its result is compared with it if all steps of the result are recorded
     whole = complete or bool(result.content_digest and result.steps_recorded)
-    steps = recorder.steps
-    if not whole:  # the job was run a little further than it is recorded
-        steps = {"train": recording.count(schema.TRAIN_STEP), "eval": recording.count(schema.EVAL_STEP)}
+    steps = {"train": recording.count(schema.TRAIN_STEP), "eval": recording.count(schema.EVAL_STEP)}
+    if whole:  # else the job was run a little further than it is recorded
+        steps = recorder.steps
     found = replace(found, train_steps=steps["train"], eval_steps=steps["eval"])
     return _compare_result(found, recording, session.summary(topics)) if whole else found
 
@@ -290,7 +287,7 @@ def _compare_values(path: str, found: Any, expected: Any) -> None:
         raise Diverged("environment.json", path, found, expected)
 
 
-def _compare_result(found: Verification, recording: Recording, expected: Mapping[str, Any]) -> Verification:
+def _compare_result(found: Verification, recording: Recording, expected: dict[str, Any]) -> Verification:
     """Compare the result in a recording with the computed one."""
     for key, value in expected.items():
         if recording.result.get(key) != value:
@@ -306,8 +303,7 @@ def _verify_loop(recording: Recording) -> Verification:
     """
     finished = "content_digest" in recording.result
     notes = ["recorded from a loop, which alone can repeat it: its steps were not recomputed"]
-    if not finished:
-        notes.append(_NOT_COMPLETE)
+    notes += [] if finished else [_NOT_COMPLETE]
     found = Verification(
         recording.path,
         train_steps=recording.count(schema.TRAIN_STEP),
@@ -402,9 +398,3 @@ def differing_environment(recording: Recording, mdp: Mdp) -> Differences:
         for name in sorted({*then, *now})
         if name not in then or name not in now or not np.array_equal(then[name], now[name])
     }
-
-
-def _explanations(recording: Recording, mdp: Mdp) -> Differences:
-    """Return the differences that may explain why a rerun differs."""
-    differing = differing_provenance(recording.provenance) | differing_environment(recording, mdp)
-    return {key: values for key, values in differing.items() if key not in CIRCUMSTANCES}

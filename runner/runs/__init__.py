@@ -1,1 +1,1 @@
-"""The recordings folder: its runs, their labels and locks, and the catalogue over them."""
+"""The recordings folder: runs, their locks and provenance, and the catalogue over them."""

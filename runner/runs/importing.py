@@ -1,6 +1,6 @@
-"""Taking a recording from elsewhere into a folder of runs; it is checked completely before it appears there.
+"""Import a recording from elsewhere into a recordings folder, after checking it completely.
 
-An upload to the service, a pulled run and a file written by `dualtaxi export mcap` all come in this way.
+Uploads to the service, pulled runs and files of `dualtaxi export mcap` are all imported in this way.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def import_recording(
         facts = _checked_facts(opened, exported if details is None else details)
         finished = opened.finished
     if not finished and not is_merely_cut_off(recording):
-        raise RecordingError(f"{recording}: is damaged, not merely cut off; `dualtaxi repair` mends it.")
+        raise RecordingError(f"{recording}: is damaged, not merely cut off; `dualtaxi repair` repairs it.")
     if labels is None:
         found = exported.get("labels")
         labels = labels_from(found) if isinstance(found, dict) else Labels()

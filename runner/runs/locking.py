@@ -1,4 +1,4 @@
-"""One process at a time works in a folder: on a run that is there already, a sweep, a queue."""
+"""Locks on folders, so that one process at a time changes a run, a sweep or a queue."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ RUN_LOCK: Final = "owner.lock"
 
 @contextlib.contextmanager
 def locked(run: Run, archived: bool = False) -> Iterator[Run]:
-    """Give a run as it is now, its folder kept from every other process that would write to it.
+    """Lock the folder of a run, and yield the run as it is now.
 
     Args:
-        run: whose folder.
-        archived: whether it may be one whose recording is in an archive alone.
+        run: the run.
+        archived: whether it may be archived.
 
     Raises:
-        RunnerError: it is running or archived, or another process has it in this way.
+        RunnerError: it is running or archived, or locked by another process.
         StorageError: the folder cannot be written.
     """
-    busy = RunnerError(f"run {run.run_id} is being worked on by another process; let it.")
+    busy = RunnerError(f"run {run.run_id} is locked by another process; try again when it has finished.")
     lock = acquired(run.folder / RUN_LOCK, busy)
     try:
         if not run.stands_alone:
@@ -37,23 +37,22 @@ def locked(run: Run, archived: bool = False) -> Iterator[Run]:
         if run.status == "running":
             owner = run.file.owner
             raise RunnerError(
-                f"run {run.run_id} is running (process {owner.get('pid')} on {owner.get('host')}); let it."
+                f"run {run.run_id} is running (process {owner.get('pid')} on {owner.get('host')}); "
+                "try again when it has finished."
             )
         if run.status == "archived" and not archived:
-            raise RunnerError(
-                f"run {run.run_id} is archived; `dualtaxi restore {run.run_id}` brings it back."
-            )
+            raise RunnerError(f"run {run.run_id} is archived; `dualtaxi restore {run.run_id}` restores it.")
         yield run
     finally:
         lock.release()
 
 
 def acquired(path: Path, busy: RunnerError) -> FileLock:
-    """Return the lock of a file, acquired without waiting; who asked for it releases it.
+    """Acquire the lock of a file without waiting; the caller releases it.
 
     Args:
-        path: the file; its folder is made if it is missing.
-        busy: what is raised if another process has it.
+        path: the lock file; its folder is created if it is missing.
+        busy: raised if another process has the lock.
 
     Raises:
         RunnerError: `busy`.

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from runner.errors import RunNotFound, nearest
-from runner.recording.run_file import run_title
-from runner.runs.run import Run, recordings_folder, run_at, run_of_id, runs_in
+from runner.recording.run_file import RUN_ID, run_title
+from runner.runs.run import Run, recordings_folder, run_at, runs_in
 from runner.util.values import RUN_NAME_PATTERN
 
 if TYPE_CHECKING:
@@ -88,6 +88,13 @@ def find_run(
     if not candidates:
         raise look([folder], lambda index: not_found(name, index, folder), report, cached=True)
     return choose(name, candidates)._replace(root=os.fspath(folder)).run()  # the path as the user gave it
+
+
+def run_of_id(run_id: str, recordings: Path) -> Run | None:
+    """Return the run in the folder with this name and id; None if there is none, or it is not an id."""
+    if not RUN_ID.fullmatch(run_id) or not run_id.strip("."):
+        return None
+    return next((run for run in runs_in(recordings / run_id) if run.run_id == run_id), None)
 
 
 def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> list[Run]:

@@ -1,11 +1,11 @@
-"""The recordings folder: a folder a run, with its recording and a small file that says what it is.
+"""The recordings folder: each run has a folder with its recording and a small file that describes it.
 
     recordings/k3v9m2xq/run.json         id, name, configuration, owner, status, summary
-    recordings/k3v9m2xq/labels.json      what people say of it: another name, tags, a note
-    recordings/k3v9m2xq/recording.mcap   the truth
+    recordings/k3v9m2xq/labels.json      another name, tags, a note
+    recordings/k3v9m2xq/recording.mcap   everything else
 
-`run.json` stands before anything heavy is imported and is only ever replaced whole. Its status is what
-the owner last said; whether a `running` run still has a living owner is looked at when asked.
+`run.json` is written before anything heavy is imported, and only ever replaced as a whole. Its status was
+written by the owner; whether the owner of a `running` run is still alive is checked at each access.
 """
 
 from __future__ import annotations
@@ -29,18 +29,17 @@ from runner.recording.run_file import RUN_ID, ArchiveReference, RunFile, Summary
 from runner.util.files import read_object, storage_errors, write_object
 from runner.util.values import as_utf8, checked_run_name, is_utf8
 
-if TYPE_CHECKING:  # listing runs is to be quick
+if TYPE_CHECKING:  # listing runs must be quick
     from runner.config import ExperimentConfig
 
 RUN_FILE: Final = "run.json"
 RECORDING_FILE: Final = "recording.mcap"
 MAX_RUN_FILE_BYTES: Final = 8 << 20
 MADE_BY: Final = ("host", "git", "dualtaxi")
-"""What `run.json` says of where and by what a run was made; its recording says it all."""
+"""The provenance in `run.json`; the recording has all of it."""
 RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"
 
-_ALPHABET: Final = "abcdefghjkmnpqrstvwxyz23456789"
-_ID_LENGTH: Final = 8
+_ID_ALPHABET: Final = "abcdefghjkmnpqrstvwxyz23456789"
 
 
 @dataclass(frozen=True, repr=False)
@@ -51,13 +50,12 @@ class Run:
     facts: dict[str, Any]
     """The contents of `run.json`."""
     restored: Path | None = None
-    """Where its recording was restored to, if it is in an archive alone."""
+    """The path of its restored recording, if it is archived."""
 
     def __repr__(self) -> str:
         """Return id, first name and folder; `facts` has the rest."""
-        return (
-            f"Run({str(self.facts.get('run_id'))!r}, {str(self.facts.get('name'))!r}, {str(self.folder)!r})"
-        )
+        run_id, name = (str(self.facts.get(key)) for key in ("run_id", "name"))
+        return f"Run({run_id!r}, {name!r}, {str(self.folder)!r})"
 
     @cached_property
     def file(self) -> RunFile:
@@ -66,7 +64,7 @@ class Run:
 
     @property
     def problem(self) -> str:
-        """What of `run.json` does not fit, and what to do; empty if all does."""
+        """What is invalid in `run.json`, and what to do; empty if nothing is."""
         if not self.file.problems:
             return ""
         return (
@@ -77,48 +75,47 @@ class Run:
 
     @property
     def run_id(self) -> str:
-        """Its id, unique."""
+        """The unique id."""
         return self.file.run_id
 
     @property
     def name(self) -> str:
-        """What it is called now, not unique."""
+        """The present name, which is not unique."""
         return self.labels.name or self.file.name
 
     @property
     def file_stem(self) -> str:
-        """What files made from it are called by default: its name and its id."""
-        name = re.sub(r"[^\w.+=@ -]", "_", self.name)
-        return f"{name}-{self.run_id}"
+        """The default stem of files made from the run: its name and its id."""
+        return re.sub(r"[^\w.+=@ -]", "_", self.name) + f"-{self.run_id}"
 
     @property
     def tags(self) -> tuple[str, ...]:
-        """The tags it was given, in alphabetical order."""
+        """The tags, in alphabetical order."""
         return self.labels.tags
 
     @property
     def note(self) -> str:
-        """The note that was written on it, or nothing."""
+        """The note; empty if there is none."""
         return self.labels.note
 
     @cached_property
     def labels(self) -> Labels:
-        """What people say of it, read when first asked."""
+        """Name, tags and note given by users, read at the first access."""
         return Labels() if self.stands_alone else read_labels(self.folder)
 
     @property
     def seed(self) -> int:
-        """Its job's seed; 0 for a loop that was given none."""
+        """The seed; 0 for a loop without one."""
         return self.file.seed or 0
 
     @property
     def has_seed(self) -> bool:
-        """Whether it was given a seed; every job has one."""
+        """Whether it has a seed; every job has one."""
         return self.facts.get("seeded") is not False
 
     @property
     def title(self) -> str:
-        """Its name, and its seed if it has one: `patient, seed 3`."""
+        """The name, and the seed if it has one: `patient, seed 3`."""
         return run_title(self.name, self.seed if self.has_seed else None)
 
     @property
@@ -133,53 +130,58 @@ class Run:
 
     @property
     def created(self) -> datetime:
-        """When it began, in UTC; if its file does not say, when its folder was last changed."""
-        return self.file.created or _folder_time(self.folder)
+        """When it began, in UTC; if unknown, when its folder was last changed."""
+        if self.file.created:
+            return self.file.created
+        try:
+            return datetime.fromtimestamp(self.folder.stat().st_mtime, UTC)
+        except OSError:  # it is gone
+            return datetime.fromtimestamp(0, UTC)
 
     @property
     def created_text(self) -> str:
-        """When it began, in ISO 8601, as recordings have it."""
+        """When it began, in ISO 8601."""
         return self.created.isoformat(timespec="milliseconds")
 
     @property
     def summary(self) -> Summary:
-        """What its owner wrote at the end; empty before."""
+        """The summary written at the end; empty before."""
         return self.file.summary
 
     @property
     def status(self) -> str:
-        """`running`, `finished`, `interrupted` or `failed`; a dead owner's run is interrupted.
+        """`running`, `finished`, `interrupted`, `failed`, `damaged` or `archived`.
 
-        `damaged` if its file holds what cannot be, and `archived` if its recording is in an archive alone,
-        and not at hand.
+        A run whose owner died is interrupted; a run is `damaged` if `run.json` is invalid, and `archived` if
+        its recording is in an archive alone, and not restored.
         """
-        said = self.file.status
-        if said == "running" and lives(self.file.owner, self.folder / RUN_FILE):
-            return said
+        status = self.file.status
+        if status == "running" and lives(self.file.owner, self.folder / RUN_FILE):
+            return status
         if self.file.problems:
             return "damaged"
         if self.archive and not self.recording.exists():
             return "archived"
-        return "interrupted" if said == "running" else said
+        return "interrupted" if status == "running" else status
 
     @property
     def episodes_to_do(self) -> int | None:
-        """The training episodes that its configuration asks for; None if it is not a job's."""
+        """The training episodes in its configuration; None for a loop."""
         episodes = self.file.config.get("episodes")
         return episodes if type(episodes) is int and 0 < episodes < 2**62 else None
 
     @property
     def archive(self) -> ArchiveReference:
-        """Where else its recording is kept; false if nowhere."""
+        """The archive of its recording; false if it has none."""
         return self.file.archive
 
     def beat(self) -> None:
-        """Say that the owner lives."""
+        """Record that the owner is alive."""
         with contextlib.suppress(OSError):
             os.utime(self.folder / RUN_FILE)
 
     def update(self, **facts: Any) -> Run:
-        """Return the run with these facts, written to its file.
+        """Write facts to `run.json`, and return the run with them.
 
         Raises:
             StorageError: the file cannot be written; it is as before.
@@ -193,14 +195,14 @@ class Run:
 def create_run(
     recordings: Path, config: ExperimentConfig, seed: int, name: str | None = None, run_id: str | None = None
 ) -> Run:
-    """Make a folder for a new run and write what it is; an id is never used twice.
+    """Create the folder of a new run with its `run.json`; an id is never used twice.
 
     Args:
-        recordings: the folder to make it in; made if it is missing.
-        config: what is run.
-        seed: the one seed that is run.
-        name: what the run is called; the configuration's name unless given.
-        run_id: its id, from `new_run_id`, if that had to be known before; another if it is taken by now.
+        recordings: the recordings folder, created if it is missing.
+        config: the configuration.
+        seed: the seed.
+        name: the name of the run; the configuration's name by default.
+        run_id: an id from `new_run_id`; replaced if it is taken by now.
 
     Raises:
         StorageError: the recordings folder cannot be written.
@@ -216,13 +218,9 @@ def new_run(
     run_id: str | None = None,
     **more: Any,
 ) -> Run:
-    """Make a folder for a new run of this configuration, as `create_run` does; `more` are further facts.
-
-    Raises:
-        StorageError: the recordings folder cannot be written.
-    """
+    """Create the folder of a new run; `more` are further facts, the rest is as for `create_run`."""
     check_folder_name(recordings)
-    try:
+    with storage_errors(recordings, f"choose another folder by --recordings or {RECORDINGS_VARIABLE}"):
         recordings.mkdir(parents=True, exist_ok=True)
         while True:
             run_id = run_id or new_run_id(recordings)
@@ -232,39 +230,31 @@ def new_run(
                 break
             except FileExistsError:
                 run_id = None
-        run = Run(
-            folder,
-            {
-                "run_id": run_id,
-                "name": name,
-                "seed": seed or 0,
-                **({"seeded": False} if seed is None else {}),
-                "status": "running",
-                "created": datetime.now(UTC).isoformat(timespec="milliseconds"),
-                "owner": owner(),
-                "config": dict(config),
-                **more,
-            },
-        )
-        write_object(folder / RUN_FILE, run.facts)
-    except OSError as error:
-        raise StorageError(
-            f"{recordings}: cannot be written ({error.strerror}); "
-            f"choose another folder by --recordings or {RECORDINGS_VARIABLE}."
-        ) from error
-    return run
+        facts = {
+            "run_id": run_id,
+            "name": name,
+            "seed": seed or 0,
+            **({"seeded": False} if seed is None else {}),
+            "status": "running",
+            "created": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "owner": owner(),
+            "config": dict(config),
+            **more,
+        }
+        write_object(folder / RUN_FILE, facts)
+    return Run(folder, facts)
 
 
 def new_run_id(recordings: Path) -> str:
-    """Return an id that no run in the folder has."""
-    while (recordings / (run_id := "".join(secrets.choice(_ALPHABET) for _ in range(_ID_LENGTH)))).exists():
+    """Return a new id that no run in the folder has."""
+    while (recordings / (run_id := "".join(secrets.choice(_ID_ALPHABET) for _ in range(8)))).exists():
         continue
     return run_id
 
 
 @contextlib.contextmanager
 def unless_empty(run: Run) -> Iterator[None]:
-    """Remove the run's folder if what is done here fails before there is a recording; the error says so."""
+    """Remove the run's folder if the block fails before there is a recording, and add a note to the error."""
     try:
         yield
     except BaseException as error:
@@ -275,15 +265,15 @@ def unless_empty(run: Run) -> Iterator[None]:
 
 
 def recordings_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
-    """Return the recordings folder: the chosen one, else the variable's, else ./recordings."""
+    """Return the recordings folder: the chosen one, else that of the variable, else ./recordings."""
     return Path(chosen or os.environ.get(RECORDINGS_VARIABLE) or "recordings")
 
 
 def check_folder_name(recordings: str | os.PathLike[str]) -> None:
-    """Refuse a recordings folder whose path is not UTF-8: neither the index nor JSON can hold it.
+    """Refuse a recordings folder whose path is not UTF-8, which neither the index nor JSON can store.
 
     Raises:
-        StorageError: it is one.
+        StorageError: it is not UTF-8.
     """
     path = os.path.abspath(recordings)  # noqa: PTH100 - links stay what they are
     if not is_utf8(path):
@@ -294,10 +284,10 @@ def check_folder_name(recordings: str | os.PathLike[str]) -> None:
 
 
 def list_runs(recordings: str | os.PathLike[str] | None = None) -> list[Run]:
-    """Return the runs of a folder, the newest first; what is no run is left alone.
+    """Return the runs of a recordings folder, the newest first.
 
     Args:
-        recordings: the folder: $DUALTAXI_RECORDINGS, or ./recordings, unless given.
+        recordings: the folder: $DUALTAXI_RECORDINGS, or ./recordings, by default.
 
     Raises:
         StorageError: the folder is there and cannot be read.
@@ -308,7 +298,7 @@ def list_runs(recordings: str | os.PathLike[str] | None = None) -> list[Run]:
 
 
 def run_entries(recordings: Path) -> list[str]:
-    """Return the names of the folders in which there may be a run: all but the hidden ones.
+    """Return the names of the folders that may have a run: all but the hidden ones.
 
     Raises:
         StorageError: the recordings folder is there and cannot be read.
@@ -323,11 +313,11 @@ def run_entries(recordings: Path) -> list[str]:
 
 
 def run_at(path: Path) -> Run:
-    """Return the run in a folder, or of a recording that may stand alone.
+    """Return the run in a folder, or of a recording outside a run's folder.
 
     Raises:
         RunNotFound: there is none.
-        RecordingError: it stands alone, and cannot be read.
+        RecordingError: the recording cannot be read.
     """
     if path.is_dir():
         for run in runs_in(path):
@@ -340,22 +330,13 @@ def run_at(path: Path) -> Run:
     return _from_recording(path)
 
 
-def run_of_id(run_id: str, recordings: Path) -> Run | None:
-    """Return the run in the folder called like this id; None if there is none, or the text is no id."""
-    if not RUN_ID.fullmatch(run_id) or not run_id.strip("."):
-        return None
-    return next((run for run in runs_in(recordings / run_id) if run.run_id == run_id), None)
-
-
 def runs_in(folder: Path) -> Iterator[Run]:
     """Yield the run in a folder, if there is one; from its recording when `run.json` is gone."""
-    try:
+    with contextlib.suppress(OSError, ValueError):
         facts = read_object(folder / RUN_FILE, MAX_RUN_FILE_BYTES)
         if _is_run(facts):
             yield Run(folder, facts)
             return
-    except (OSError, ValueError):
-        pass
     if (folder / RECORDING_FILE).is_file():
         with contextlib.suppress(RecordingError):
             yield _from_recording(folder / RECORDING_FILE)
@@ -400,20 +381,13 @@ def label(
 
 
 def _is_run(facts: dict[str, Any]) -> bool:
-    """Return whether these are the facts of a run: with an id, they are, however damaged."""
+    """Return whether facts have the id of a run; the others may be damaged."""
     run_id = facts.get("run_id")
     return isinstance(run_id, str) and RUN_ID.fullmatch(run_id) is not None and run_id.strip(".") != ""
 
 
-def _folder_time(folder: Path) -> datetime:
-    """Return when a folder was last changed; the beginning of 1970 if it is gone."""
-    with contextlib.suppress(OSError):
-        return datetime.fromtimestamp(folder.stat().st_mtime, UTC)
-    return datetime.fromtimestamp(0, UTC)
-
-
 def _from_recording(path: Path) -> Run:
-    """Return the run that a recording says it is."""
+    """Return the run that a recording describes."""
     from runner.recording.reader import open_recording
 
     with open_recording(path) as recording:
@@ -422,5 +396,5 @@ def _from_recording(path: Path) -> Run:
             made_by = recording.provenance
             facts["provenance"] = {key: made_by[key] for key in MADE_BY if key in made_by}
     if not _is_run(facts):
-        raise RecordingError(f"{path}: is damaged: what it says of its run makes no sense.")
+        raise RecordingError(f"{path}: is damaged: its description of the run is invalid.")
     return Run(path.parent, facts)

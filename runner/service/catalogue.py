@@ -14,8 +14,8 @@ from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.database import Version, version
 from runner.runs.catalogue.folders import Depth
 from runner.runs.catalogue.index import look
-from runner.runs.resolve import choose, matching, not_found, of_name
-from runner.runs.run import Run, run_of_id
+from runner.runs.resolve import choose, matching, not_found, of_name, run_of_id
+from runner.runs.run import Run
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import Index

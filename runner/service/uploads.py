@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Final, Self
 
 from runner.errors import RunNotFound, StorageError
-from runner.runs.run import run_of_id
+from runner.runs.resolve import run_of_id
 from runner.service.errors import TooManyUploads, UploadConflict, UploadTooLarge
 from runner.service.jobs.store import lock_folder
 from runner.service.logs import LOG

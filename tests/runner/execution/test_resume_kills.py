@@ -65,7 +65,7 @@ def test_one_of_two_processes_may_resume(tmp_path):
     while find_run(run.run_id, recordings).status != "running":
         assert process.poll() is None, process.communicate()
         time.sleep(0.005)
-    with pytest.raises(RunnerError, match="is being worked on by another process"):
+    with pytest.raises(RunnerError, match="is locked by another process"):
         resume(run)
     second = start("resume", run.run_id, "--recordings", recordings)
     _, told = second.communicate(timeout=60)
