@@ -1,4 +1,4 @@
-"""The last results of a loop, kept while it runs: what `ls` lists without opening the recording."""
+"""The last results of a loop while it runs, which `ls` lists without opening the recording."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_u
 from runner.recording.schema import Topic
 
 MAX_NAMES: Final = 64
-"""Names whose last logged value a summary carries."""
+"""The most names whose last logged value is in a summary."""
 
 
 class Outcomes:
     """Returns and lengths of the last training episodes and of the last evaluation, and logged values.
 
-    `summary` returns the same values as `runner.frames.loop_summary` computes from a whole recording.
+    `summary` returns what `runner.analysis.evaluations.loop_summary` computes from a whole recording.
     """
 
     def __init__(self, mdp: Mdp | None) -> None:
@@ -39,7 +39,7 @@ class Outcomes:
         self._logged: dict[str, float | None] = {}
 
     def take_records(self, topic: Topic, records: NDArray[np.void]) -> None:
-        """Take the episodes among the records that the recorder takes in."""
+        """Add the records of episodes among those that the recorder gets."""
         if topic.name == schema.TRAIN_EPISODE.name:
             self._trained += len(records)
             last = records[-RECENT_EPISODES:]
@@ -57,7 +57,7 @@ class Outcomes:
                 self._sums[metric.name] = total + float(values.sum()), count + len(values)
 
     def take_logged(self, name: str, value: float) -> None:
-        """Take a logged value."""
+        """Add a logged value."""
         if name in self._logged or len(self._logged) < MAX_NAMES:
             self._logged[name] = value if math.isfinite(value) else None
 

@@ -129,12 +129,12 @@ class VectorRows:
 
     @property
     def filled(self) -> int:
-        """Steps, of single environments, that the recorder has not taken yet."""
+        """Steps of single environments that the recorder does not have yet."""
         return self._filled * self._n
 
     @property
     def place(self) -> tuple[int, int]:
-        """The steps of the phase so far, and how many episodes have ended."""
+        """The steps of the phase so far, and the number of episodes that have ended."""
         if self._counted < self._filled:
             new = slice(self._counted, self._filled)
             self._ended_here += int(np.count_nonzero(self._terminated[new] | self._truncated[new]))
@@ -186,20 +186,15 @@ class VectorRows:
         self._rewards[row] = rewards
         self._terminated[row] = terminated
         self._truncated[row] = truncated
-        if final is not None:
-            self._keep_final(row, final)
-        self._filled = row + 1
-        if self._filled == self._room:
-            self.commit()
-
-    def _keep_final(self, row: int, final: Any) -> None:
-        which = np.flatnonzero(self._terminated[row] | self._truncated[row])
-        if len(which):
+        if final is not None and len(which := np.flatnonzero(self._terminated[row] | self._truncated[row])):
             last = np.zeros(self._n, self._observation_dtype)
             put_chosen(self._observation_leaves, final, last, which)
             self._finals.append((row, which, last[which]))
             after = self._observations[row, which]
             self._block_resets.append(_Reset(row + 1, which, after, [None] * len(which)))
+        self._filled = row + 1
+        if self._filled == self._room:
+            self.commit()
 
     def reset(self, observation: Any, seeds: Sequence[int | None], which: Flags) -> None:
         """Record a reset of some environments; it ends episodes in progress in them."""
@@ -321,8 +316,7 @@ class VectorRows:
 
     def _states(self) -> NDArray[np.int64]:
         """Return the states before each row; keep those after the last."""
-        states = np.empty((self._filled + 1, self._n), np.int64)
-        states[0], states[1:] = self._state, self._observations[: self._filled]
+        states = np.vstack([self._state, self._observations[: self._filled].astype(np.int64)])
         states[1:] -= self._state_start
         for reset in self._block_resets:
             states[reset.row, reset.which] = reset.observation.astype(np.int64) - self._state_start
