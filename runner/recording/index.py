@@ -80,13 +80,13 @@ class ChunkTable:
     def __getitem__(self, k: int) -> ChunkEntry:
         return ChunkEntry(*_ENTRY.unpack_from(self._packed, k * _ENTRY.size))
 
-    def append(self, entry: ChunkEntry, path: str) -> None:
+    def append(self, entry: ChunkEntry) -> None:
         """Add a chunk after the last one.
 
         Raises:
             RecordingError: it declares what no chunk of ours does.
         """
-        where = f"{path}: the chunk at {entry.offset}"
+        where = f"the chunk at {entry.offset}"
         if entry.length > MAX_CHUNK_BYTES or entry.uncompressed_size > MAX_CHUNK_BYTES:
             size = max(entry.length, entry.uncompressed_size)
             raise RecordingError(f"{where} declares {size:,} bytes, expected at most {MAX_CHUNK_BYTES:,}.")
@@ -95,10 +95,10 @@ class ChunkTable:
         if len(self) and entry.offset < sum(self[len(self) - 1][:2]):
             raise RecordingError(f"{where} overlaps the one before it in the index.")
         if len(self) == MAX_CHUNKS:
-            raise RecordingError(f"{path}: has more than {MAX_CHUNKS:,} chunks; too many to be ours.")
+            raise RecordingError(f"has more than {MAX_CHUNKS:,} chunks; too many to be ours.")
         self._packed += _ENTRY.pack(*entry)
 
-    def set_channel(self, channel: int, path: str) -> None:
+    def set_channel(self, channel: int) -> None:
         """Set the channel of the last chunk's messages.
 
         Raises:
@@ -107,7 +107,7 @@ class ChunkTable:
         last = self[len(self) - 1]
         if last.channel or channel not in TOPIC_OF:
             raise RecordingError(
-                f"{path}: chunk at {last.offset}: found messages of channel {channel}"
+                f"chunk at {last.offset}: found messages of channel {channel}"
                 f"{f' and {last.channel}' if last.channel else ''}, expected those of one of ours."
             )
         self._packed[-_ENTRY.size :] = _ENTRY.pack(*last._replace(channel=channel))
@@ -142,11 +142,14 @@ def read_index(stream: BinaryIO, path: str) -> Index:
         RecordingError: it is no recording of ours, or is damaged before its first chunk.
     """
     size = stream.seek(0, 2)
-    _check_beginning(stream, path)
-    footer = _footer(stream, size)
-    index = _from_records(stream, path, size) if footer is None else _from_summary(stream, path, footer, size)
-    if not index.channels:
-        raise RecordingError(f"{path}: the recording was cut off before its first message.")
+    try:
+        _check_beginning(stream)
+        footer = _footer(stream, size)
+        index = _from_records(stream, size) if footer is None else _from_summary(stream, footer, size)
+        if not index.channels:
+            raise RecordingError("the recording was cut off before its first message.")
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from error
     unpacked = int(index.chunks.columns["uncompressed_size"].sum(dtype=np.uint64)) if index.chunks else 0
     refuse_exhausting(size, unpacked, path)
     return index
@@ -161,18 +164,18 @@ def checksum(stream: BinaryIO, start: int, end: int) -> int:
     return crc
 
 
-def _check_beginning(stream: BinaryIO, path: str) -> None:
+def _check_beginning(stream: BinaryIO) -> None:
     stream.seek(0)
     beginning = stream.read(len(MCAP0_MAGIC) + 9)
     if not beginning:
-        raise RecordingError(f"{path}: found an empty file, expected a recording.")
+        raise RecordingError("found an empty file, expected a recording.")
     if not beginning.startswith(MCAP0_MAGIC):
-        raise RecordingError(f"{path}: found {beginning[:8]!r} at its start, expected an MCAP file.")
+        raise RecordingError(f"found {beginning[:8]!r} at its start, expected an MCAP file.")
     opcode, length = RECORD_HEAD.unpack(beginning[len(MCAP0_MAGIC) :].ljust(9, b"\0"))
-    header = _parse(Header, stream.read(min(length, 4096)), path, len(MCAP0_MAGIC))
+    header = _parse(Header, stream.read(min(length, 4096)), len(MCAP0_MAGIC))
     if opcode != Opcode.HEADER or header.profile != PROFILE:
         raise RecordingError(
-            f"{path}: found an MCAP file of profile {header.profile!r}, expected {PROFILE!r}: "
+            f"found an MCAP file of profile {header.profile!r}, expected {PROFILE!r}: "
             "not a dualtaxi recording."
         )
 
@@ -188,117 +191,106 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
     return Footer.read(ReadDataStream(BytesIO(tail[9:])))
 
 
-def _from_summary(stream: BinaryIO, path: str, footer: Footer, size: int) -> Index:
+def _from_summary(stream: BinaryIO, footer: Footer, size: int) -> Index:
     """Return the index in the summary section, after comparing its checksum."""
     start, end = footer.summary_start, size - _TAIL_BYTES
     if not len(MCAP0_MAGIC) < start <= footer.summary_offset_start <= end:
-        raise RecordingError(
-            f"{path}: the footer points to a summary at {start}, outside the file; try `repair`."
-        )
+        raise RecordingError(f"the footer points to a summary at {start}, outside the file; try `repair`.")
     fields = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, footer.summary_offset_start)
     if zlib.crc32(fields, checksum(stream, start, end)) != footer.summary_crc:
-        raise RecordingError(f"{path}: the summary at {start} does not match its checksum; try `repair`.")
+        raise RecordingError(f"the summary at {start} does not match its checksum; try `repair`.")
     index = Index(finished=True, end=start)
-    for opcode, offset, body in _records(stream, start, end, path):
-        _note_summary(index, path, opcode, offset, body, start)
+    for opcode, offset, body in _records(stream, start, end):
+        _note_summary(index, opcode, offset, body, start)
     return index
 
 
-def _note_summary(index: Index, path: str, opcode: int, offset: int, body: bytes, data_end: int) -> None:
+def _note_summary(index: Index, opcode: int, offset: int, body: bytes, data_end: int) -> None:
     """Take one record of the summary into the index."""
     if opcode == Opcode.CHUNK_INDEX:
-        chunk = _chunk_entry(body, path, offset)
-        _within(path, "chunk", chunk.offset, chunk.length, data_end)
-        index.chunks.append(chunk._replace(channel=0), path)
+        chunk = _chunk_entry(body, offset)
+        _within("chunk", chunk.offset, chunk.length, data_end)
+        index.chunks.append(chunk._replace(channel=0))
         if chunk.channel:
-            index.chunks.set_channel(chunk.channel, path)
-    elif opcode == Opcode.SCHEMA:
-        _note_schema(index, path, offset, body)
-    elif opcode == Opcode.CHANNEL:
-        _note_channel(index, path, offset, body)
+            index.chunks.set_channel(chunk.channel)
+    elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        _note_topic(index, opcode, offset, body)
     elif opcode == Opcode.STATISTICS:
-        index.message_counts = dict(_parse(Statistics, body, path, offset).channel_message_counts)
-    elif opcode == Opcode.ATTACHMENT_INDEX:
-        attachment = _parse(AttachmentIndex, body, path, offset)
-        _within(path, "attachment", attachment.offset, attachment.length, data_end)
-        place = (attachment.offset, attachment.length)
-        _put(index.attachments, attachment.name, place, path, "attachment")
-    elif opcode == Opcode.METADATA_INDEX:
-        metadata = _parse(MetadataIndex, body, path, offset)
-        _within(path, "metadata", metadata.offset, metadata.length, data_end)
-        _put(index.metadata, metadata.name, (metadata.offset, metadata.length), path, "metadata")
+        index.message_counts = dict(_parse(Statistics, body, offset).channel_message_counts)
+    elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+        is_metadata = opcode == Opcode.METADATA_INDEX
+        entry = _parse(MetadataIndex if is_metadata else AttachmentIndex, body, offset)
+        what = "metadata" if is_metadata else "attachment"
+        _within(what, entry.offset, entry.length, data_end)
+        places = index.metadata if is_metadata else index.attachments
+        _put(places, entry.name, (entry.offset, entry.length), what)
 
 
-def _from_records(stream: BinaryIO, path: str, size: int) -> Index:
+def _from_records(stream: BinaryIO, size: int) -> Index:
     """Return the index of an unfinished file, up to the last whole record."""
     index = Index(end=len(MCAP0_MAGIC))
     for opcode, offset, length in record_heads(stream, size):
         if opcode not in IN_DATA or (opcode == Opcode.MESSAGE_INDEX and not index.chunks):
             break
-        _note(index, stream, path, opcode, offset, length)
+        _note(index, stream, opcode, offset, length)
         index.end = offset + RECORD_HEAD.size + length
     return index
 
 
-def _note(index: Index, stream: BinaryIO, path: str, opcode: int, offset: int, length: int) -> None:
+def _note(index: Index, stream: BinaryIO, opcode: int, offset: int, length: int) -> None:
     """Take one record of the data section into the index; the stream is at its body."""
     if opcode == Opcode.CHUNK:
         head = stream.read(min(length, CHUNK_HEAD.size)).ljust(CHUNK_HEAD.size, b"\0")
         start, end, unpacked, _, _ = CHUNK_HEAD.unpack(head)
-        index.chunks.append(ChunkEntry(offset, 9 + length, unpacked, start, end, 0), path)
+        index.chunks.append(ChunkEntry(offset, 9 + length, unpacked, start, end, 0))
     elif opcode == Opcode.MESSAGE_INDEX:
         (channel,) = struct.unpack("<H", stream.read(min(length, 2)).ljust(2, b"\0"))
-        index.chunks.set_channel(channel, path)
+        index.chunks.set_channel(channel)
     elif opcode == Opcode.METADATA:
-        name = _name(stream.read(min(length, 4 + MAX_NAME_BYTES)), 0, path, offset)
-        _put(index.metadata, name, (offset, 9 + length), path, "metadata")
+        name = _name(stream.read(min(length, 4 + MAX_NAME_BYTES)), 0, offset)
+        _put(index.metadata, name, (offset, 9 + length), "metadata")
     elif opcode == Opcode.ATTACHMENT:
-        name = _name(stream.read(min(length, 20 + MAX_NAME_BYTES)), 16, path, offset)
-        _put(index.attachments, name, (offset, 9 + length), path, "attachment")
+        name = _name(stream.read(min(length, 20 + MAX_NAME_BYTES)), 16, offset)
+        _put(index.attachments, name, (offset, 9 + length), "attachment")
     elif opcode != Opcode.HEADER:
-        _check_length(length, path, offset)
-        note = _note_schema if opcode == Opcode.SCHEMA else _note_channel
-        note(index, path, offset, stream.read(length))
+        _check_length(length, offset)
+        _note_topic(index, opcode, offset, stream.read(length))
     elif offset != len(MCAP0_MAGIC):
-        raise RecordingError(f"{path}: found a second header at {offset}.")
+        raise RecordingError(f"found a second header at {offset}.")
 
 
-def _note_schema(index: Index, path: str, offset: int, body: bytes) -> None:
-    schema = _parse(Schema, body, path, offset)
+def _note_topic(index: Index, opcode: int, offset: int, body: bytes) -> None:
+    """Take a schema or a channel into the index."""
+    if opcode == Opcode.CHANNEL:
+        channel = _parse(Channel, body, offset)
+        _put(index.channels, channel.id, channel, "channel")
+        return
+    schema = _parse(Schema, body, offset)
     if schema.id in index.schemas:
-        raise RecordingError(f"{path}: has schema {schema.id} twice, at {offset} again.")
+        raise RecordingError(f"has schema {schema.id} twice, at {offset} again.")
     index.schemas.add(schema.id)
 
 
-def _note_channel(index: Index, path: str, offset: int, body: bytes) -> None:
-    channel = _parse(Channel, body, path, offset)
-    _put(index.channels, channel.id, channel, path, "channel")
-
-
-def _records(stream: BinaryIO, start: int, end: int, path: str) -> Iterator[tuple[int, int, bytes]]:
+def _records(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
     """Yield (opcode, offset, body) of the records in a part of the file."""
     at = stream.seek(start)
     while at < end:
         if at + 9 > end:
-            raise RecordingError(f"{path}: found {end - at} stray bytes at {at}, expected a record.")
+            raise RecordingError(f"found {end - at} stray bytes at {at}, expected a record.")
         opcode, length = RECORD_HEAD.unpack(stream.read(9))
         if length > end - at - 9:
-            raise RecordingError(
-                f"{path}: the record at {at} declares {length} bytes, {end - at - 9} are there."
-            )
-        _check_length(length, path, at)
+            raise RecordingError(f"the record at {at} declares {length} bytes, {end - at - 9} are there.")
+        _check_length(length, at)
         yield opcode, at, stream.read(length)
         at += 9 + length
 
 
-def _check_length(length: int, path: str, offset: int) -> None:
+def _check_length(length: int, offset: int) -> None:
     if length > MAX_RECORD_BYTES:
-        raise RecordingError(
-            f"{path}: the record at {offset} declares {length:,} bytes; too large to be ours."
-        )
+        raise RecordingError(f"the record at {offset} declares {length:,} bytes; too large to be ours.")
 
 
-def _chunk_entry(body: bytes, path: str, offset: int) -> ChunkEntry:
+def _chunk_entry(body: bytes, offset: int) -> ChunkEntry:
     """Return the entry in a ChunkIndex record: there are thousands, so not by the library's reader."""
     try:
         start, end, chunk_offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(body)
@@ -307,23 +299,23 @@ def _chunk_entry(body: bytes, path: str, offset: int) -> ChunkEntry:
         (name_length,) = struct.unpack_from("<I", body, at)
         (uncompressed,) = struct.unpack_from("<Q", body, at + 4 + name_length + 8)
     except struct.error as error:
-        raise RecordingError(f"{path}: the ChunkIndex record at {offset} cannot be read.") from error
+        raise RecordingError(f"the ChunkIndex record at {offset} cannot be read.") from error
     if len(channels) > 1 or channels == [0]:
         raise RecordingError(
-            f"{path}: the ChunkIndex record at {offset} names {len(channels)} channels, expected one of ours."
+            f"the ChunkIndex record at {offset} names {len(channels)} channels, expected one of ours."
         )
     return ChunkEntry(chunk_offset, length, uncompressed, start, end, channels[0] if channels else 0)
 
 
-def _parse(kind: type[T], body: bytes, path: str, offset: int) -> T:
+def _parse(kind: type[T], body: bytes, offset: int) -> T:
     """Return the record in these bytes."""
     try:
         return kind.read(ReadDataStream(BytesIO(body)))  # type: ignore[attr-defined, no-any-return]
     except (McapError, struct.error, UnicodeDecodeError, ValueError) as error:
-        raise RecordingError(f"{path}: the {kind.__name__} record at {offset} cannot be read.") from error
+        raise RecordingError(f"the {kind.__name__} record at {offset} cannot be read.") from error
 
 
-def _name(body: bytes, at: int, path: str, offset: int) -> str:
+def _name(body: bytes, at: int, offset: int) -> str:
     """Return the text at `at` in a record's body, which its length precedes."""
     try:
         (length,) = struct.unpack_from("<I", body, at)
@@ -331,23 +323,21 @@ def _name(body: bytes, at: int, path: str, offset: int) -> str:
         if len(name) == length:
             return name.decode()
     except (struct.error, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: the record at {offset} has no readable name.") from error
-    raise RecordingError(f"{path}: the record at {offset} declares a name of {length:,} bytes.")
+        raise RecordingError(f"the record at {offset} has no readable name.") from error
+    raise RecordingError(f"the record at {offset} declares a name of {length:,} bytes.")
 
 
-def _put(known: dict[K, T], key: K, value: T, path: str, what: str) -> None:
+def _put(known: dict[K, T], key: K, value: T, what: str) -> None:
     """Add what a file may have once."""
     if key in known:
-        raise RecordingError(f"{path}: has {what} {key!r} twice.")
+        raise RecordingError(f"has {what} {key!r} twice.")
     if len(known) == (len(ALL_TOPICS) if what == "channel" else MAX_NAMED):
-        raise RecordingError(f"{path}: has more than {len(known):,} {what} records; too many to be ours.")
+        raise RecordingError(f"has more than {len(known):,} {what} records; too many to be ours.")
     if isinstance(key, str) and len(key) > MAX_NAME_BYTES:
-        raise RecordingError(f"{path}: has {what} with a name of {len(key):,} letters.")
+        raise RecordingError(f"has {what} with a name of {len(key):,} letters.")
     known[key] = value
 
 
-def _within(path: str, what: str, offset: int, length: int, end: int) -> None:
+def _within(what: str, offset: int, length: int, end: int) -> None:
     if offset < len(MCAP0_MAGIC) or length < 9 or offset + length > end:
-        raise RecordingError(
-            f"{path}: the index points to {what} of {length} bytes at {offset}, outside the data."
-        )
+        raise RecordingError(f"the index points to {what} of {length} bytes at {offset}, outside the data.")
