@@ -161,7 +161,7 @@ class _Builder:
             return self._mapping(node, path)
         if isinstance(node, yaml.SequenceNode) and known == "seq":
             return [self.value(item, (*path, position)) for position, item in enumerate(node.value)]
-        if isinstance(node, yaml.ScalarNode) and known in _CONVERT:
+        if isinstance(node, yaml.ScalarNode) and known in _KINDS:
             return self._scalar(node, known, path)
         tag = _shown("!!" + known if known != node.tag else node.tag)
         self.problems.append(Problem(path, f"found the tag {tag}, expected a plain value without a tag"))
@@ -185,24 +185,23 @@ class _Builder:
         return built
 
     def _key(self, node: yaml.Node, path: Path) -> str | None:
-        place = self._place(node)
         if not isinstance(node, yaml.ScalarNode):
-            self.problems.append(Problem(path, "found a list or mapping for a key, expected text", place))
-            return None
-        if node.value == "<<" and node.style is None:
-            self.problems.append(Problem(path, "found the merge key <<, expected the keys themselves", place))
-            return None
-        if node.tag != _TAG + "str":
+            message = "found a list or mapping for a key, expected text"
+        elif node.value == "<<" and node.style is None:
+            message = "found the merge key <<, expected the keys themselves"
+        elif node.tag != _TAG + "str":
             message = f"found the key {_shown(node.value)}, expected text: quote it"
-            self.problems.append(Problem(path, message, place))
-            return None
-        return str(node.value)
+        else:
+            return str(node.value)
+        self.problems.append(Problem(path, message, self._place(node)))
+        return None
 
-    def _scalar(self, node: yaml.ScalarNode, known: str, path: Path) -> Any:
+    def _scalar(self, node: yaml.ScalarNode, kind: str, path: Path) -> Any:
+        convert, description = _KINDS[kind]
         try:
-            return _CONVERT[known](node.value)
+            return convert(node.value)
         except (ValueError, KeyError):
-            self.problems.append(Problem(path, f"found {_shown(node.value)}, which is no {_KIND[known]}"))
+            self.problems.append(Problem(path, f"found {_shown(node.value)}, which is no {description}"))
             return None
 
     def _place(self, node: yaml.Node) -> Place:
@@ -228,11 +227,11 @@ def _number(text: str) -> float:
 
 _NULL = dict.fromkeys(("", "~", "null"))
 _BOOL = {"true": True, "false": False}
-_CONVERT: dict[str, Callable[[str], Any]] = {
-    "null": lambda text: _NULL[text.lower()],
-    "bool": lambda text: _BOOL[text.lower()],
-    "int": _whole_number,
-    "float": _number,
-    "str": str,
+_KINDS: dict[str, tuple[Callable[[str], Any], str]] = {
+    "null": (lambda text: _NULL[text.lower()], "null"),
+    "bool": (lambda text: _BOOL[text.lower()], "true or false"),
+    "int": (_whole_number, "whole number of a usable size"),
+    "float": (_number, "number"),
+    "str": (str, "text"),
 }
-_KIND = {"null": "null", "bool": "true or false", "int": "whole number of a usable size", "float": "number"}
+"""The scalars by tag: the conversion of their text, and their name in messages."""
