@@ -164,6 +164,10 @@ class Group(click.Group):
         super().__init__(*args, **options)
         self.help = _with_examples(self.help)
 
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Return the names in the order of definition."""
+        return list(self.commands)
+
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:

@@ -21,6 +21,7 @@ from runner.util.humanize import UNKNOWN, duration, size
 if TYPE_CHECKING:
     from runner.api import Interrupt
     from runner.execution.session import Report
+    from runner.recording.reader import Recording
     from runner.runs.run import Run
 
 # --- finding ----------------------------------------------------------------------------------------------
@@ -108,6 +109,23 @@ def command_for(run: Run, verb: str, *options: str) -> str:
     if root.absolute() != recordings_folder().absolute():
         words += ["--recordings", shlex.quote(os.fspath(root))]
     return " ".join(words)
+
+
+@contextlib.contextmanager
+def opened_run(
+    run_name: str, recordings: Path | None, needs_steps: bool = False
+) -> Iterator[tuple[Run, Recording]]:
+    """Open a run to export it, and print what its recording lacks when that is done."""
+    from runner.export.contents import require_steps, shortcomings
+    from runner.recording.reader import open_recording
+
+    run = find_recorded(run_name, recordings)
+    with open_recording(run.recording) as recording:
+        if needs_steps:
+            require_steps(recording, "export")
+        yield run, recording
+        for shortcoming in shortcomings(recording):
+            say(shortcoming)
 
 
 # --- working ----------------------------------------------------------------------------------------------

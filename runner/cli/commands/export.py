@@ -1,60 +1,37 @@
-"""`dualtaxi export`: a run in another form; the command of each form is imported on demand."""
+"""`dualtaxi export`: a run in another form, for other programs."""
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-from collections.abc import Iterator
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.output import say
-from runner.cli.runs import find_recorded
-from runner.errors import nearest
+from runner.cli import Group
+from runner.cli.commands import export_gif, export_tables, export_tools
+from runner.cli.options import (
+    EXPORTS,
+    Ranges,
+    force_option,
+    json_option,
+    output_option,
+    recordings_option,
+    run_argument,
+    selection_options,
+)
+from runner.cli.output import draw, facts, print_json, say
+from runner.cli.progress import stage_line
+from runner.cli.runs import compilation_notice, find_recorded
+from runner.export.places import require_new
+from runner.export.rerun.viewer import require_rerun
+from runner.util.humanize import duration, size
 
 if TYPE_CHECKING:
-    from runner.recording.reader import Recording
-    from runner.runs.run import Run
-
-FORMS: Final[dict[str, tuple[str, str]]] = {
-    "rerun": ("runner.cli.commands.export_rerun", "For the Rerun viewer: every view of selected episodes."),
-    "mcap": ("runner.cli.commands.export_mcap", "One file with everything, for `dualtaxi import`."),
-    "parquet": ("runner.cli.commands.export_tables:parquet", "Steps, episodes and metrics as Parquet."),
-    "csv": ("runner.cli.commands.export_tables:csv", "Steps, episodes and metrics as CSV."),
-    "minari": ("runner.cli.commands.export_minari", "A Minari dataset, for offline learning."),
-    "tensorboard": ("runner.cli.commands.export_tensorboard", "An event file for TensorBoard."),
-    "mlflow": ("runner.cli.commands.export_mlflow", "A run in an MLflow store."),
-    "gif": ("runner.cli.commands.export_gif", "A short film of an episode, for slides and READMEs."),
-}
-"""Form to module, with the name of the command unless it is `command`, and short help."""
+    from runner.export.rerun.selection import Selection
 
 
-class _Forms(click.Group):
-    """The commands of `FORMS`, imported one by one."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
-        """Return the forms."""
-        return list(FORMS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import a form's command."""
-        if cmd_name not in FORMS:
-            if not ctx.resilient_parsing:
-                ctx.fail(f"there is no export {cmd_name!r}.{nearest(cmd_name, FORMS)}")
-            return None
-        module, _, name = FORMS[cmd_name][0].partition(":")
-        command: click.Command = getattr(importlib.import_module(module), name or "command")
-        return command
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
-        """Write the forms with their short help."""
-        with formatter.section("Forms"):
-            formatter.write_dl([(name, text) for name, (_, text) in FORMS.items()])
-
-
-@click.group("export", cls=_Forms)
+@click.group("export", cls=Group)
 def export_command() -> None:
     """Export a run for other programs.
 
@@ -63,18 +40,100 @@ def export_command() -> None:
     """
 
 
-@contextlib.contextmanager
-def opened_run(
-    run_name: str, recordings: Path | None, needs_steps: bool = False
-) -> Iterator[tuple[Run, Recording]]:
-    """Open a run to export it, and print what its recording lacks when that is done."""
-    from runner.export.contents import require_steps, shortcomings
+@export_command.command("rerun", short_help="For the Rerun viewer: every view of selected episodes.")
+@run_argument
+@output_option("exports/NAME-RUN.rrd", "FILE.rrd")
+@selection_options
+@force_option
+@recordings_option
+def rerun(
+    run_name: str,
+    output: Path | None,
+    episodes: Ranges | None,
+    evaluations: tuple[int, ...] | None,
+    every: int | None,
+    everything: bool,
+    force: bool,
+    recordings: Path | None,
+) -> None:
+    """Export RUN for the Rerun viewer, arranged and ready to look at.
+
+    All metrics are exported. By default the steps are those of 20 training episodes spread from the first to
+    the last, and the trials of the last evaluation; what is left out is reported.
+
+    Examples:
+      dualtaxi export rerun @latest
+      dualtaxi export rerun k3v9m2xq -o look.rrd --episodes 0:20,49980: --evaluations 49000
+      dualtaxi export rerun k3v9m2xq --all --force
+    """
     from runner.recording.reader import open_recording
 
+    require_rerun("export rerun")
+    from runner.export.rerun.selection import Request
+    from runner.export.rerun.writing import Source, export
+
+    started = time.monotonic()
     run = find_recorded(run_name, recordings)
-    with open_recording(run.recording) as recording:
-        if needs_steps:
-            require_steps(recording, "export")
-        yield run, recording
-        for shortcoming in shortcomings(recording):
-            say(shortcoming)
+    path = output or EXPORTS / f"{run.file_stem}.rrd"
+    require_new(path, force)
+    request = Request(episodes or (), evaluations or (), every or 0, everything)
+    with open_recording(run.recording) as recording, compilation_notice(), stage_line("exporting"):
+        source = Source(recording, f"{run.title} ({run.run_id})")
+        (selection,) = export([source], request, path)
+    print_selection(selection)
+    took = duration(time.monotonic() - started)
+    click.echo(f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}")
+
+
+def print_selection(selection: Selection) -> None:
+    """Print which steps are exported, and which are not."""
+    for warning in selection.warnings:
+        say(warning)
+    if selection.exported:
+        say("Exported: all metrics; " + "; ".join(selection.exported) + ".")
+    for left_out in selection.left_out:
+        say(f"Left out: {left_out}.")
+
+
+@export_command.command("mcap", short_help="One file with everything, for `dualtaxi import`.")
+@run_argument
+@output_option("NAME-RUN.mcap")
+@click.option("--anonymous", is_flag=True, help="Leave out host, user, command line and folder.")
+@force_option
+@recordings_option
+@json_option
+def mcap(
+    run_name: str, output: Path | None, anonymous: bool, force: bool, recordings: Path | None, as_json: bool
+) -> None:
+    """Write RUN into one MCAP file with its labels, for `dualtaxi import` on another machine.
+
+    Every MCAP reader opens the file. The same run gives the same bytes. An interrupted run can be exported,
+    and stays interrupted.
+
+    Examples:
+      dualtaxi export mcap @latest
+      dualtaxi export mcap k3v9m2xq --anonymous -o for_review.mcap
+    """
+    from runner.export.mcap import export_mcap
+
+    run = find_recorded(run_name, recordings)
+    path = output or Path(f"{run.file_stem}.mcap")
+    with stage_line(f"exporting {run.run_id}"):
+        exported = export_mcap(run, path, anonymous, force)
+    for warning in exported.warnings:
+        say(warning)
+    if as_json:
+        print_json({"path": str(path.absolute()), "bytes": path.stat().st_size, "anonymous": anonymous})
+        return
+    draw(facts({"file": f"{path}  {size(path.stat().st_size)}", "next": f"dualtaxi import {path}"}))
+
+
+for _command in (
+    export_gif.command,
+    export_tables.parquet,
+    export_tables.csv,
+    export_tools.minari,
+    export_tools.tensorboard,
+    export_tools.mlflow,
+):
+    export_command.add_command(_command)

@@ -14,7 +14,7 @@ from runner.cli.runs import find_recorded
 from runner.util.humanize import size
 
 
-@click.command("gif", cls=Command)
+@click.command("gif", cls=Command, short_help="A short film of an episode, for slides and READMEs.")
 @run_argument
 @episode_option
 @trial_option

@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from runner.cli import Command
-from runner.cli.commands.export import opened_run
 from runner.cli.options import (
     EXPORTS,
     Ranges,
@@ -19,6 +18,8 @@ from runner.cli.options import (
 )
 from runner.cli.output import say
 from runner.cli.progress import count_line
+from runner.cli.runs import opened_run
+from runner.export.places import new_folder
 from runner.util.extras import require
 from runner.util.humanize import size
 
@@ -36,7 +37,6 @@ def _command(form: str, text: str) -> click.Command:
         gz: bool = False,
     ) -> None:
         require("pyarrow", extra="archive", purpose=f"export {form}")
-        from runner.export.places import new_folder
         from runner.export.tables import PATTERNS, left_out, write_tables
 
         with opened_run(run_name, recordings, needs_steps=True) as (found, recording):
@@ -66,7 +66,7 @@ def _command(form: str, text: str) -> click.Command:
         run_argument,
     ):
         run = option(run)
-    return click.command(form, cls=Command)(run)
+    return click.command(form, cls=Command, short_help="Steps, episodes and metrics as tables.")(run)
 
 
 csv: click.Command = _command(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import Command
-from runner.cli.commands.export_rerun import print_selection
+from runner.cli.commands.export import print_selection
 from runner.cli.options import PICTURE_SIZE, STEP, RunName, recordings_option, selection_options
 from runner.cli.output import say
 from runner.cli.runs import find_recorded
