@@ -1,6 +1,6 @@
 """The archives of runs: found where they are, and restored into the user's cache to be read.
 
-A restore runs in a child process with a memory limit: whoever made an archive may have made it to exhaust the
+A restore runs in a child process with a memory limit, as an archive may be made to exhaust the
 memory. For a run that is not archived nothing heavy is imported.
 """
 

@@ -81,7 +81,7 @@ def _archive(run: Run, store: Store, remove: bool, report: Report, dry_run: bool
             manifest = existing
         else:
             raise RunnerError(
-                f"{place}: found an archive of another content, made of this run at "
+                f"{place}: found an archive of this run with other content, made at "
                 f"another time ({existing.digest[:16]}…); remove it, or choose another --to."
             )
     if dry_run:

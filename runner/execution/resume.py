@@ -1,7 +1,7 @@
 """Resume an interrupted run, so that it ends as if it had never been interrupted.
 
 The job is run again from its beginning: what the recording has already is compared byte for byte, and
-everything after its end is recorded. Learning is so much faster than recording that this costs a fraction of
+everything after its end is recorded. Learning is much faster than recording: this costs a fraction of
 what it saves, and it proves what it continues.
 
 A recording with a hole, or with damage before undamaged chunks, is left alone: the run is recorded again in

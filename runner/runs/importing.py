@@ -37,7 +37,7 @@ MAX_ERROR: Final = 10_000
 
 
 class Occupied(RunnerError):
-    """Another run of this id is there already: `run`."""
+    """There is another run of this id: `run`."""
 
     def __init__(self, run: Run, recordings: Path) -> None:
         super().__init__(
@@ -54,7 +54,7 @@ class Imported:
     run: Run
     content_digest: str
     already: bool
-    """Whether the folder had the run before, with this content or more; nothing was written then."""
+    """Whether the folder had the run before, with this content or more, so that nothing was written."""
     anonymous: bool = False
     """Whether the file was exported without the names of persons and places."""
 
@@ -72,18 +72,18 @@ def import_recording(
     labels. When this returns the run is on disk, even if the power fails now.
 
     Args:
-        recording: the file, which nobody writes to any more. If it is finished, nothing in it changes and it
-            is on the same disk, it is linked instead of copied.
+        recording: the file, to which nothing is written any more. If it is finished, nothing in it changes and
+            it is on the same disk, it is linked instead of copied.
         recordings: the folder of runs; created if it is missing.
-        details: what `run.json` says where the run comes from; the file's own record of it by default. What
-            the recording contradicts or cannot know is ignored.
+        details: the contents of `run.json` where the run comes from; the file's own record of it by default.
+            Values that the recording contradicts are ignored.
         labels: name, tags and note of the run; the file's own record of them by default.
         as_new: give the run a new id, so that it can stand next to another run of its id.
 
     Raises:
         RecordingError: the recording is damaged or inconsistent; nothing was written.
         Occupied: another run of this id is there.
-        RunnerError: another process is working on the run that is there.
+        RunnerError: the existing run is locked by another process.
         StorageError: the folder cannot be written, or has too little space.
     """
     with open_recording(recording) as opened:
@@ -109,7 +109,7 @@ def import_recording(
     with _staging_folder(recordings, recording) as folder:
         facts["run_id"] = run_id
         _place(recording, folder / RECORDING_FILE, facts, rewritten=as_new or bool(exported))
-        (folder / RUN_FILE).write_bytes(facts_bytes(facts))
+        write_object(folder / RUN_FILE, facts)
         if labels != Labels():
             write_object(folder / LABELS_FILE, as_json(labels))
         for path in (*folder.iterdir(), folder):
@@ -146,13 +146,8 @@ def run_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str, Any
     return facts | {"summary": summary}
 
 
-def facts_bytes(facts: Mapping[str, Any]) -> bytes:
-    """Return the contents of `run.json` as bytes."""
-    return json.dumps(facts, indent=1, ensure_ascii=False).encode() + b"\n"
-
-
 def _export_record(recording: Recording) -> dict[str, Any]:
-    """Return what an exported recording says of its run, empty for any other recording."""
+    """Return the description of the run in an exported recording; empty for any other recording."""
     if EXPORT_RECORD not in recording.metadata_names:
         return {}
     try:
@@ -166,7 +161,7 @@ def _checked_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str
     """Return the contents of `run.json`.
 
     Raises:
-        RecordingError: the recording says something that no run can be.
+        RecordingError: the recording's description of the run is invalid.
     """
     try:
         facts = run_facts(recording, details)
@@ -208,14 +203,14 @@ def _same_run(run_id: str, content_digest: str, recordings: Path) -> Run | None:
 def _continue_or_keep(
     occupied: Occupied, recording: Path, facts: Mapping[str, Any], labels: Labels
 ) -> tuple[Run, bool]:
-    """Return the run that is there, and whether it already holds all of the recording.
+    """Return the existing run, and whether it already has all of the recording.
 
-    If it did not finish and the recording continues it, the recording takes the place of its own. Should this
-    be interrupted, `_finish` completes it when the same recording is imported again.
+    If it did not finish and the recording continues it, the recording replaces its own. If that is
+    interrupted, `_finish` completes it when the same recording is imported again.
 
     Raises:
         Occupied: neither continues the other.
-        RunnerError: another process is working on the run.
+        RunnerError: the run is locked by another process.
         StorageError: the folder cannot be written; nothing was lost.
     """
     there = occupied.run
@@ -237,7 +232,7 @@ def _continue_or_keep(
 
 
 def _finish(run: Run, facts: Mapping[str, Any]) -> Run:
-    """Return the run; if its recording is complete but its `run.json` does not say so, update that."""
+    """Return the run; update its `run.json` if only its recording is finished."""
     if facts["status"] != "finished" or run.status not in UNFINISHED or run.stands_alone:
         return run
     with locked(run) as there:
@@ -245,7 +240,7 @@ def _finish(run: Run, facts: Mapping[str, Any]) -> Run:
 
 
 def _with_facts(run: Run, facts: Mapping[str, Any]) -> Run:
-    """Replace what `run.json` says of the recording; keep what it says of its folder."""
+    """Replace the facts on the recording in `run.json`; keep those on its folder."""
     kept = {key: value for key, value in run.facts.items() if key not in ("owner", "proof", "summary")}
     write_object(run.folder / RUN_FILE, kept | dict(facts))
     return run_at(run.folder)
@@ -258,13 +253,13 @@ def _merged(own: Labels, more: Labels) -> Labels:
 
 
 def _place(source: Path, target: Path, facts: dict[str, Any], rewritten: bool) -> None:
-    """Put a recording at its place, and its size there into the facts.
+    """Copy, link or rewrite a recording, and set its size in the facts.
 
     Args:
         source: the recording.
-        target: its place. A finished recording that is not rewritten becomes a link on the same disk; others
-            are copied, as `resume` continues them in place, which must not change the source.
-        facts: what `run.json` is going to say.
+        target: the new file. A finished recording that is not rewritten becomes a link on the same disk;
+            others are copied, as `resume` continues them in place, which must not change the source.
+        facts: the contents of `run.json`.
         rewritten: write it with the id of the facts and without its export record.
 
     Raises:
@@ -295,7 +290,7 @@ def _linked(source: Path, target: Path) -> bool:
 
 @contextlib.contextmanager
 def _staging_folder(recordings: Path, recording: Path) -> Iterator[Path]:
-    """Give a folder inside a hidden one, on the disk of the recordings; both are removed afterwards."""
+    """Yield a folder inside a hidden one, on the disk of the recordings; both are removed afterwards."""
     created = not recordings.exists()
     hidden = recordings / f".importing-{secrets.token_hex(4)}"
     try:

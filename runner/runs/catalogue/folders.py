@@ -21,7 +21,7 @@ from runner.runs.catalogue.database import tuples_of, write_rows
 from runner.runs.catalogue.rows import Row, row_of
 from runner.runs.run import RECORDING_FILE, RUN_FILE, run_entries, runs_in
 
-_SETTLED_NS: Final = 2 * 10**9
+_STABLE_NS: Final = 2 * 10**9
 """Files that changed this recently may change again with the same time: they are read again next time."""
 _RUN_FILES: Final = (RUN_FILE, LABELS_FILE, RECORDING_FILE)
 _BATCH: Final = 2000
@@ -114,8 +114,8 @@ class Folders:
             changed = [entry for entry in tokens if entry not in known]
             return self._difference_of(root, known, changed, [])
         changed = [entry for entry, token in tokens.items() if known.get(entry) != token]
-        running, unsettled = self._unstable(root)
-        again = [*tokens] if self._rebuild else unsettled
+        running, unstable = self._unstable(root)
+        again = [*tokens] if self._rebuild else unstable
         if self._depth is Depth.FOLDERS:
             again = [*again, *running]  # their recordings grow in place
         changed += [e for e in again if known.get(e) == tokens.get(e) and e not in self._read[root]]
@@ -155,24 +155,24 @@ class Folders:
 
     def _unstable(self, root: str) -> tuple[list[str], list[str]]:
         """Return the runs that were running when they were read, and those just changed then."""
-        unsteady = (Row.status == "running") | (Row.settled == False)  # noqa: E712 - an expression of SQL
-        rows = Row.select(Row.entry, Row.status, Row.settled).where((Row.root == root) & unsteady)
+        unsteady = (Row.status == "running") | (Row.stable == False)  # noqa: E712 - an expression of SQL
+        rows = Row.select(Row.entry, Row.status, Row.stable).where((Row.root == root) & unsteady)
         found = list(tuples_of(self._database, rows))
         running = [entry for entry, status, _ in found if status == "running"]
-        return running, [entry for entry, _, settled in found if not settled]
+        return running, [entry for entry, _, stable in found if not stable]
 
     def _row(self, root: str, entry: str) -> dict[str, Any]:
         """Read a run's folder into a row."""
         mark, changed = _mark(root, entry)  # before the files: later changes are found next time
         seen = _state_of(root, entry) or State("", 0, None)
-        settled = max(changed, seen.changed) + _SETTLED_NS < time.time_ns()
+        stable = max(changed, seen.changed) + _STABLE_NS < time.time_ns()
         self._tokens[root][entry] = mark if self._depth is Depth.FOLDERS else seen.fingerprint
         self._read[root].add(entry)
         place = {"root": root, "entry": entry, "fingerprint": seen.fingerprint, "mark": mark}
         for run in runs_in(Path(root, entry)):
-            return _EMPTY | place | {"settled": settled} | row_of(run, seen.size)
+            return _EMPTY | place | {"stable": stable} | row_of(run, seen.size)
         problem = f"{Path(root, entry)}: neither {RUN_FILE} nor {RECORDING_FILE} can be read as a run."
-        return _EMPTY | place | {"settled": settled, "problem": problem}
+        return _EMPTY | place | {"stable": stable, "problem": problem}
 
 
 class State(NamedTuple):

@@ -133,7 +133,7 @@ def remove(removal: Removal, force: bool = False) -> None:
         StorageError: the folder cannot be written; the rest of the run is out of sight.
     """
     run = removal.run()
-    # It may have been tagged, or resumed, while the user was asked.
+    # It may have been tagged, or resumed, while the user was confirming.
     refusal = removal.refusal or _protected(run)
     if refusal:
         raise RunnerError(f"run {run.run_id} stays: {refusal}.")

@@ -58,7 +58,7 @@ class Row(Model):
     """Changes with every change of its files."""
     mark = TextField()
     """Changes when a file in it is created, replaced or removed."""
-    settled = BooleanField()
+    stable = BooleanField()
     """Whether they had not just changed; if they had, they may change again with the same time."""
     problem = TextField(null=True)
 
@@ -86,7 +86,7 @@ class Row(Model):
         primary_key = CompositeKey("root", "entry")
         without_rowid = True
         indexes = (
-            (("root", "entry", "fingerprint", "mark", "settled", "status"), False),
+            (("root", "entry", "fingerprint", "mark", "stable", "status"), False),
             (("digest",), False),
             (("root", "created", "id", "name", "seed"), False),
             (_SUMMED, False),

@@ -144,7 +144,7 @@ class Usage:
 
 
 COLUMNS_OF_USAGE: Final = (
-    *("root", "entry", "id", "name", "status", "tags", "digest", "fingerprint", "mark", "settled"),
+    *("root", "entry", "id", "name", "status", "tags", "digest", "fingerprint", "mark", "stable"),
     *("used_recording", "used_other", "used_left_over", "used_freed"),
 )
 """The columns of the index that a `Usage` needs."""
@@ -227,7 +227,7 @@ def usage_of(
             contents = contents_of(Path(row["root"], row["entry"]))
         except OSError:
             contents = Contents()  # removed just now
-        if row["settled"] and row["status"] != "running" and not contents.strange:
+        if row["stable"] and row["status"] != "running" and not contents.strange:
             measured.append((row, contents))
         every.append(usage(row, contents))
         sums.add(every[-1])

@@ -73,7 +73,7 @@ def test_all_three_read_the_same_steps(runs, monkeypatch):
     pattern = "archive/*/steps.parquet"
     table = f"read_parquet('{pattern}', union_by_name = true)"
     duck = duckdb.sql(f"SELECT run_id, count(*), sum(reward) FROM {table} GROUP BY 1").fetchall()
-    told = {run_id: figures for run_id, *figures in duck}
+    by_run = {run_id: figures for run_id, *figures in duck}
     panda = pd.concat(pd.read_parquet(path) for path in folder.glob(pattern))
     polar = pl.scan_parquet(pattern, missing_columns="insert", extra_columns="ignore").collect()
     for run in made:
@@ -82,7 +82,7 @@ def test_all_three_read_the_same_steps(runs, monkeypatch):
                 block for topic in (schema.TRAIN_STEP, schema.EVAL_STEP) for block in recording.blocks(topic)
             ]
         expected = sum(map(len, blocks)), sum(float(block["rewards"].sum()) for block in blocks)
-        assert tuple(told[run.run_id]) == pytest.approx(expected)
+        assert tuple(by_run[run.run_id]) == pytest.approx(expected)
         mine = panda[panda["run_id"] == run.run_id]["reward"]
         assert (len(mine), mine.sum()) == pytest.approx(expected)
         ours = polar.filter(pl.col("run_id").cast(pl.String) == run.run_id)["reward"]

@@ -183,7 +183,7 @@ def test_a_forged_value_is_found_by_the_topics_hash(archive, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("forge", "told"),
+    ("forge", "message"),
     [
         (lambda steps: steps.drop(["state"]), "found columns"),
         (lambda steps: with_column(steps, "t", pa.nulls(len(steps), pa.int32())), "rows without t"),
@@ -201,10 +201,10 @@ def test_a_forged_value_is_found_by_the_topics_hash(archive, tmp_path):
     ],
     ids=["no column", "nulls", "type", "more rows", "fewer rows", "no such state", "no such phase"],
 )
-def test_tables_of_another_kind_are_refused(archive, tmp_path, forge, told):
+def test_tables_of_another_kind_are_refused(archive, tmp_path, forge, message):
     steps = pq.read_table(archive / layout.STEPS)
     folder = forged(archive, tmp_path / "forged", layout.STEPS, forge(steps))
-    with pytest.raises(RunnerError, match=told):
+    with pytest.raises(RunnerError, match=message):
         check(folder)
 
 

@@ -43,14 +43,14 @@ def done(result):
 
 def test_archived_and_removed_a_run_is_listed_and_restored_the_same(run, recordings, command):
     before = run.recording.stat().st_size
-    told = json.loads(done(command("archive", run.run_id, "--remove", "--json")))
+    result = json.loads(done(command("archive", run.run_id, "--remove", "--json")))
     place = recordings.parent / "archive" / run.run_id
-    assert told["place"] == str(place)
-    assert told["content_digest"] == run.summary["content_digest"]
-    assert told["bytes"] == sum(
+    assert result["place"] == str(place)
+    assert result["content_digest"] == run.summary["content_digest"]
+    assert result["bytes"] == sum(
         p.stat().st_size for p in place.rglob("*") if p.name != layout.MANIFEST and p.is_file()
     )
-    assert told["bytes"] < before
+    assert result["bytes"] < before
     left = find_run(run.run_id, recordings)
     assert left.status == "archived"
     assert not left.recording.exists()
@@ -104,18 +104,18 @@ def test_what_looks_at_a_run_looks_at_an_archived_one(words, run, command, tmp_p
 
 
 def test_a_dry_run_tells_the_sizes_and_leaves_everything(run, recordings, command):
-    told = json.loads(done(command("archive", run.run_id, "--dry-run", "--remove", "--json")))
-    assert told["bytes"] > 0
-    assert not told["removed"]
+    result = json.loads(done(command("archive", run.run_id, "--dry-run", "--remove", "--json")))
+    assert result["bytes"] > 0
+    assert not result["removed"]
     assert not (recordings.parent / "archive").exists()
     assert find_run(run.run_id, recordings).facts == run.facts
 
 
 def test_an_archive_that_is_there_is_looked_at_again_not_written(run, command):
     done(command("archive", run.run_id))
-    told = json.loads(done(command("archive", run.run_id, "--remove", "--json")))
-    assert not told["new"]
-    assert told["removed"]
+    result = json.loads(done(command("archive", run.run_id, "--remove", "--json")))
+    assert not result["new"]
+    assert result["removed"]
 
 
 def test_nothing_is_removed_for_an_archive_that_is_damaged(run, recordings, command):

@@ -94,13 +94,13 @@ def test_a_run_goes_there_and_comes_back(run, bucket, tmp_path):
         assert result.exit_code == 0, result.output
         return result
 
-    told = json.loads(command("archive", run.run_id, "--to", URL, "--remove", "--json").stdout)
-    assert told["place"] == f"{URL}/{run.run_id}"
+    result = json.loads(command("archive", run.run_id, "--to", URL, "--remove", "--json").stdout)
+    assert result["place"] == f"{URL}/{run.run_id}"
     assert find_run(run.run_id, recordings).status == "archived"
     manifest = Store(URL).manifest(run.run_id)
     assert keys(bucket) == {f"runs/{run.run_id}/{name}" for name in (*manifest.files, layout.MANIFEST)}
     command("restore", run.run_id)
-    assert find_run(run.run_id, recordings).summary["content_digest"] == told["content_digest"]
+    assert find_run(run.run_id, recordings).summary["content_digest"] == result["content_digest"]
     shutil.rmtree(recordings)
     command("restore", f"{URL}/{run.run_id}")
     command("verify", run.run_id)

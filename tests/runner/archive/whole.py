@@ -1,4 +1,4 @@
-"""Archives made of recordings, and all that a recording holds."""
+"""Archives of recordings, and the complete contents of a recording."""
 
 from __future__ import annotations
 

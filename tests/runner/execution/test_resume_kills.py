@@ -1,4 +1,4 @@
-"""Runs whose process was killed end as if nothing had happened; of two processes one goes on with a run."""
+"""Killed runs are resumed as if never killed; only one of two processes resumes a run."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ def test_one_of_two_processes_may_resume(tmp_path):
     with pytest.raises(RunnerError, match="is locked by another process"):
         resume(run)
     second = start("resume", run.run_id, "--recordings", recordings)
-    _, told = second.communicate(timeout=60)
+    _, errors = second.communicate(timeout=60)
     assert second.returncode == 2
-    assert "another process" in told
+    assert "another process" in errors
     process.send_signal(signal.SIGTERM)
-    _, told = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "Interrupted again" in told
+    assert "Interrupted again" in errors
     assert find_run(run.run_id, recordings).status == "interrupted"

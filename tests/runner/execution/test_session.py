@@ -186,11 +186,11 @@ def test_the_same_job_twice_is_the_same_content_and_every_seed_another(tmp_path)
 def test_recorded_without_threads_a_run_is_the_same_to_the_byte(parts, tmp_path):
     before = set(threading.enumerate())
     config = experiment(TAXIS, parts)
-    beside, alone = (
+    threaded, alone = (
         run_job(Job(config, 0), create_run(tmp_path, config, 0), threads=threads) for threads in (True, False)
     )
-    assert alone.summary["content_digest"] == beside.summary["content_digest"]
-    with open_recording(alone.recording) as one, open_recording(beside.recording) as other:
+    assert alone.summary["content_digest"] == threaded.summary["content_digest"]
+    with open_recording(alone.recording) as one, open_recording(threaded.recording) as other:
         for topic in schema.ALL_TOPICS:
             assert list(one.messages(topic)) == list(other.messages(topic))
     assert set(threading.enumerate()) <= before, "no thread is left"
@@ -198,17 +198,17 @@ def test_recorded_without_threads_a_run_is_the_same_to_the_byte(parts, tmp_path)
 
 def test_progress_is_told_with_every_evaluation(tmp_path):
     config = experiment(TAXIS)
-    told = []
+    reports = []
     run = run_job(
         Job(config, 0),
         create_run(tmp_path, config, 0),
-        report=lambda progress: told.append(
+        report=lambda progress: reports.append(
             (progress.episode, progress.train_steps, len(progress.evaluations))
         ),
     )
-    assert told == sorted(told)
-    assert {evaluations for _, _, evaluations in told} >= {1, 2, 3, 4}
-    assert told[-1] == (60, run.summary["train_steps"], 4)
+    assert reports == sorted(reports)
+    assert {evaluations for _, _, evaluations in reports} >= {1, 2, 3, 4}
+    assert reports[-1] == (60, run.summary["train_steps"], 4)
 
 
 @pytest.mark.parametrize("asked", [1, 2, 3, 5, 9])
@@ -260,12 +260,12 @@ def test_an_error_of_whoever_listens_ends_the_run_as_failed(tmp_path):
     run = create_run(tmp_path, config, 0)
 
     def report(_):
-        raise ZeroDivisionError("by whoever listens")
+        raise ZeroDivisionError("by the listener")
 
     with pytest.raises(ZeroDivisionError):
         run_job(Job(config, 0), run, report=report)
     failed = find_run(run.run_id, tmp_path)
-    assert (failed.status, failed.summary["error"]) == ("failed", "by whoever listens")
+    assert (failed.status, failed.summary["error"]) == ("failed", "by the listener")
 
 
 @pytest.mark.parametrize("threads", [True, False])
@@ -320,7 +320,7 @@ def test_learning_goes_on_from_a_recorded_run(tmp_path):
         run = make_run(tmp_path, TAXIS, name="second", initial_q=start)
         with open_recording(run.recording) as recording:
             assert [table.values.tobytes() for table in recording.snapshots()][:2] == tables[step]
-            assert recording.metrics("eval")[0]["step"] == 0, "counting begins anew"
+            assert recording.metrics("eval")[0]["step"] == 0, "counting starts again"
 
 
 def test_learning_goes_on_from_any_step_of_a_recorded_run(tmp_path):

@@ -330,7 +330,7 @@ def test_other_files_are_no_recordings(tmp_path):
 
 
 def described_as(source, target, change):
-    """Write a recording anew with another description of its environment; return where it is."""
+    """Rewrite a recording with another description of its environment; return its path."""
     with open_recording(source) as recording, RecordingFile(target, recording.topics) as file:
         for name in recording.metadata_names:
             if name != "result":

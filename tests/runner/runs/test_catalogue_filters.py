@@ -217,7 +217,7 @@ def test_any_text_is_a_filter_or_refused_with_its_place(folder, text):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("sede:3", "Did you mean 'seed'?"),
         ("config.discuont:3", "Did you mean 'discount'?"),
@@ -245,10 +245,10 @@ def test_any_text_is_a_filter_or_refused_with_its_place(folder, text):
         ("a" * (MAX_LENGTH + 1), "characters"),
     ],
 )
-def test_refusals_say_what_was_meant(folder, text, told):
+def test_refusals_say_what_was_meant(folder, text, message):
     with pytest.raises(RunnerError) as caught:
         found(folder, text)
-    assert told in str(caught.value)
+    assert message in str(caught.value)
 
 
 def test_very_many_words_are_no_trouble(folder):

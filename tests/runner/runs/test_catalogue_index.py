@@ -52,9 +52,9 @@ def recorded(tmp_path_factory):
 
 
 def rows(*folders, text=""):
-    told = []
-    found = look(folders, lambda index: index.select(parse(text)), told.append)
-    return found, told
+    messages = []
+    found = look(folders, lambda index: index.select(parse(text)), messages.append)
+    return found, messages
 
 
 def ids(folder, text=""):
@@ -144,7 +144,7 @@ def test_a_run_is_found_in_the_recording_alone_and_keeps_its_labels(folder, reco
     (place / RUN_FILE).unlink()
     alone = rows(folder)[0][0]
     differing = {key for key in whole if whole[key] != alone[key]}
-    assert differing <= {"fingerprint", "mark", "settled", "seconds", "settings"}
+    assert differing <= {"fingerprint", "mark", "stable", "seconds", "settings"}
     assert json.loads(whole["settings"]) == json.loads(alone["settings"])
 
 
@@ -171,9 +171,9 @@ def test_a_lost_or_damaged_index_is_made_anew(folder, damage):
         case "another version":
             with sqlite3.connect(path) as other:
                 other.execute("PRAGMA user_version = 99")
-    found, told = rows(folder)
+    found, messages = rows(folder)
     assert {row["id"] for row in found} == set(made)
-    assert (not told) == (damage == "deleted")
+    assert (not messages) == (damage == "deleted")
     assert rows(folder)[1] == []
 
 
@@ -181,9 +181,9 @@ def test_without_a_place_for_the_index_the_folders_are_read(folder, tmp_path, mo
     run = create_run(folder, CONFIG, 1)
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    found, told = rows(folder)
+    found, messages = rows(folder)
     assert [row["id"] for row in found] == [run.run_id]
-    assert "cannot be used" in told[0]
+    assert "cannot be used" in messages[0]
 
 
 def test_the_index_is_never_needed(folder):
@@ -319,12 +319,12 @@ def test_a_run_is_found_by_the_names_that_find_it_in_the_folder(folder):
     assert find_run("patient", folder).run_id == runs[1].run_id
     assert find_run("@latest", folder).run_id == newest.run_id
     assert find_run(runs[0].run_id, folder) == find_run(runs[0].run_id[:7], folder) == runs[0]
-    for name, told in (
+    for name, message in (
         ("", "empty name"),
         ("some", "matches 2 runs"),
         ("ptient", "Did you mean 'patient'"),
     ):
-        with pytest.raises(RunNotFound, match=told):
+        with pytest.raises(RunNotFound, match=message):
             find_run(name, folder)
 
 

@@ -218,9 +218,9 @@ def test_a_damaged_recording_is_neither_exported_nor_imported(lake, tmp_path):
 def test_what_is_not_a_recording_is_refused(lake, tmp_path, cut):
     file = tmp_path / "a.mcap"
     file.write_bytes(lake.recording.read_bytes()[:cut])
-    told = CliRunner().invoke(cli, ["import", str(file), "--recordings", str(tmp_path / "theirs")])
-    assert told.exit_code == 2, told.output
-    assert str(file) in told.stderr
+    result = CliRunner().invoke(cli, ["import", str(file), "--recordings", str(tmp_path / "theirs")])
+    assert result.exit_code == 2, result.output
+    assert str(file) in result.stderr
     assert not (tmp_path / "theirs").exists()
 
 

@@ -1,4 +1,4 @@
-"""The recordings folder: runs are made, told apart, listed and found."""
+"""The recordings folder: runs are created, listed and found."""
 
 import json
 import os
@@ -72,7 +72,10 @@ def test_an_update_is_whole_and_leaves_the_rest(folder):
         ({"pid": 2**30}, "interrupted"),
         ({"pid": "x"}, "interrupted"),
         ({"process_started": 1.0}, "interrupted"),
-        ({"boot_id": "another"}, "running"),  # another machine's, as far as one can tell: its heart beats
+        (
+            {"boot_id": "another"},
+            "running",
+        ),  # of another machine, it seems: it still beats
         ({"host": "elsewhere"}, "running"),
     ],
 )
