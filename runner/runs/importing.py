@@ -72,8 +72,8 @@ def import_recording(
     labels. When this returns the run is on disk, even if the power fails now.
 
     Args:
-        recording: the file, to which nothing is written any more. If it is finished, nothing in it changes and
-            it is on the same disk, it is linked instead of copied.
+        recording: the file, to which nothing is written any more. If it is finished, nothing in it changes
+            and it is on the same disk, it is linked instead of copied.
         recordings: the folder of runs; created if it is missing.
         details: the contents of `run.json` where the run comes from; the file's own record of it by default.
             Values that the recording contradicts are ignored.
