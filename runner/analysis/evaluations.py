@@ -107,10 +107,8 @@ def evaluation_records(recording: Recording) -> list[Record]:
     agents, events = recording.agents, recording.event_names
     if recording.is_job:
         return [evaluation_record(metrics, agents, events) for metrics in recording.metrics("eval")]
-    return [
-        _loop_record(recording, one, recording.episodes("eval", one.start, one.stop))
-        for one in evaluations_of(recording)
-    ]
+    trials = recording.episodes("eval")
+    return [_loop_record(recording, one, trials[one.start : one.stop]) for one in evaluations_of(recording)]
 
 
 def evaluation_record(metrics: Mapping[str, Any], agents: Sequence[str], events: Sequence[str]) -> Record:
