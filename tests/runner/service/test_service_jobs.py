@@ -166,7 +166,7 @@ def test_a_sweep_uses_the_free_workers(client, submit, recordings, tmp_path):
 
     page, _, table = until(lambda seen: seen[0] == seen[1] and seen[2] in seen[0], texts)
     assert all(f'href="/runs/{run.run_id}"' in table for run in runs)
-    assert 'alt="Length of evaluation trials over training episodes"' in page
+    assert 'aria-label="Length of evaluation trials over training episodes"' in page
 
 
 def test_a_job_whose_worker_dies_is_retried_and_then_fails(client, submit):
