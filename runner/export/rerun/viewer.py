@@ -69,9 +69,7 @@ def viewer_program() -> Path:
 
 def free_port() -> int:
     """Return a port that nothing listens on now."""
-    with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
-        return int(probe.getsockname()[1])
+    return check_port(0)
 
 
 def check_port(port: int) -> int:
@@ -80,8 +78,6 @@ def check_port(port: int) -> int:
     Raises:
         ViewerError: something listens on it.
     """
-    if not port:
-        return free_port()
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -90,7 +86,7 @@ def check_port(port: int) -> int:
             raise ViewerError(
                 f"port {port} cannot be used ({error.strerror}); choose another by --port, or leave it out."
             ) from error
-    return port
+        return int(probe.getsockname()[1])
 
 
 def check_address(url: str) -> str:
