@@ -112,16 +112,18 @@ class Sender:
         self.send(part, [rr.TimeColumn("step", sequence=times)], columns)
 
 
-class _Column(NamedTuple):
+class Column(NamedTuple):
     """An Arrow array with the interface of Rerun's `ComponentColumn`, which would copy it."""
 
     descriptor: Any
     array: pa.Array
 
     def component_descriptor(self) -> Any:
+        """Return the descriptor of the component."""
         return self.descriptor
 
     def as_arrow_array(self) -> pa.Array:
+        """Return the array."""
         return self.array
 
 
@@ -154,7 +156,7 @@ def strips(lines: NDArray[np.float32]) -> list[Any]:
     n, count, points, _ = lines.shape
     flat = pa.FixedSizeListArray.from_arrays(pa.array(lines.reshape(-1)), type=_POINT)
     each = pa.ListArray.from_arrays(_offsets(n * count, points), flat, type=_STRIP)
-    return [_Column(rr.LineStrips2D.descriptor_strips(), pa.ListArray.from_arrays(_offsets(n, count), each))]
+    return [Column(rr.LineStrips2D.descriptor_strips(), pa.ListArray.from_arrays(_offsets(n, count), each))]
 
 
 def images(values: NDArray[np.float32]) -> list[Any]:
@@ -167,17 +169,17 @@ def images(values: NDArray[np.float32]) -> list[Any]:
         low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
     ranges = np.stack((low, np.where(high > low, high, low + 1)), axis=1).astype(np.float64)
     shown = rr.DepthImage.columns(depth_range=np.nan_to_num(ranges))
-    return [_Column(rr.DepthImage.descriptor_buffer(), rows), *shown]
+    return [Column(rr.DepthImage.descriptor_buffer(), rows), *shown]
 
 
-def _column(archetype: Any, name: str, offsets: pa.Array, flat: NDArray[Any]) -> _Column:
+def _column(archetype: Any, name: str, offsets: pa.Array, flat: NDArray[Any]) -> Column:
     # Arrow refuses memory that is not aligned, which the field of a lone record may be.
     flat = np.require(flat, requirements=["C", "A"])
     items = (
         pa.FixedSizeListArray.from_arrays(flat.reshape(-1), type=_POINT) if flat.ndim == 2 else pa.array(flat)
     )
     descriptor = getattr(archetype, f"descriptor_{name}")()
-    return _Column(descriptor, pa.ListArray.from_arrays(offsets, items))
+    return Column(descriptor, pa.ListArray.from_arrays(offsets, items))
 
 
 def _offsets(count: int, size: int) -> pa.Array:

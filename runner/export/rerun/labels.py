@@ -11,12 +11,14 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, numbered_actions, spoken
+from runner.export.rerun.columns import Column
 from runner.export.rerun.scene import Scene
 
 MAX_REWARDS: Final = 2_000
@@ -70,10 +72,22 @@ class Labels:
     def log(self, stream: rr.RecordingStream, root: str) -> None:
         """Log texts and colours for everything below an entity path."""
         classes = [
-            (number, text, palette.rgb(colour))
+            {
+                "class_id": number,
+                "class_description": {
+                    "info": {"id": number, "label": text, "color": int(f"{colour[1:]}ff", 16)},
+                    "keypoint_annotations": [],
+                    "keypoint_connections": [],
+                },
+            }
             for number, (text, colour) in enumerate(zip(self.texts, self._colours, strict=True))
         ]
-        stream.log(f"{root}/", rr.AnnotationContext(classes), static=True)
+        # As Arrow, because Rerun is slow to convert thousands of labels.
+        empty: Any = rr.AnnotationContext([]).context
+        context: Any = Column(
+            rr.AnnotationContext.descriptor_context(), pa.array([classes], empty.as_arrow_array().type)
+        )
+        stream.log(f"{root}/", [context], static=True)
 
     def of_movers(self, is_carrying: NDArray[np.int64], events: NDArray[np.uint32]) -> NDArray[np.uint16]:
         """Return the label of each mover in each step, [n, movers]: its name, and what happened to it."""
@@ -93,11 +107,6 @@ class Labels:
         return (
             np.stack(numbers, axis=1).astype(np.uint16) if numbers else np.empty((len(rewards), 0), np.uint16)
         )
-
-    def of_values(self, values: NDArray[np.float64]) -> NDArray[np.uint16]:
-        """Return the label of each value, rounded; that of the end beyond the labelled range."""
-        level = np.rint(np.nan_to_num(values) / self._unit) - self._lowest
-        return np.asarray(self._levels + level.clip(0, self._level_count - 1), np.uint16)
 
     def _add(self, texts: Sequence[str], colour: str = palette.MIDTONE) -> int:
         """Add texts; return the number of the first."""
@@ -146,18 +155,24 @@ class Labels:
     def _add_levels(self, low: float, high: float) -> None:
         """Number values to three digits of the greatest one, with a margin on both sides."""
         low, high = min(low, 0.0), max(high, 0.0)
-        self._unit = 10.0 ** (math.floor(math.log10(max(-low, high, 1e-9))) - 2)
-        while (high - low) / self._unit > MAX_LEVELS:
-            self._unit *= 10
-        margin = (high - low) / 2 + self._unit
+        self.unit = 10.0 ** (math.floor(math.log10(max(-low, high, 1e-9))) - 2)
+        while (high - low) / self.unit > MAX_LEVELS:
+            self.unit *= 10
+        margin = (high - low) / 2 + self.unit
         self._lowest, highest = (
-            math.floor((low - margin) / self._unit),
-            math.ceil((high + margin) / self._unit),
+            math.floor((low - margin) / self.unit),
+            math.ceil((high + margin) / self.unit),
         )
-        digits = max(0, -round(math.log10(self._unit)))
-        texts = [_signed(round(k * self._unit, digits), digits) for k in range(self._lowest, highest + 1)]
+        digits = max(0, -round(math.log10(self.unit)))
+        texts = [_signed(round(k * self.unit, digits), digits) for k in range(self._lowest, highest + 1)]
         texts[0], texts[-1] = f"≤ {texts[0]}", f"≥ {texts[-1]}"
         self._levels, self._level_count = self._add(texts), len(texts)
+
+    @property
+    def value_marks(self) -> tuple[int, ...]:
+        """The labels of marks, the first label of a value, the lowest level, and the number of levels."""
+        marks = self.unmarked, self.greedy, self.exploited, self.explored
+        return *marks, self._levels, self._lowest, self._level_count
 
 
 def _event_labels(mdp: Mdp, mask: int, agent: str) -> list[str]:

@@ -178,17 +178,15 @@ class TableWriter(Sender):
         """Send the values of each step of a batch: as they were before its update."""
         q, labels = values.values, self._labels
         n, count = q.shape
-        classes = np.full((n, 3 * count), labels.unmarked, np.uint16)
-        classes[:, :count] = labels.of_values(q)
-        row, first = np.arange(n)[:, None], self._bounds[:-1]
-        classes[row, count + first + values.greedy] = labels.greedy
         own = self._own[batch.records["action"]]
-        explored = (batch.records["explored"][:, None] >> self._explored_bit & 1).astype(bool)
-        classes[row, 2 * count + first + own] = np.where(explored, labels.explored, labels.exploited)
+        explored = batch.records["explored"][:, None] >> self._explored_bit & 1
+        classes = np.empty((n, 3 * count), np.uint16)
         bars = np.empty((n, count, 2, 2), np.float32)
         bars[:, :, 0, 0] = BAR_LEFT
         bars[..., 1] = self._y[:, None]
-        _fill_bar_ends(q, self._bounds, BAR_LEFT, BAR_LENGTH, _BAR_FRACTION, bars[:, :, 1, 0])
+        ends = bars[:, :, 1, 0]
+        marks = labels.value_marks
+        _fill_table(q, values.greedy, own, explored, self._bounds, labels.unit, marks, classes, ends)
         columns = [*scalars(q), *instances(rr.Points2D, class_ids=classes), *strips(bars)]
         self.send("q", batch.times, columns)
         rows = values.map_rows  # the points never change, but are cleared with the rest
@@ -267,7 +265,7 @@ class MapWriter(Sender):
 
     def write(self, batch: Batch, values: StepValues) -> None:
         """Send where each step of a batch is in the map, and the maps that there are."""
-        here = self._centres[self._pixel[batch.records["state"]]][:, None]
+        here = self._centres.take(self._pixel.take(batch.records["state"]), axis=0)[:, None]
         self.send(f"{self._part}/here", batch.times, instances(rr.Boxes2D, centers=here))
         rows = values.map_rows
         if not len(rows):
@@ -325,25 +323,49 @@ def _split_joint(rows: Any, own: Any, first: Any, best: Any, greedy: Any) -> Non
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
-def _fill_bar_ends(values: Any, bounds: Any, left: float, length: float, fraction: int, ends: Any) -> None:
-    """Fill in where the bar of each value ends: from an agent's lowest value in a step to its highest.
+def _fill_table(
+    values: Any,
+    greedy: Any,
+    own: Any,
+    explored: Any,
+    bounds: Any,
+    unit: float,
+    marks: Any,
+    classes: Any,
+    ends: Any,
+) -> None:
+    """Fill in the label of each value, the marks of greedy and chosen actions, and where the bars end.
 
     Args:
         values: [n, values].
+        greedy: [n, agents], the greedy action of each agent.
+        own: [n, agents], its chosen action.
+        explored: [n, agents], whether that was explored.
         bounds: [agents + 1], the first value of each agent, and the number of values.
-        left: where bars begin.
-        length: of the longest bar.
-        fraction: parts of a unit to which lengths are rounded up.
-        ends: [n, values], filled.
+        unit: of the labels of values.
+        marks: of `Labels`.
+        classes: [n, 3 * values], filled with the labels of values, greedy and chosen actions.
+        ends: [n, values], filled: a bar reaches from the agent's lowest value in a step to its highest.
     """
+    unmarked, is_greedy, exploited, is_explored, first_level, lowest, levels = marks
+    count = values.shape[1]
     for k in range(len(values)):
+        for i in range(count):
+            value = 0.0 if np.isnan(values[k, i]) else values[k, i]
+            level = min(max(np.rint(value / unit) - lowest, 0.0), levels - 1.0)
+            classes[k, i] = first_level + int(level)
+            classes[k, count + i] = classes[k, 2 * count + i] = unmarked
         for agent in range(len(bounds) - 1):
+            start, stop = bounds[agent], bounds[agent + 1]
+            classes[k, count + start + greedy[k, agent]] = is_greedy
+            chosen = is_explored if explored[k, agent] else exploited
+            classes[k, 2 * count + start + own[k, agent]] = chosen
             low, high = np.inf, -np.inf
-            for i in range(bounds[agent], bounds[agent + 1]):
+            for i in range(start, stop):
                 low, high = min(low, values[k, i]), max(high, values[k, i])
-            scale = length * fraction / (high - low) if high > low else 0.0
-            for i in range(bounds[agent], bounds[agent + 1]):
-                ends[k, i] = left + np.ceil((values[k, i] - low) * scale) / fraction
+            scale = BAR_LENGTH * _BAR_FRACTION / (high - low) if high > low else 0.0
+            for i in range(start, stop):
+                ends[k, i] = BAR_LEFT + np.ceil((values[k, i] - low) * scale) / _BAR_FRACTION
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]

@@ -81,6 +81,11 @@ class Scene:
         return np.concatenate((movers, passengers), axis=1)
 
     @cached_property
+    def mover_points(self) -> NDArray[np.float32]:
+        """[S, movers, 2]: where each mover is drawn."""
+        return np.ascontiguousarray(self.points[:, : len(self.movers)])
+
+    @cached_property
     def shapes(self) -> list[tuple[int, Shape]]:
         """The boxes that are drawn, each with the index of the mover or passenger it belongs to."""
         shapes: list[tuple[int, Shape]] = []
@@ -144,9 +149,9 @@ class Scene:
         self, state: NDArray[Any], action: NDArray[Any], next_state: NDArray[Any]
     ) -> NDArray[np.float32]:
         """Return the vector of each mover's move, [n, movers, 2]: short where it led nowhere."""
-        movers = len(self.movers)
-        moved = self.points[next_state, :movers] - self.points[state, :movers]
-        return np.where(moved.any(axis=2, keepdims=True), moved, self.moves[action])
+        points = self.mover_points
+        moved = points.take(next_state, axis=0) - points.take(state, axis=0)
+        return np.where(moved.any(axis=2, keepdims=True), moved, self.moves.take(action, axis=0))
 
     @cached_property
     def placements(self) -> Placements | None:

@@ -136,10 +136,11 @@ class _Grid(Sender):
     def write(self, batch: Batch, events: NDArray[np.uint32]) -> None:
         """Send the grid of each step of a batch."""
         scene, records, labels = self._scene, batch.records, self._labels
-        state, movers = records["state"].astype(np.int64), len(scene.movers)
+        state = records["state"].astype(np.int64)
         vectors = scene.arrows(
             state, records["action"].astype(np.int64), records["next_state"].astype(np.int64)
         )
+        origins = scene.mover_points.take(state, axis=0)
         waiting = np.arange(len(scene.passengers)) + labels.waiting
         numbers = [
             labels.of_movers(scene.is_carrying[state], events),
@@ -149,10 +150,12 @@ class _Grid(Sender):
         ]
         columns = [
             *instances(
-                rr.Points2D, positions=self._label_points[state], class_ids=np.concatenate(numbers, axis=1)
+                rr.Points2D,
+                positions=self._label_points.take(state, axis=0),
+                class_ids=np.concatenate(numbers, axis=1),
             ),
-            *instances(rr.Boxes2D, centers=scene.shape_centres[state]),
-            *instances(rr.Arrows2D, vectors=vectors, origins=scene.points[state, :movers]),
+            *instances(rr.Boxes2D, centers=scene.shape_centres.take(state, axis=0)),
+            *instances(rr.Arrows2D, vectors=vectors, origins=origins),
             *strips(self._trails(state, records["t"])),
         ]
         self.send("grid/things", batch.times, columns)
@@ -179,7 +182,7 @@ class _Grid(Sender):
         states = np.concatenate((before, state))
         self._before = states[-TRAIL_STEPS:]
         # A point as one number of eight bytes: fewer and larger values to copy.
-        points = self._scene.points[states, : len(self._scene.movers)].view(np.int64)[..., 0]
+        points = self._scene.mover_points.take(states, axis=0).view(np.int64)[..., 0]
         lines = np.ascontiguousarray(sliding_window_view(points, TRAIL_STEPS + 1, axis=0))
         young = np.flatnonzero(t < TRAIL_STEPS)
         back = np.minimum(np.arange(TRAIL_STEPS, -1, -1), t[young, None])
