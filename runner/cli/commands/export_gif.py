@@ -7,18 +7,10 @@ from pathlib import Path
 import click
 
 from runner.cli import Command
-from runner.cli.commands.export import opened_run
-from runner.cli.options import (
-    EXPORTS,
-    episode_option,
-    force_option,
-    output_option,
-    recordings_option,
-    run_argument,
-    trial_option,
-)
+from runner.cli.options import EXPORTS, episode_option, recordings_option, run_argument, trial_option
 from runner.cli.output import say
 from runner.cli.progress import count_line
+from runner.cli.runs import find_recorded
 from runner.util.humanize import size
 
 
@@ -26,7 +18,15 @@ from runner.util.humanize import size
 @run_argument
 @episode_option
 @trial_option
-@output_option(EXPORTS / "episode.gif")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    default=EXPORTS / "episode.gif",
+    show_default=True,
+    metavar="FILE",
+    help="The file to write.",
+)
 @click.option(
     "--speed",
     type=click.FloatRange(0.1, 50),
@@ -51,7 +51,7 @@ from runner.util.humanize import size
     metavar="PIXELS",
     help="Width of the film.",
 )
-@force_option
+@click.option("--force", is_flag=True, help="Replace the file if it exists.")
 @recordings_option
 def command(
     run_name: str,
@@ -77,14 +77,15 @@ def command(
     """
     if episode is not None and trial is not None:
         raise click.UsageError("--episode and --eval exclude each other: choose one.")
-    from runner.export.contents import require_steps
+    from runner.export.contents import require_steps, shortcomings
     from runner.export.gif import require_packages, require_states, write_gif
     from runner.export.places import write_new
     from runner.export.reports import episode as replay
+    from runner.recording.reader import open_recording
 
     require_packages()
     frames: list[int] = []
-    with opened_run(run_name, recordings) as (_, recording):
+    with open_recording(find_recorded(run_name, recordings).recording) as recording:
         require_states(recording)
         require_steps(recording, "show")
         if episode is None and trial is None:
@@ -97,11 +98,13 @@ def command(
                 say(f"There is no whole evaluation: this is the last training episode, {episode:,}.")
             shown = replay.training_episode(recording, episode, steps)
         with count_line("frames", shown.steps + 1) as progress:
-            write_new(
-                output,
-                force,
-                lambda path: frames.append(write_gif(path, recording, shown, speed, width, progress)),
-            )
+
+            def write(path: Path) -> None:
+                frames.append(write_gif(path, recording, shown, speed, width, progress))
+
+            write_new(output, force, write)
+        for shortcoming in shortcomings(recording):
+            say(shortcoming)
     if shown.steps < shown.length:
         say(f"Shown are the first {shown.steps:,} of {shown.length:,} steps; --steps shows more.")
     click.echo(f"{output}: {shown.title}, {frames[0]} frames, {size(output.stat().st_size)}")
