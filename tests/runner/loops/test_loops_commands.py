@@ -405,7 +405,7 @@ def test_csv_lists_the_omitted_columns(tmp_path):
         list(play(rec, 20))
     done = dualtaxi(tmp_path / "loops", "export", "csv", "camera", "-o", str(tmp_path / "tables"))
     assert done.exit_code == 0
-    assert "Left out, as CSV cannot hold their bytes: next_observation, observation" in done.output
+    assert "Left out, as CSV cannot hold bytes: next_observation, observation" in done.output
 
 
 def test_a_killed_loop_is_listed_repaired_and_compared(folder, tmp_path):
