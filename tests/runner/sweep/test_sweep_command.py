@@ -86,7 +86,7 @@ def test_a_level_that_is_never_reached_is_printed_as_never(type_in, file, tmp_pa
     type_in("show", "small", "--best", str(best))
     assert ": never, the median" in best.read_text()
     plotted = CliRunner().invoke(cli, ["plot", "small", "--recordings", str(tmp_path / "runs")])
-    assert "none of its 1 finished trials came to success_percent, first at 101" in plotted.output
+    assert "none of its 1 finished trials reached success_percent, first at 101" in plotted.output
 
 
 def test_an_unknown_sweep_is_refused_with_the_nearest_name(type_in, file):
