@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import BinaryIO, Final, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -182,6 +182,7 @@ def _places(records: bytes, where: str) -> tuple[int, Times, Times]:
             raise RecordingError(f"{where}: its messages differ in size")
         block = np.frombuffer(records, np.dtype([*HEADER, ("data", "u1", (size - HEADER_BYTES,))]))
         offsets = np.arange(len(block), dtype=np.uint64) * np.uint64(size)
+        lengths: Any = length
     else:
         starts, at = [], 0
         while at + HEADER_BYTES <= len(records):
@@ -192,7 +193,7 @@ def _places(records: bytes, where: str) -> tuple[int, Times, Times]:
         heads = b"".join(records[start : start + HEADER_BYTES] for start in starts)
         block = np.frombuffer(heads, np.dtype(HEADER))
         offsets = np.array(starts, dtype=np.uint64)
-    lengths = np.diff(offsets, append=np.uint64(len(records))) - np.uint64(RECORD_HEAD.size)
+        lengths = np.diff(offsets, append=np.uint64(len(records))) - np.uint64(RECORD_HEAD.size)
     as_written = (
         (block["opcode"] == Opcode.MESSAGE)
         & (block["record_length"] == lengths)
