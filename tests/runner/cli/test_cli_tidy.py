@@ -217,7 +217,7 @@ def test_rm_removes_nothing_if_a_run_is_protected(command, make):
         assert result.exit_code == 2
         assert values in result.stderr
     with locked(busy):
-        assert "worked on by another process" in command("rm", busy.run_id, "--yes").stderr
+        assert "locked by another process" in command("rm", busy.run_id, "--yes").stderr
     assert there(command) == {run.run_id for run in (free, kept, busy, running)}
 
 
