@@ -72,7 +72,7 @@ def test_the_rerun_viewer_gets_the_run(monkeypatch, tmp_path):
     assert sent[0].startswith(b"RRF")
 
 
-def test_without_rerun_notebook_it_says_what_to_install(run, monkeypatch):
+def test_without_rerun_notebook_the_error_names_the_extra(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun_notebook", None)
     with pytest.raises(MissingExtra, match=r"\[notebook\]"):
         rerun_view(run)

@@ -85,7 +85,7 @@ def values_left_out(runs: Iterable[RunSeries]) -> list[str]:
 def title_of(metric: str) -> tuple[str, str]:
     """Return a metric's title and its unit."""
     if metric.startswith("event."):
-        return f"Event: {event_in_words(metric.removeprefix('event.'))}", "times a trial, mean"
+        return f"Event: {event_in_words(metric.removeprefix('event.'))}", "times per trial, mean"
     if metric.startswith(LOGGED):
         name = " ".join(metric.removeprefix(LOGGED).split())
         name = name if len(name) <= _MAX_TITLE else name[: _MAX_TITLE - 1] + "…"

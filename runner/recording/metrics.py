@@ -87,7 +87,7 @@ METRICS: Final = (
     EvaluationMetric(
         name="mean_penalties",
         title="Penalties in evaluation trials",
-        unit="a trial, mean",
+        unit="per trial, mean",
         better="lower",
         field="mean_penalties",
         number=16,
@@ -129,7 +129,7 @@ TRAINING_METRICS: Final = (
         field="mean_length",
     ),
     Metric("training.mean_return", "Return of training episodes", "summed reward, mean", "higher", True),
-    Metric("training.mean_reward", "Reward in training", "a step, running mean", "higher"),
+    Metric("training.mean_reward", "Reward in training", "per step, running mean", "higher"),
     Metric(
         "training.percent_filled",
         "Q-table filled",

@@ -72,7 +72,7 @@ def test_resets_draw_every_start_state_about_equally_often():
 
 @given(state=st.integers(0, 6143), action=st.integers(0, 35))
 @settings(deadline=None)
-def test_step_does_what_p_says(state, action):
+def test_step_follows_p(state, action):
     for env in (ENV, COMPETITIVE):
         env.s = state
         after, reward, terminated, truncated, info = env.step(action)
@@ -82,7 +82,7 @@ def test_step_does_what_p_says(state, action):
         assert type(reward) is float
 
 
-def test_step_with_slip_draws_outcomes_as_often_as_p_says():
+def test_step_with_slip_draws_outcomes_with_the_probabilities_of_p():
     env = DualTaxiEnv(map=SMALL, slip=0.3)
     env.reset(seed=2)
     state = env.encode((1, 1), (0, 2), 0, 1)
@@ -231,7 +231,7 @@ def test_the_tables_cannot_be_written_to():
             array[...] = 0
 
 
-def test_what_one_instance_is_told_another_does_not_hear():
+def test_changes_to_one_instance_do_not_affect_another():
     plain = DualTaxiEnv()
     before = trajectory(plain, seed=4)
     strange = DualTaxiEnv(rewards={"step": 7, "collision": 3}, map=SMALL, slip=1.0, competitive=True)

@@ -24,7 +24,7 @@ def test_pettingzoo_finds_no_fault(arguments):
 
 
 @pytest.mark.parametrize("slip", [0.0, 0.2])
-def test_pettingzoo_finds_seeds_kept(slip):
+def test_pettingzoo_seed_test_passes(slip):
     def make() -> DualTaxiParallelEnv:
         return DualTaxiParallelEnv(map=["+---+", "|A: |", "| :B|", "+---+"], slip=slip)
 
@@ -102,7 +102,7 @@ def test_the_environment_needs_none_of_the_optional_packages():
     assert (done.stdout.strip(), done.stderr) == ("3", "")
 
 
-def test_without_pettingzoo_the_error_says_how_to_get_it():
+def test_without_pettingzoo_the_error_names_the_extra():
     done = run("import sys; sys.modules['pettingzoo'] = None\nimport dualtaxi.parallel")
     assert done.returncode == 1
     assert "pip install 'pettingzoo>=1.25'" in done.stderr

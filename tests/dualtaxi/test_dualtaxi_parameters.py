@@ -71,7 +71,7 @@ def test_a_reward_changes_where_it_is_paid_and_nowhere_else(name):
         assert np.array_equal(getattr(env.transitions, part), getattr(PLAIN.transitions, part))
 
 
-def test_a_wrong_stop_is_worth_a_step_unless_told_otherwise():
+def test_a_wrong_stop_costs_a_step_by_default():
     for rewards, worth in (({}, -2), ({"step": -3}, -3), ({"step": -3, "wrong_drop_off": -50}, -50)):
         env = DualTaxiEnv(competitive=True, rewards=rewards)
         wrong_stop = has_event(env, "taxi_1.wrong_stop")

@@ -82,7 +82,7 @@ def test_letters_say_all_that_colours_say(in_letters):
         ((0, 2), 1, ":G*  p|", "arrived"),
     ],
 )
-def test_letters_tell_where_the_passenger_is(in_letters, taxi_1, passenger, cell, words):
+def test_letters_show_where_the_passenger_is(in_letters, taxi_1, passenger, cell, words):
     text = show(TEXT, TEXT.encode(taxi_1, (3, 2), passenger, 1))
     assert cell.strip("|:") in text
     assert f"passenger: {words}, destination: G" in text

@@ -126,7 +126,7 @@ def test_a_taxi_pays_less_while_the_passenger_rides_in_the_other(play):
     ],
     ids=["both into one cell", "into a taxi at work", "into a taxi at the edge", "into a taxi at pickup"],
 )
-def test_a_collision_undoes_the_step_and_tells_of_nothing_else(play, taxi_1, taxi_2, action_1, action_2):
+def test_a_collision_undoes_the_step_and_is_its_only_event(play, taxi_1, taxi_2, action_1, action_2):
     result = play(taxi_1, taxi_2, action_1, action_2)
     assert result == (taxi_1, taxi_2, R, (-15, -15), False, {"collision"})
 

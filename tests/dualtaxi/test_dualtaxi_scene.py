@@ -54,7 +54,7 @@ def test_landmarks_of_other_names_have_colours_of_their_own():
 
 
 @given(state=st.integers(0, 6143))
-def test_cells_and_carriers_are_where_the_state_says(state):
+def test_cells_and_carriers_match_the_state(state):
     taxi_1, taxi_2, passenger, destination = ENV.decode(state)
     landmarks = [tuple(mark["cell"]) for mark in ENV.scene["landmarks"]]
     rider = passenger - 4 if passenger >= 4 else -1

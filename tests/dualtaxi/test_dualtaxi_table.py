@@ -77,7 +77,7 @@ def test_no_state_with_both_taxis_in_one_cell_is_ever_reached(cooperative):
     assert all(s.taxi_1 != s.taxi_2 for s in map(cooperative.decode, np.flatnonzero(reached).tolist()))
 
 
-def test_p_says_what_the_arrays_say(competitive, cooperative):
+def test_p_agrees_with_the_arrays(competitive, cooperative):
     for env in (competitive, cooperative):
         table = env.transitions
         assert len(env.P) == 6144
@@ -115,7 +115,7 @@ def test_outcomes_are_distinct_sum_to_one_and_are_padded_at_the_end(slip, compet
             assert len({outcome[1:] for outcome in outcomes}) == len(outcomes)
 
 
-def test_p_with_slip_says_what_the_arrays_say():
+def test_p_with_slip_agrees_with_the_arrays():
     env = DualTaxiEnv(map=SMALL, slip=0.3)
     table = env.transitions
     for state, actions in env.P.items():

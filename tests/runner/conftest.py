@@ -33,7 +33,7 @@ def lake(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    """Return Chromium, whose log says what it asked for and what went wrong."""
+    """Return Chromium, whose log holds its requests and errors."""
     from selenium import webdriver
     from selenium.webdriver.chrome.service import Service
 

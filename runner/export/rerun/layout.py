@@ -32,7 +32,7 @@ PLOTS: Final = (
         )
         for metric in METRICS
     ),
-    ("Collisions an episode", ("train/metrics/collisions", "eval/metrics/collisions")),
+    ("Collisions per episode", ("train/metrics/collisions", "eval/metrics/collisions")),
     ("Q-table filled (%)", ("train/metrics/filled_percent",)),
     ("Epsilon, step size", ("train/metrics/epsilon", "train/metrics/step_size")),
     ("Rewards (% of the last steps)", ("train/metrics/reward_percent",)),

@@ -112,7 +112,7 @@ class MetricWriter:
         texts = [
             f"evaluation after {row['episode']:,} episodes: "
             + (f"{row['success_percent']:.1f} % success, " if row["successes"] >= 0 else "")
-            + f"{row['eval_mean_length']:.1f} steps and {row['mean_penalties']:.1f} penalties a trial"
+            + f"{row['eval_mean_length']:.1f} steps and {row['mean_penalties']:.1f} penalties per trial"
             for row in rows
         ]
         columns = rr.TextLog.columns(text=texts, level=["INFO"] * len(texts))

@@ -73,7 +73,7 @@ def test_intervals_hold_what_they_are_of_and_are_the_same_again():
     assert first.pairs[0].iqm.low > 0
 
 
-def test_the_interval_of_the_iqm_covers_as_often_as_it_says():
+def test_the_interval_of_the_iqm_has_its_nominal_coverage():
     rng = np.random.default_rng(1)
     inside = [
         estimate.low <= 0 <= estimate.high
@@ -83,7 +83,7 @@ def test_the_interval_of_the_iqm_covers_as_often_as_it_says():
 
 
 @pytest.mark.parametrize(("seeds", "shift"), [(5, 0.0), (5, 1.5), (10, 0.8)])
-def test_the_interval_of_the_probability_of_improvement_covers_as_often_as_it_says(seeds, shift):
+def test_the_interval_of_the_probability_of_improvement_has_its_nominal_coverage(seeds, shift):
     rng = np.random.default_rng(2)
     true = 0.5 * (1 + math.erf(shift / 2))  # of normal values, P(X + shift > Y)
     estimates = [
@@ -147,7 +147,7 @@ def test_workers_of_one_training_are_one_value_of_their_seed():
     assert "are equal at all 1 seeds" in summary(compared)[0]
 
 
-def test_identical_groups_are_said_to_be_identical():
+def test_identical_groups_are_reported_as_identical():
     def digested(runs):
         return [replace(one, content_digest=f"content{one.seed}") for one in runs]
 
@@ -205,7 +205,7 @@ def test_runs_of_one_configuration_are_one_group_whatever_they_are_called():
     assert [group.label for group in groups] == ["a / b", "a"]
 
 
-def test_a_run_done_twice_counts_once_and_it_is_said():
+def test_a_run_done_twice_counts_once_and_is_reported():
     groups, notes = grouped([run(0, [1, 2], finished=False), run(0, [1, 2]), run(1, [1, 2])])
     assert [r.run_id for r in groups[0].runs] == ["a0", "a1"]
     assert "a0x" in notes[0]
@@ -329,7 +329,7 @@ def test_the_command_prints_text_json_and_markdown(command):
         (["near", "nobody"], "nobody"),
     ],
 )
-def test_what_cannot_be_compared_is_said_and_ends_with_2(command, words, expected):
+def test_what_cannot_be_compared_is_reported_with_exit_code_2(command, words, expected):
     refused = command(*words)
     assert refused.exit_code == 2
     assert expected in refused.stderr
@@ -387,6 +387,6 @@ def test_a_line_does_not_jump_between_runs_that_evaluated_at_other_moments():
     assert curve.median.tolist() == [0, 50, 50, 50, 50, 100]
 
 
-def test_a_legend_says_how_a_run_ended():
+def test_a_legend_shows_how_a_run_ended():
     failed = replace(run(0, [1, 2]), status="failed")
     assert "a0 seed 0, failed" in groups_of([failed])[0].described

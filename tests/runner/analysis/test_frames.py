@@ -127,7 +127,7 @@ def test_only_what_can_happen_is_in_the_table():
     assert (frame["probability"] > 0).all()
 
 
-def test_without_pandas_it_says_which_extra(run, monkeypatch):
+def test_without_pandas_the_error_names_the_extra(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     for make in (frames.evaluations, frames.training, frames.episodes, frames.steps):
         with pytest.raises(MissingExtra, match=r"pip install .*\[frames\]"):

@@ -141,7 +141,7 @@ def test_progress_is_reported(tiny, tmp_path):
     assert seen[-1] == run.summary["episodes"]
 
 
-def test_recordings_go_where_the_variable_says(tiny, tmp_path, monkeypatch):
+def test_the_variable_sets_the_recordings_folder(tiny, tmp_path, monkeypatch):
     monkeypatch.setenv("DUALTAXI_RECORDINGS", str(tmp_path / "there"))
     assert runner.run(tiny).folder.parent == tmp_path / "there"
 

@@ -82,7 +82,7 @@ def test_what_an_environment_does_not_say_is_left_out():
     assert taxi.scene is taxi.scene_cells is taxi.scene_carriers is None
 
 
-def test_dualtaxi_says_who_acts_what_happens_and_where_things_are():
+def test_dualtaxi_declares_agents_events_and_scene():
     mdp = load_mdp(DUALTAXI, {}, "individual")
     assert (mdp.agents, mdp.action_counts) == (("taxi_1", "taxi_2"), (6, 6))
     assert set(mdp.success_events) <= set(mdp.event_names)
@@ -178,7 +178,7 @@ RAISING = {
 
 
 @pytest.mark.parametrize("case", RAISING)
-def test_whatever_a_module_of_ones_own_raises_is_told_with_its_place(case, tmp_path, monkeypatch):
+def test_errors_of_a_user_module_are_reported_with_their_place(case, tmp_path, monkeypatch):
     source, message = RAISING[case]
     (tmp_path / "town.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
@@ -256,13 +256,13 @@ def test_arrays_that_contradict_each_other_are_refused(case, lake):
         ("no agents", r"1 to \d+ agents; found 0\."),
     ],
 )
-def test_it_is_said_what_was_found(case, found, lake):
+def test_errors_name_what_was_found(case, found, lake):
     broken = replace(lake, **CONTRADICTIONS[case](lake))
     with pytest.raises(EnvironmentNotUsable, match=found):
         from_parts(broken.description(), broken.arrays())
 
 
-def test_it_is_said_what_is_wrong_with_a_scene(lake):
+def test_errors_name_what_is_wrong_with_a_scene(lake):
     with pytest.raises(EnvironmentNotUsable, match=r"a scene must have .*; found rows\."):
         from_parts(lake.description() | {"scene": {"rows": 3}}, lake.arrays())
 
@@ -277,7 +277,7 @@ DESCRIBED = sorted(load_mdp("FrozenLake-v1", {}).description())
 
 @settings(deadline=None, max_examples=200)
 @given(name=st.sampled_from(DESCRIBED), value=anything, left_out=st.booleans())
-def test_whatever_a_recording_says_of_its_environment_is_taken_or_refused(name, value, left_out, lake):
+def test_any_environment_metadata_is_accepted_or_refused(name, value, left_out, lake):
     description = json.loads(json.dumps(lake.description()))
     description[name] = value
     if left_out:

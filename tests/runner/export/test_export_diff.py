@@ -67,7 +67,7 @@ def test_a_page_of_runs_that_hardly_have_anything_in_common_is_whole(pictured):
         check_page(page)
 
 
-def test_a_page_of_the_same_run_says_so(pictured):
+def test_a_page_of_the_same_run_is_marked_as_such(pictured):
     _, page = page_of(pictured("taxis"), pictured("taxis"))
     check_page(page)
     assert "The content is the same" in page
@@ -100,7 +100,7 @@ def test_an_existing_page_is_replaced_by_force_only(command, pictured, tmp_path)
 
 
 @pytest.mark.parametrize("command", ["diff", "compare"])
-def test_beside_a_page_stdout_is_json_alone(command, pictured, tmp_path):
+def test_with_a_page_stdout_is_json_alone(command, pictured, tmp_path):
     runs = [pictured("taxi"), pictured("taxi", discount=0.5)]
     page = tmp_path / "page.html"
     words = [command, *(str(run.recording) for run in runs), "--html", str(page), "--json"]

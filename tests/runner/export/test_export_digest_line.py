@@ -11,7 +11,7 @@ from tests.runner.recording.making import LAKE, make_run
 
 
 @pytest.mark.parametrize("status", ["running", "interrupted"])
-def test_a_report_says_why_there_is_no_digest(status, tmp_path):
+def test_a_report_explains_a_missing_digest(status, tmp_path):
     run = make_run(tmp_path / "recordings", LAKE, episodes=200)
     data = run.recording.read_bytes()
     run.recording.write_bytes(data[: len(data) * 2 // 3])

@@ -113,7 +113,7 @@ def test_missing_episodes_are_refused(pictured, tmp_path, case):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_run_without_steps_says_how_to_get_them(pictured, tmp_path):
+def test_without_steps_the_error_names_the_command_that_records_them(pictured, tmp_path):
     run = pictured("lake", recording={"steps": "none"})
     result = gif(run.recording, "-o", tmp_path / "film.gif")
     assert result.exit_code == 2

@@ -71,7 +71,7 @@ def test_observations_and_actions_equal_those_of_the_loop(name, tmp_path, monkey
         assert dataset.recover_environment().spec.id == name
 
 
-def test_images_are_kept_exactly(tmp_path, monkeypatch):
+def test_images_are_exported_exactly(tmp_path, monkeypatch):
     class Camera(Rooms):
         def __init__(self) -> None:
             super().__init__()

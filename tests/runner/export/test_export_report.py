@@ -94,7 +94,7 @@ def test_several_runs_are_one_page_with_a_summary(pictured, tmp_path):
     assert len(outline.ids) == len(set(outline.ids))
 
 
-def test_a_run_without_steps_is_shown_without_replay_and_says_so(pictured, tmp_path):
+def test_a_run_without_steps_is_shown_without_replay_and_with_a_note(pictured, tmp_path):
     run, path = pictured("lake", recording={"steps": "none"}), tmp_path / "r.html"
     result = report(run.recording, "-o", path)
     assert result.exit_code == 0
@@ -198,7 +198,7 @@ def test_the_space_bar_plays_and_pauses(opened):
     assert button.get_attribute("aria-label") == "Play"
 
 
-def test_without_a_scene_state_and_action_are_told(opened):
+def test_without_a_scene_state_and_action_are_shown_as_text(opened):
     driver = opened("corridor")
     slider = driver.find_element(By.CSS_SELECTOR, ".step")
     slider.send_keys(Keys.ARROW_RIGHT)

@@ -56,7 +56,7 @@ def test_every_view_of_the_default_blueprint_is_drawn_without_an_error(pictured)
     views = drawn(path, location.time)
     maps = {f"taxi {i}: max Q, greedy moves" for i in (1, 2)}
     title = f"rivals, seed 1 ({run.run_id})"
-    assert set(views) == PLOTS | maps | {TABLE, title, "Events", "Collisions an episode"}
+    assert set(views) == PLOTS | maps | {TABLE, title, "Events", "Collisions per episode"}
     assert [view.reports for view in views.values()] == [[]] * len(views)
     assert all(view.visible for view in views.values())
 

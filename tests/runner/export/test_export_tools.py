@@ -377,6 +377,6 @@ def test_the_layout_for_foxglove_names_what_a_recording_has(taxis):
         ("mlflow", "mlflow", "mlflow"),
     ],
 )
-def test_a_missing_package_is_told_with_its_extra(export, taxis, monkeypatch, form, package, extra):
+def test_a_missing_package_is_reported_with_its_extra(export, taxis, monkeypatch, form, package, extra):
     monkeypatch.setitem(sys.modules, package, None)
     assert f"[{extra}]" in export(form, taxis.recording, code=2).stderr

@@ -139,7 +139,7 @@ def test_what_it_learned_is_played_again(algorithm, run, tmp_path):
             assert np.array_equal(own[:, i], table["q"].argmax(axis=1)[steps["state"]])
 
 
-def test_another_algorithm_may_go_on_from_its_q_tables(run, tmp_path):
+def test_another_algorithm_can_start_from_its_q_tables(run, tmp_path):
     with open_recording(run.recording) as recording:
         tables = tables_at(recording, run.summary["train_steps"])
     for other, values in ALGORITHMS.items():

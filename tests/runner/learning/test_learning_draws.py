@@ -88,7 +88,7 @@ def test_draws_are_uniform_along_an_episode_and_across_episodes(stream):
             assert abs(ones - len(bits) / 2) < 5 * np.sqrt(len(bits)) / 2, f"bit {bit}"
 
 
-def test_whether_to_explore_tells_nothing_of_where_to():
+def test_whether_to_explore_is_independent_of_the_action_drawn():
     _, floats, small = drawn(np.uint64(1), draws.EXPLORATION, 0, 40_000)
     table = np.histogram2d(floats[:, 1], small, bins=(8, 36), range=((0, 1), (-0.5, 35.5)))[0]
     assert abs(chi_squared(table)) < 5

@@ -61,7 +61,7 @@ def test_steps_after_a_snapshot_give_the_tables_from_it(game):
     assert replayed(config, mdp, 11, after.steps, snapshot).q.tobytes() == learner.tables.q.tobytes()
 
 
-def test_the_greedy_action_and_value_kept_beside_a_table_are_always_its_own():
+def test_the_cached_greedy_action_and_value_always_match_the_table():
     config, mdp = experiment(SMALL, {"mode": "competitive"}, epsilon=0.7, step_size=0.5)
     learner = Learner(config, mdp, 5)
     for step in range(50, 2000, 50):

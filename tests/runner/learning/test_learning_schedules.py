@@ -43,7 +43,7 @@ def test_the_value_is_the_twins(schedule, episode, step):
 
 @settings(deadline=None)
 @given(linear | exponential | piecewise, positions, positions, positions)
-def test_it_counts_only_what_it_is_said_to_count_and_keeps_to_its_floor(schedule, n, other, another):
+def test_it_depends_only_on_its_own_count_and_respects_its_floor(schedule, n, other, another):
     def at(others):
         return value(schedule, *((n, others) if schedule.by == "episode" else (others, n)))
 

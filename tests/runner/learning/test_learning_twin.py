@@ -177,7 +177,7 @@ def test_the_second_table_takes_the_first_action_only_where_it_has_one():
 
 
 @pytest.mark.parametrize("start", ["each", 77, "random"])
-def test_trials_start_where_they_are_told_to(start):
+def test_trials_start_in_the_given_states(start):
     config, mdp = experiment(SMALL, evaluation={"every": 1, "trials": 1, "start": start})
     twin = assert_kernel_is_twin(config, mdp, seed=3, blocks=[1000], trials=30)
     begun = [step.state for step in twin.evaluation.steps if step.t == 0]

@@ -151,7 +151,7 @@ def test_a_tabular_environment_is_attached_and_its_events_are_counted(tmp_path):
     assert int(ends["penalties"].sum()) <= falls
 
 
-def test_scalars_texts_and_arrays_are_kept_with_their_place(tmp_path):
+def test_scalars_texts_and_arrays_are_recorded_with_their_step(tmp_path):
     q = np.arange(6, dtype=np.float32).reshape(2, 3)
     with runner.record(make("FrozenLake-v1"), tmp_path) as env:
         for k, entry in enumerate(play(env, 50)):

@@ -60,7 +60,7 @@ def said(run) -> tuple[str, dict[str, str]]:
 
 
 @pytest.mark.parametrize("made_of", [TAXIS, LAKE, LAKE | {"evaluation": None, "log": None}])
-def test_the_digest_is_what_its_definition_says(made_of, tmp_path):
+def test_the_digest_follows_its_definition(made_of, tmp_path):
     run = make_run(tmp_path, made_of)
     assert said(run) == digest_of(run.recording)
     with open_recording(run.recording) as recording:

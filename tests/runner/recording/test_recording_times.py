@@ -86,7 +86,7 @@ def test_times_do_not_decrease_within_a_topic_and_equal_publish_times(recording)
         assert times == sorted(times), topic
 
 
-def test_text_says_the_same_time_as_its_message(recording):
+def test_the_time_in_a_text_is_that_of_its_message(recording):
     lines = [
         (time, message_class(schema.LOG).FromString(payload))
         for time, payload in recording.messages(schema.LOG_TOPIC)

@@ -65,7 +65,7 @@ def test_a_trial_that_the_environment_cannot_have_is_an_error(taxis, tmp_path):
         exported(recording, tmp_path / "made.rrd")
 
 
-def test_the_command_says_it_and_leaves_no_file(tmp_path):
+def test_the_command_reports_it_and_leaves_no_file(tmp_path):
     run = make_run(tmp_path, TAXIS)
     forged = altered(
         run.recording, tmp_path / "x.mcap", schema.TRAIN_STEP, lambda r: (r["action"].put(9, FAR), r)[1]

@@ -135,7 +135,7 @@ def history_by_hand(recording, visits, state):
     return counts, steps, episodes
 
 
-def test_without_steps_it_is_said_what_is_missing_and_where_tables_are(tmp_path):
+def test_without_steps_the_error_names_where_tables_are(tmp_path):
     settings = ["episodes=20", "recording.steps=none", "snapshots.every=10"]
     done = runner.run("configs/quick.yaml", recordings=tmp_path, overrides=settings)
     with open_recording(done.recording) as recording:

@@ -109,7 +109,7 @@ def test_a_mistake_is_shown_at_its_line_then_a_job_is_submitted_and_watched(page
     assert "180" in text_of(browser, "#status")
 
 
-def test_metrics_are_drawn_and_zoomed_and_the_address_says_so(page):
+def test_metrics_are_drawn_and_zoomed_and_the_address_follows(page):
     browser = page("/runs/first")
     wait(browser, lambda: len(browser.find_elements(By.CSS_SELECTOR, ".uplot canvas")) > 3)
     assert "Every recorded point" in text_of(browser, "[data-message]")
@@ -120,7 +120,7 @@ def test_metrics_are_drawn_and_zoomed_and_the_address_says_so(page):
     assert browser.find_element(By.NAME, "to").get_attribute("value") == "40"
 
 
-def test_the_key_of_a_plot_tells_every_line_apart_and_reads_out_values(page):
+def test_the_legend_of_a_plot_distinguishes_lines_and_shows_values(page):
     browser = page("/compare?run=first&run=second")
     wait(browser, lambda: len(browser.find_elements(By.CSS_SELECTOR, ".uplot canvas")) > 3)
     looks = browser.execute_script(

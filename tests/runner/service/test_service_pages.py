@@ -55,7 +55,7 @@ def test_the_caret_of_a_wrong_filter_stands_under_its_place_in_a_fixed_width(cli
     assert "<pre>  status:finishd\n         ^</pre>" in page
 
 
-def test_the_page_says_when_not_all_evaluations_are_shown(client, monkeypatch):
+def test_the_page_notes_when_not_all_evaluations_are_shown(client, monkeypatch):
     assert "The last" not in page_of(client, "/runs/first/evaluations")
     monkeypatch.setattr("runner.service.pages.run.MAX_EVALUATIONS", 2)
     page = page_of(client, "/runs/first/evaluations")
@@ -99,7 +99,7 @@ def test_missing_pages_are_pages(client):
     assert client.get("/nowhere").json()["error"]["message"]
 
 
-def test_files_are_kept_for_ever_and_compressed(client):
+def test_files_are_cached_for_ever_and_compressed(client):
     address = re.search(r'"(/static/[^"]*style.css)"', page_of(client, "/runs"))[1]
     answer = client.get(address)
     assert "immutable" in answer.headers["cache-control"]

@@ -351,7 +351,7 @@ def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
     assert over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data))).state == "stored"
 
 
-def test_the_disk_reserve_is_kept_for_uploads_of_unknown_size(tmp_path, monkeypatch):
+def test_the_disk_reserve_holds_for_uploads_of_unknown_size(tmp_path, monkeypatch):
     uploads = Uploads(tmp_path / "runs", UploadLimits(spare_bytes=5_000))
     upload, _ = uploads.begin(ANNA, Announcement())
     free = iter((7_000, 7_000, 6_000))
