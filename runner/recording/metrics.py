@@ -111,10 +111,12 @@ METRICS: Final = (
 """The measures of an evaluation, in the order they are shown."""
 
 EXACT_METRICS: Final = (
-    Metric("exact.success_percent", "Start states that succeed, exactly", "percent of start states"),
-    Metric("exact.mean_length", "Length of an episode, exactly", "steps, mean over start states"),
-    Metric("exact.value", "Value of the greedy policy", "discounted, mean"),
-    Metric("exact.to_gain", "To gain by a best response", "discounted, mean", per_agent=True),
+    Metric("exact.success_percent", "Start states that succeed, exactly", "percent of start states", "higher"),
+    Metric(
+        "exact.mean_length", "Length of an episode, exactly", "steps, mean over start states", "lower_to_goal"
+    ),
+    Metric("exact.value", "Value of the greedy policy", "discounted, mean", "higher"),
+    Metric("exact.to_gain", "To gain by a best response", "discounted, mean", "lower", per_agent=True),
 )
 """The measures of a greedy policy that are computed from the environment's transition table."""
 

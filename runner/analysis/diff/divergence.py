@@ -33,7 +33,7 @@ _TRANSITION_FIELDS: Final = (
     *("terminated", "truncated", "agents_terminated", "agents_truncated"),
 )
 """The same of a step in spaces that are not both `Discrete`."""
-_EVALUATION_FIELDS: Final = FIELDS[1:]
+_EVALUATION_FIELDS: Final = FIELDS[1:]  # trials are numbered over all evaluations of a run
 _MAX_NUMBERS: Final = 16
 """Of a longer value the first number that differs is reported."""
 
@@ -135,7 +135,9 @@ def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
         steps = [_trial_steps(one, first, trials) for one, first in ((a, left.start), (b, right.start))]
         if steps[0] is None or steps[1] is None:
             continue
-        found = _divergence("eval", first_difference(steps[0], steps[1], _EVALUATION_FIELDS))
+        found = _divergence(
+            "eval", first_difference(steps[0], steps[1], _EVALUATION_FIELDS), _EVALUATION_FIELDS
+        )
         if found is not None:
             start = right.start if found.a_step is None else left.start
             yield replace(

@@ -236,6 +236,20 @@ def test_moments_of_a_curve():
     assert value(Moment("crossing", level=99.0)) == math.inf
 
 
+@pytest.mark.parametrize(
+    ("metric", "best"),
+    [
+        ("exact.success_percent", 80),
+        ("exact.mean_length", 5),
+        ("exact.value", 80),
+        ("exact.to_gain", 5),
+    ],
+)
+def test_the_best_of_an_exact_measure_is_on_its_better_side(metric, best):
+    series = [run(0, [40, 80, 5, 60], metric=metric, discount=d, name=n) for d, n in ((1, "a"), (0.5, "b"))]
+    assert result(series, Moment("best"), [(metric, "")]).metrics[0].groups[0].median == best
+
+
 def test_a_level_reached_by_some_is_ranked_after_all_numbers():
     series = [run(seed, [0, 10 * seed], discount=1) for seed in range(6)]
     series += [run(seed, [0, 100], name="b") for seed in range(6)]

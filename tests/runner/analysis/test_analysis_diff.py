@@ -409,6 +409,14 @@ def test_an_evaluation_after_a_lost_one_is_compared_with_its_own_tables(lossy, r
     assert cause.rows[0].a == tables_at(damaged, trained)[0][state].tolist()
 
 
+def test_evaluations_of_other_numbers_are_compared_by_trial(record):
+    with open_recording(record()) as a, open_recording(record("evaluation.every=40")) as b:
+        divergence = diff(a, b).evaluation_divergence
+    assert divergence is not None
+    assert divergence.after == 120
+    assert divergence.field not in ("episode", "step")
+
+
 def test_lost_trials_leave_out_their_evaluation_alone(record, tmp_path):
     def change(records):
         records["action"][records["episode"] == 24] ^= 1
