@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,33 @@ class Outcome:
     """The cycles of time-outs, the most frequent first; empty if the environment is not deterministic."""
 
 
+@dataclass(frozen=True)
+class _Chosen:
+    """The outcomes of the action that a policy chooses in each state, [S, K] each."""
+
+    next_state: NDArray[np.int32]
+    probability: NDArray[np.float64]
+    rewards: NDArray[np.float64]
+    """[S, K, L]."""
+    terminated: NDArray[np.bool_]
+    success: NDArray[np.bool_]
+    penalty: NDArray[np.bool_] | NDArray[np.float64]
+    """Whether a step is a penalty; of merged outcomes its probability."""
+
+
+class _AtStarts(NamedTuple):
+    """What episodes from each of N start states come to."""
+
+    success_percent: float
+    """Mean over the start states."""
+    timeout_percent: float
+    totals: NDArray[np.float64]
+    """[N, 2 + L]: length, penalties, and the return of each learner."""
+    values: NDArray[np.float64]
+    """[N, L]: discounted; nan for a discount of 1."""
+    cycles: tuple[Cycle, ...] = ()
+
+
 def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount: float) -> Outcome:
     """Return the exact outcome of a deterministic policy.
 
@@ -63,7 +90,6 @@ def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount
     Raises:
         EnvironmentNotUsable: it has no step limit.
     """
-    _require_step_limit(mdp)
     rows = np.arange(mdp.states)
     chosen = _Chosen(
         mdp.next_state[rows, policy],
@@ -91,7 +117,6 @@ def evaluate_stochastic_policy(
     Raises:
         EnvironmentNotUsable: it has no step limit.
     """
-    _require_step_limit(mdp)
     joint = joint_probabilities(policies)
     if ((joint > 0).sum(axis=1) == 1).all():
         return evaluate_policy(mdp, joint.argmax(axis=1).astype(np.int32), learners, discount)
@@ -111,35 +136,29 @@ def joint_probabilities(policies: Sequence[NDArray[np.float64]]) -> NDArray[np.f
     )
 
 
-def _require_step_limit(mdp: Mdp) -> None:
+def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
+    """Return the outcome of the chosen actions."""
     if not mdp.step_limit:
         raise EnvironmentNotUsable(
             f"{mdp.env_id}: found no step limit, expected one: without it some episodes never end."
         )
-
-
-def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
-    """Return the outcome of the chosen actions."""
     starts = np.flatnonzero(mdp.start > 0)
     weights = mdp.start[starts]
     certain = ((chosen.probability > 0).sum(axis=1) == 1).all()
-    if certain and np.isin(chosen.penalty, (0, 1)).all():  # merged outcomes may be penalties by chance
-        return _deterministic(chosen, starts, weights, mdp.step_limit, discount, bool(mdp.success_mask))
-    return _stochastic(chosen, starts, weights, mdp.step_limit, discount, bool(mdp.success_mask))
-
-
-@dataclass(frozen=True)
-class _Chosen:
-    """The outcomes of the action that a policy chooses in each state, [S, K] each."""
-
-    next_state: NDArray[np.int32]
-    probability: NDArray[np.float64]
-    rewards: NDArray[np.float64]
-    """[S, K, L]."""
-    terminated: NDArray[np.bool_]
-    success: NDArray[np.bool_]
-    penalty: NDArray[np.bool_] | NDArray[np.float64]
-    """Whether a step is a penalty; of merged outcomes its probability."""
+    certain &= np.isin(chosen.penalty, (0, 1)).all()  # merged outcomes may be penalties by chance
+    measure = _deterministic if certain else _stochastic
+    found = measure(chosen, starts, weights, mdp.step_limit, discount)
+    length, penalties, *returns = _means(found.totals, weights)
+    return Outcome(
+        starts=len(starts),
+        success_percent=found.success_percent if mdp.success_mask else math.nan,
+        timeout_percent=found.timeout_percent,
+        mean_length=length,
+        mean_penalties=penalties,
+        mean_returns=tuple(returns),
+        values=_means(found.values, weights),
+        cycles=found.cycles,
+    )
 
 
 def _merged(mdp: Mdp, probability: NDArray[np.float64], learners: int) -> _Chosen:
@@ -177,13 +196,8 @@ def _merged(mdp: Mdp, probability: NDArray[np.float64], learners: int) -> _Chose
 
 
 def _deterministic(
-    chosen: _Chosen,
-    starts: NDArray[np.int64],
-    weights: NDArray[np.float64],
-    limit: int,
-    discount: float,
-    known: bool,
-) -> Outcome:
+    chosen: _Chosen, starts: NDArray[np.int64], weights: NDArray[np.float64], limit: int, discount: float
+) -> _AtStarts:
     only = np.arange(len(chosen.next_state)), chosen.probability.argmax(axis=1)
     chain = Chain(
         chosen.next_state[only].astype(np.int64),
@@ -196,25 +210,33 @@ def _deterministic(
     lengths, returns, counts = kernel.play_all(chain, paths, starts, limit)
     values = np.full_like(chain.rewards, np.nan)
     if discount < 1:
-        kernel.discounted_paths(chain, paths, _nearest_first(paths), discount, values)
+        steps = paths.length + paths.away  # to the end of the episode, or to its cycle
+        order = np.argsort(steps, kind="stable")
+        kernel.discounted_paths(chain, paths, order[steps[order] > 0], discount, values)
     timed_out = (paths.cycle[starts] >= 0) | (paths.length[starts] > limit)
-    return Outcome(
-        starts=len(starts),
-        success_percent=_mean(100.0 * (counts[:, 0] > 0), weights) if known else float("nan"),
+    return _AtStarts(
+        success_percent=_mean(100.0 * (counts[:, 0] > 0), weights),
         timeout_percent=_mean(100.0 * timed_out, weights),
-        mean_length=_mean(lengths, weights),
-        mean_penalties=_mean(counts[:, 1], weights),
-        mean_returns=_means(returns, weights),
-        values=_means(values[starts], weights),
+        totals=np.column_stack([lengths, counts[:, 1], returns]),
+        values=values[starts],
         cycles=_cycles(paths, starts, weights),
     )
 
 
-def _nearest_first(paths: Paths) -> NDArray[np.int64]:
-    """Return the states outside cycles, by the steps to their end or their cycle."""
-    steps = paths.length + paths.away
-    order = np.argsort(steps, kind="stable")
-    return order[steps[order] > 0]
+def _stochastic(
+    chosen: _Chosen, starts: NDArray[np.int64], weights: NDArray[np.float64], limit: int, discount: float
+) -> _AtStarts:
+    p = chosen.probability
+    expected = (p[..., None] * chosen.rewards).sum(axis=1)
+    gains = np.column_stack([np.ones(len(p)), (p * chosen.penalty).sum(axis=1), expected])
+    chances, totals = kernel.expect(chosen.next_state, p, chosen.terminated, chosen.success, gains, limit)
+    values = np.full_like(expected, np.nan)
+    if discount < 1:
+        values[:] = 0.0
+        weight = discount * p * ~chosen.terminated
+        kernel.discounted(chosen.next_state, weight, expected, values, sweep_tolerance(discount))
+    succeeded, ended = _means(chances[starts], weights)
+    return _AtStarts(100 * succeeded, 100 * (1 - ended), totals[starts], values[starts])
 
 
 def _cycles(paths: Paths, starts: NDArray[np.int64], weights: NDArray[np.float64]) -> tuple[Cycle, ...]:
@@ -244,35 +266,3 @@ def _mean(values: NDArray[Any], weights: NDArray[np.float64]) -> float:
 def _means(columns: NDArray[np.float64], weights: NDArray[np.float64]) -> tuple[float, ...]:
     """Return the weighted mean of each column of [N, C]."""
     return tuple(_mean(column, weights) for column in columns.T)
-
-
-def _stochastic(
-    chosen: _Chosen,
-    starts: NDArray[np.int64],
-    weights: NDArray[np.float64],
-    limit: int,
-    discount: float,
-    known: bool,
-) -> Outcome:
-    p = chosen.probability
-    expected = (p[..., None] * chosen.rewards).sum(axis=1)
-    gains = np.column_stack([np.ones(len(p)), (p * chosen.penalty).sum(axis=1), expected])
-    chances, sums = kernel.expect(chosen.next_state, p, chosen.terminated, chosen.success, gains, limit)
-    values = np.full_like(expected, np.nan)
-    if discount < 1:
-        values[:] = 0.0
-        weight = discount * p * ~chosen.terminated
-        tolerance = sweep_tolerance(discount)
-        kernel.discounted(chosen.next_state, weight, expected, values, tolerance)
-    finished, ended = _means(chances[starts], weights)
-    length, penalties, *returns = _means(sums[starts], weights)
-    return Outcome(
-        starts=len(starts),
-        success_percent=100 * finished if known else float("nan"),
-        timeout_percent=100 * (1 - ended),
-        mean_length=length,
-        mean_penalties=penalties,
-        mean_returns=tuple(returns),
-        values=_means(values[starts], weights),
-        cycles=(),
-    )

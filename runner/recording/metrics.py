@@ -111,7 +111,9 @@ METRICS: Final = (
 """The measures of an evaluation, in the order they are shown."""
 
 EXACT_METRICS: Final = (
-    Metric("exact.success_percent", "Start states that succeed, exactly", "percent of start states", "higher"),
+    Metric(
+        "exact.success_percent", "Start states that succeed, exactly", "percent of start states", "higher"
+    ),
     Metric(
         "exact.mean_length", "Length of an episode, exactly", "steps, mean over start states", "lower_to_goal"
     ),
