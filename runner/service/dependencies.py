@@ -16,6 +16,7 @@ from runner.service.jobs.pool import JobPool
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ALWAYS, ResponseCache
 from runner.service.settings import Settings
+from runner.service.uploads import Uploads
 
 
 def _state(name: str) -> Any:
@@ -33,6 +34,7 @@ ProcessesOf = Annotated[ProcessPool, _state("processes")]
 SweepProcesses = Annotated[ProcessPool, _state("sweep_processes")]
 CacheOf = Annotated[ResponseCache, _state("cache")]
 JobsOf = Annotated[JobPool, _state("jobs")]
+UploadsOf = Annotated[Uploads, _state("uploads")]
 RunName = Annotated[
     str,
     Path(

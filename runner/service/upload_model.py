@@ -49,6 +49,10 @@ class Announcement(_Model):
     name: Text = ""
     content_digest: Digest | None = None
 
+    def is_same(self, other: Announcement) -> bool:
+        """Return whether both announce the same bytes."""
+        return (self.digest, self.size) == (other.digest, other.size)
+
 
 class RunDetails(_Model):
     """What `run.json` has of a run and its recording does not."""
@@ -99,3 +103,27 @@ class Upload(_Model):
     def size(self) -> int | None:
         """Its number of bytes when it is complete; None if unknown."""
         return self.completion.size if self.completion else self.announced.size
+
+    @property
+    def is_over(self) -> bool:
+        """Whether its result is final."""
+        return self.state in ("stored", "refused")
+
+    def completed(self, completion: Completion) -> Upload:
+        """Return the upload when all bytes were sent."""
+        return self._with(state="verifying", completion=completion, problem="")
+
+    def stored(self, run_id: str, already: bool) -> Upload:
+        """Return the upload when it is a run."""
+        return self._with(state="stored", run_id=run_id, already=already, problem="")
+
+    def refused(self, problem: str) -> Upload:
+        """Return the upload when it can never be a run."""
+        return self._with(state="refused", problem=problem)
+
+    def returned(self, problem: str) -> Upload:
+        """Return the upload when it is to be completed again: the problem is the server's."""
+        return self._with(state="receiving", completion=None, problem=problem)
+
+    def _with(self, **changes: object) -> Upload:
+        return self.model_copy(update=changes)

@@ -6,7 +6,6 @@ import contextlib
 import os
 import signal
 import threading
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -15,9 +14,10 @@ from filelock import FileLock
 from runner.errors import RunnerError, StorageError
 from runner.recording.labels import labels_from
 from runner.runs.importing import import_recording
+from runner.service.logs import LOG
 from runner.service.processes import PRELOADED
 from runner.service.settings import without_folders
-from runner.service.upload_model import Completion, RunDetails, RunLabels
+from runner.service.upload_model import RunDetails, RunLabels, Upload
 from runner.util.files import hash_of
 from runner.util.processes import CallFailed, ChildProcess, TimedOut, start_method
 
@@ -27,20 +27,6 @@ BYTES_A_SECOND: Final = 2 << 20
 MEMORY_BYTES: Final = 2 << 30
 NICENESS: Final = 5
 _LOCK_FILE: Final = "verifying.lock"
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The result of a verification."""
-
-    run_id: str = ""
-    """The run that it became."""
-    already: bool = False
-    """Whether that run had been there before."""
-    problem: str = ""
-    """Why it is no run; empty if it is."""
-    try_again: bool = False
-    """Whether the problem is the server's, such as a full disk."""
 
 
 class Verifier:
@@ -58,30 +44,36 @@ class Verifier:
             if self._child is not None:
                 self._child.kill()
 
-    def verify(self, body: Path, recordings: Path, completion: Completion) -> Verdict | None:
-        """Verify an uploaded file, and make it a run if it passes; None if `stop` was called meanwhile."""
-        seconds = MAX_SECONDS + completion.size / BYTES_A_SECOND
+    def verify(self, upload: Upload, body: Path, recordings: Path) -> Upload | None:
+        """Return an upload after its verification, see `verify`; None if `stop` was called meanwhile."""
+        seconds = MAX_SECONDS + (upload.size or 0) / BYTES_A_SECOND
         try:
             with ChildProcess(MEMORY_BYTES, start_method(PRELOADED)) as child:
                 with self._lock:
                     self._child = child
                     if self._is_stopping:
                         return None
-                return child.call(verify, seconds, body, recordings, completion)
+                return child.call(verify, seconds, upload, body, recordings)
+        except TimedOut:
+            return upload.refused(
+                f"its verification was stopped after {seconds:,.0f} s, more than any needs."
+            )
         except CallFailed as error:
-            problem = f"its verification failed: {error}"
-            if isinstance(error, TimedOut):
-                problem = f"its verification was stopped after {seconds:,.0f} s, more than any run needs."
-            return None if self._is_stopping else Verdict(problem=problem)
+            return None if self._is_stopping else upload.refused(f"its verification failed: {error}")
         except OSError as error:
-            return Verdict(problem=f"the server has no process for it ({error.strerror}).", try_again=True)
-        finally:
-            with self._lock:
-                self._child = None
+            return upload.returned(f"the server has no process for it ({error.strerror}).")
+        except Exception:  # else it would remain in verification until the server is started again
+            LOG.exception("verification", extra={"upload": upload.upload_id})
+            return upload.returned(
+                "something unexpected went wrong while it was verified; complete it again."
+            )
 
 
-def verify(body: Path, recordings: Path, completion: Completion) -> Verdict:
-    """Verify an uploaded file, and make it a run if it passes; for a process of its own."""
+def verify(upload: Upload, body: Path, recordings: Path) -> Upload:
+    """Return an upload after its verification: stored as a run, refused, or to be completed again.
+
+    For a process of its own.
+    """
     with contextlib.suppress(OSError, AttributeError):  # not on Windows
         os.nice(NICENESS)
         # A signal to stop may go to all processes of the service, which then kills this one itself: its end
@@ -90,20 +82,26 @@ def verify(body: Path, recordings: Path, completion: Completion) -> Verdict:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
     with FileLock(body.with_name(_LOCK_FILE)):  # the verification of a server that was killed may still run
         try:
-            if hash_of(body)[1] != completion.digest:
-                return Verdict(
-                    problem="found another digest than sent: bytes changed on the way; send it again."
+            sent = upload.completion
+            if sent is None or hash_of(body)[1] != sent.digest:
+                return upload.refused(
+                    "found another digest than sent: bytes changed on the way; send it again."
                 )
             details = labels = None  # an exported recording has its own
-            if completion.run != RunDetails():
-                details = completion.run.model_dump(exclude_none=True)
+            if sent.run != RunDetails():
+                details = sent.run.model_dump(exclude_none=True)
                 details["summary"] = {key: details.pop(key) for key in ("seconds", "error") if key in details}
-            if completion.labels != RunLabels():
-                labels = labels_from(completion.labels.model_dump())
+            if sent.labels != RunLabels():
+                labels = labels_from(sent.labels.model_dump())
             imported = import_recording(body, recordings, details, labels)
-            return Verdict(imported.run.run_id, imported.already)
+            return upload.stored(imported.run.run_id, imported.already)
+        except StorageError as error:
+            return upload.returned(_problem(error, body, recordings))
         except RunnerError as error:
-            problem = without_folders(str(error).replace(os.fspath(body), "the upload"), recordings)
-            return Verdict(problem=problem, try_again=isinstance(error, StorageError))
+            return upload.refused(_problem(error, body, recordings))
         except OSError as error:
-            return Verdict(problem=f"the server's disk cannot be used ({error.strerror}).", try_again=True)
+            return upload.returned(f"the server's disk cannot be used ({error.strerror}).")
+
+
+def _problem(error: RunnerError, body: Path, recordings: Path) -> str:
+    return without_folders(str(error).replace(os.fspath(body), "the upload"), recordings)

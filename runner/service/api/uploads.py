@@ -10,10 +10,10 @@ from typing import Annotated, Final
 
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
-from fastapi.concurrency import contextmanager_in_threadpool
 from pydantic import BaseModel
 from starlette.requests import ClientDisconnect
 
+from runner.service.dependencies import UploadsOf
 from runner.service.errors import Refused
 from runner.service.problems import error_docs
 from runner.service.tokens import Token
@@ -56,19 +56,12 @@ class UploadsResponse(BaseModel):
     uploads: list[UploadResponse]
 
 
-def uploads_of(request: Request) -> Uploads:
-    """Return the uploads of the service."""
-    uploads: Uploads = request.app.state.uploads
-    return uploads
-
-
 def owner_of(request: Request) -> str:
     """Return the owner of a request's uploads: the hash of its token, hashed once more, or nothing."""
     token: Token | None = request.state.token
     return hashlib.sha256(b"owner of uploads " + token.sha256.encode()).hexdigest() if token else ""
 
 
-UploadsOf = Annotated[Uploads, Depends(uploads_of)]
 OwnerOf = Annotated[str, Depends(owner_of)]
 UploadId = Annotated[str, Path(pattern="^[0-9a-f]{32}$", description="The id from the first response.")]
 _IN_ORDER: Final = error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
@@ -137,22 +130,25 @@ async def append(
     content_length: Annotated[int | None, Header(ge=0, lt=1 << 62, include_in_schema=False)] = None,
 ) -> UploadResponse:
     """Append bytes; those that were received stay, even if the connection breaks."""
-    writers, collected = request.app.state.writers, bytearray()
-    receiving = uploads.receive(upload_id, owner, upload_offset, content_length)
-    async with contextmanager_in_threadpool(receiving) as write:
-        try:
-            async for data in request.stream():
-                collected += data
-                if len(collected) >= PIECE:
-                    piece, collected = collected, bytearray()
-                    await run_sync(write, piece, limiter=writers)
-        except ClientDisconnect:
-            raise Refused(
-                HTTPStatus.BAD_REQUEST, "the connection was closed; continue from the offset."
-            ) from None
-        finally:
-            if collected:
-                await run_sync(write, collected, limiter=writers)
+    writers, offset, collected = request.app.state.writers, upload_offset, bytearray()
+
+    async def write(data: bytes | bytearray, more: int = 0) -> int:
+        return await run_sync(uploads.append, upload_id, owner, offset, data, more, limiter=writers)
+
+    await write(b"", content_length or 0)  # refused before anything is read
+    try:
+        async for data in request.stream():
+            collected += data
+            if len(collected) >= PIECE:
+                piece, collected = collected, bytearray()
+                offset = await write(piece)
+    except ClientDisconnect:
+        raise Refused(
+            HTTPStatus.BAD_REQUEST, "the connection was closed; continue from the offset."
+        ) from None
+    finally:
+        if collected:
+            await write(collected)
     return await run_sync(_response, uploads, uploads.get(upload_id, owner), owner, limiter=writers)
 
 
@@ -166,11 +162,9 @@ async def complete(
     uploads: UploadsOf, owner: OwnerOf, upload_id: UploadId, completion: Completion, request: Request
 ) -> UploadResponse:
     """Sync an upload to disk, and queue it for verification, which makes it a run."""
-
-    def work() -> UploadResponse:
-        return _response(uploads, uploads.complete(upload_id, owner, completion), owner)
-
-    return await run_sync(work, limiter=request.app.state.writers)
+    writers = request.app.state.writers
+    upload = await run_sync(uploads.complete, upload_id, owner, completion, limiter=writers)
+    return await run_sync(_response, uploads, upload, owner, limiter=writers)
 
 
 @router.delete(

@@ -14,8 +14,8 @@ from fastapi.responses import RedirectResponse
 from runner.export.reports.rendering import View
 from runner.service.addresses import Paging
 from runner.service.api.jobs import JobResponse, Number, job_response
-from runner.service.api.uploads import OwnerOf, UploadsOf, list_uploads
-from runner.service.dependencies import JobsOf
+from runner.service.api.uploads import OwnerOf, list_uploads
+from runner.service.dependencies import JobsOf, UploadsOf
 from runner.service.pages.rendering import page
 
 if TYPE_CHECKING:

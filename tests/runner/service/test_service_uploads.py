@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
@@ -56,8 +55,7 @@ def announced(data: bytes, **more) -> Announcement:
 def send(uploads, data, owner=ANNA, whole=None, **details):
     """Upload bytes in one go, and return the upload when its verification is over."""
     upload, _ = uploads.begin(owner, announced(data))
-    with uploads.receive(upload.upload_id, owner, 0, len(data)) as write:
-        write(data)
+    uploads.append(upload.upload_id, owner, 0, data)
     return over(uploads, uploads.complete(upload.upload_id, owner, whole or completion(data, **details)))
 
 
@@ -77,8 +75,7 @@ def test_a_recording_becomes_its_run(uploads, taxis, tmp_path):
     assert new
     for offset in range(0, len(data), 10_000):
         piece = data[offset : offset + 10_000]
-        with uploads.receive(upload.upload_id, ANNA, offset, len(piece)) as write:
-            write(piece)
+        assert uploads.append(upload.upload_id, ANNA, offset, piece) == offset + len(piece)
     assert uploads.offset(upload) == len(data)
     assert list_runs(tmp_path / "runs") == []
     seconds = taxis.summary["seconds"]
@@ -127,20 +124,14 @@ def test_received_bytes_outlive_the_server(lake, tmp_path):
     data = lake.recording.read_bytes()
     first = Uploads(tmp_path / "runs")
     upload, _ = first.begin(ANNA, announced(data))
-    with (
-        contextlib.suppress(ConnectionError),
-        first.receive(upload.upload_id, ANNA, 0, len(data)) as write,
-    ):
-        write(data[:5_000])
-        raise ConnectionError
+    first.append(upload.upload_id, ANNA, 0, data[:5_000], len(data) - 5_000)
     with pytest.raises(RunnerError, match="is served by another process already"):
         Uploads(tmp_path / "runs")
     first.close()
     second = Uploads(tmp_path / "runs")
     known, new = second.begin(ANNA, announced(data))
     assert (known, new, second.offset(known)) == (upload, False, 5_000)
-    with second.receive(upload.upload_id, ANNA, 5_000, len(data) - 5_000) as write:
-        write(data[5_000:])
+    second.append(upload.upload_id, ANNA, 5_000, data[5_000:])
     second._verifier.stop()  # killed while it verifies
     second.complete(upload.upload_id, ANNA, completion(data))
     second.close()
@@ -194,8 +185,7 @@ def test_an_unsound_recording_is_refused_and_leaves_nothing(uploads, lake, tmp_p
 def test_bytes_changed_in_transit_are_refused(uploads, lake):
     data = lake.recording.read_bytes()
     upload, _ = uploads.begin(ANNA, announced(data))
-    with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
-        write(altered(data))
+    uploads.append(upload.upload_id, ANNA, 0, altered(data))
     refused = over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data)))
     assert "another digest" in refused.problem
 
@@ -282,26 +272,20 @@ def test_wrong_requests_of_a_client_are_refused(uploads, lake):
     upload, _ = uploads.begin(ANNA, announced(data))
     with pytest.raises(RunNotFound):
         uploads.get(upload.upload_id, BEN)
-    with pytest.raises(RunNotFound), uploads.receive("../" + upload.upload_id, ANNA, 0, 1):
-        pass
-    with pytest.raises(UploadConflict, match="expected 0"), uploads.receive(upload.upload_id, ANNA, 7, 1):
-        pass
-    with pytest.raises(UploadTooLarge), uploads.receive(upload.upload_id, ANNA, 0, len(data) + 1):
-        pass
-    with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
-        with pytest.raises(UploadTooLarge):
-            write(data + b"more")
-        with pytest.raises(UploadConflict), uploads.receive(upload.upload_id, ANNA, 0, 1):
-            pass
-        with pytest.raises(UploadConflict):
-            uploads.complete(upload.upload_id, ANNA, completion(data))
-        with pytest.raises(UploadConflict):
-            uploads.delete(upload.upload_id, ANNA)
+    with pytest.raises(RunNotFound):
+        uploads.append("../" + upload.upload_id, ANNA, 0, b"1")
+    with pytest.raises(UploadConflict, match="expected 0"):
+        uploads.append(upload.upload_id, ANNA, 7, b"1")
+    with pytest.raises(UploadTooLarge):
+        uploads.append(upload.upload_id, ANNA, 0, b"", len(data) + 1)
+    with pytest.raises(UploadTooLarge):
+        uploads.append(upload.upload_id, ANNA, 0, data + b"more")
     assert uploads.offset(upload) == 0
     with pytest.raises(UploadConflict, match="found 0 bytes"):
         uploads.complete(upload.upload_id, ANNA, completion(data))
-    with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
-        write(data)
+    assert uploads.append(upload.upload_id, ANNA, 0, data) == len(data)
+    with pytest.raises(UploadConflict, match=f"expected {len(data):,}"):
+        uploads.append(upload.upload_id, ANNA, 0, data)
     other = completion(data).model_copy(update={"digest": "0" * 64})
     with pytest.raises(UploadConflict, match="another digest"):
         uploads.complete(upload.upload_id, ANNA, other)
@@ -312,8 +296,8 @@ def test_uploads_beyond_the_limits_are_refused(lake, tmp_path):
     with pytest.raises(UploadTooLarge, match="1,000"):
         uploads.begin(ANNA, Announcement(size=1_001))
     first, _ = uploads.begin(ANNA, Announcement())
-    with uploads.receive(first.upload_id, ANNA, 0, None) as write, pytest.raises(UploadTooLarge):
-        write(bytes(1_001))
+    with pytest.raises(UploadTooLarge):
+        uploads.append(first.upload_id, ANNA, 0, bytes(1_001))
     uploads.begin(ANNA, Announcement())
     with pytest.raises(TooManyUploads):
         uploads.begin(BEN, Announcement())
@@ -339,28 +323,23 @@ def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
         return written
 
     monkeypatch.setattr("runner.service.uploads.os.write", full)
-    with (
-        pytest.raises(StorageError, match="No space left"),
-        uploads.receive(upload.upload_id, ANNA, 0, None) as write,
-    ):
-        write(data)
+    with pytest.raises(StorageError, match="No space left"):
+        uploads.append(upload.upload_id, ANNA, 0, data)
     monkeypatch.undo()
     assert uploads.offset(upload) == 6_000
-    with uploads.receive(upload.upload_id, ANNA, 6_000, None) as write:
-        write(data[6_000:])
+    uploads.append(upload.upload_id, ANNA, 6_000, data[6_000:])
     assert over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data))).state == "stored"
 
 
 def test_the_disk_reserve_holds_for_uploads_of_unknown_size(tmp_path, monkeypatch):
     uploads = Uploads(tmp_path / "runs", UploadLimits(spare_bytes=5_000))
     upload, _ = uploads.begin(ANNA, Announcement())
-    free = iter((7_000, 7_000, 6_000))
+    free = iter((7_000, 6_000))
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr("runner.service.uploads.shutil.disk_usage", lambda _: usage._replace(free=next(free)))
-    with uploads.receive(upload.upload_id, ANNA, 0, None) as write:
-        write(bytes(2_000))
-        with pytest.raises(StorageError, match="room for 1,000 bytes"):
-            write(bytes(2_000))
+    uploads.append(upload.upload_id, ANNA, 0, bytes(2_000))
+    with pytest.raises(StorageError, match="room for 1,000 bytes"):
+        uploads.append(upload.upload_id, ANNA, 2_000, bytes(2_000))
     assert uploads.offset(upload) == 2_000
     uploads.close()
 
@@ -418,7 +397,7 @@ def test_removing_an_upload_does_not_block_others(uploads, lake, monkeypatch):
 def test_an_upload_whose_verification_fails_unexpectedly_can_be_completed_again(uploads, lake, monkeypatch):
     data = lake.recording.read_bytes()
     with monkeypatch.context() as broken:
-        broken.setattr(uploads._verifier, "verify", lambda *_: json.loads("no verdict"))
+        broken.setattr("runner.service.verification.ChildProcess", lambda *_: json.loads("no process"))
         failed = send(uploads, data)
     assert failed.state == "receiving"
     assert failed.problem == "something unexpected went wrong while it was verified; complete it again."
