@@ -20,6 +20,7 @@ from typing import Any, Final
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 
 from runner.config import from_mapping
 from runner.config.job import Job
@@ -312,12 +313,12 @@ def _verify_loop(recording: Recording) -> Verification:
     )
     try:
         _compare_names(recording)
-        digest, counts, off_table = _hash_messages(recording)
-        if off_table:
-            notes.append(
-                f"{off_table:,} steps are no outcome of the environment's table: it has other rules too"
-            )
-        phases = {phase: check_phase(recording, phase, finished) for phase in ("train", "eval")}
+        content = _Content(recording)
+        phases = {phase: check_phase(recording, phase, finished, content.add) for phase in ("train", "eval")}
+        content.add_other_topics()
+        if content.off_table:
+            strange = f"{content.off_table:,} steps"
+            notes.append(f"{strange} are no outcome of the environment's table: it has other rules too")
         for phase, findings in phases.items():
             notes += _unusual(recording, phase, findings)
         steps, last = found.train_steps + found.eval_steps, max(each.last_time for each in phases.values())
@@ -331,6 +332,7 @@ def _verify_loop(recording: Recording) -> Verification:
     found = replace(found, notes=tuple(notes))
     if not finished:
         return found
+    digest, counts = content.digest, content.counts
     expected = {
         "topic_digests": digest.topics(),
         "messages": {name: count for name, count in counts.items() if count},
@@ -344,32 +346,32 @@ def _verify_loop(recording: Recording) -> Verification:
     return _compare_result(found, recording, expected)
 
 
-def _hash_messages(recording: Recording) -> tuple[ContentHash, dict[str, int], int]:
-    """Return digest and number of the messages by topic, and how many steps are not in the outcome table.
+class _Content:
+    """Digest and number of the messages of a loop's recording, and its steps outside the outcome table."""
 
-    Raises:
-        Inconsistent: the messages of a topic are not numbered consecutively.
-    """
-    digest, counts, off_table = ContentHash(), dict.fromkeys((topic.name for topic in recording.topics), 0), 0
-    for topic in recording.topics:
-        if topic not in recording.dtypes:
-            for time, payload in recording.messages(topic):
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self.digest = ContentHash()
+        self.counts = {topic.name: 0 for topic in recording.topics}
+        self.off_table = 0
+
+    def add(self, topic: schema.Topic, block: NDArray[np.void]) -> None:
+        """Add messages of a fixed-width topic."""
+        self.digest.update(topic, np.ascontiguousarray(block).view(np.uint8).data)
+        self.counts[topic.name] += len(block)
+        if topic.message is schema.STEP and self._recording.tabular:
+            outcomes = self._recording.mdp.outcomes_to(block["state"], block["action"], block["next_state"])
+            self.off_table += int(np.count_nonzero(~outcomes.any(axis=1)))
+
+    def add_other_topics(self) -> None:
+        """Add all messages of the topics of varying size."""
+        for topic in self._recording.topics:
+            if topic in self._recording.dtypes:
+                continue
+            for time, payload in self._recording.messages(topic):
                 if topic.digested:
-                    digest.update(topic, message_record(topic, time, payload))
-                counts[topic.name] += 1
-            continue
-        name, expected = schema.NUMBERED_BY[topic.message], 0
-        for block in recording.blocks(topic):
-            digest.update(topic, np.ascontiguousarray(block).view(np.uint8).data)
-            if (wrong := np.flatnonzero(block[name] != expected + np.arange(len(block)))).size:
-                found = block[name][wrong[0]]
-                raise Inconsistent(f"{topic.name}: found {name} {found}, expected {expected + wrong[0]}")
-            if topic.message is schema.STEP and recording.tabular:
-                outcomes = recording.mdp.outcomes_to(block["state"], block["action"], block["next_state"])
-                off_table += int(np.count_nonzero(~outcomes.any(axis=1)))
-            expected += len(block)
-        counts[topic.name] = expected
-    return digest, counts, off_table
+                    self.digest.update(topic, message_record(topic, time, payload))
+                self.counts[topic.name] += 1
 
 
 def _unusual(recording: Recording, phase: str, findings: Findings) -> Iterator[str]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from runner.environments.mdp import step_counts
 from runner.recording import schema
-from runner.recording.loop_blocks import Block, Blocks, Bools, Inconsistent, Ints
+from runner.recording.loop_blocks import Block, Blocks, Bools, Inconsistent, Ints, OnBlock
 from runner.recording.reader import Recording
 from runner.recording.schema import NEVER
 
@@ -58,26 +58,27 @@ class _State:
     """Episodes of all environments that have ended."""
 
 
-def check_phase(recording: Recording, phase: str, complete: bool) -> Findings:
-    """Compare the steps, resets and episodes of a phase with one another.
+def check_phase(recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> Findings:
+    """Compare the steps, resets and episodes of a phase with one another; each block is read once.
 
     Args:
         recording: of a loop.
         phase: `train` or `eval`.
         complete: whether the recording was completed; else it is checked up to its last reset, as later ones
             may not have been written.
+        on_block: called with each block of a fixed-width topic, also of what is not compared.
 
     Raises:
         Inconsistent: something does not follow from the rest.
         RecordingError: the recording cannot be read.
     """
-    return _Phase(recording, phase, complete).check()
+    return _Phase(recording, phase, complete, on_block).check()
 
 
 class _Phase:
     """The check of one phase."""
 
-    def __init__(self, recording: Recording, phase: str, complete: bool) -> None:
+    def __init__(self, recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:
         self._recording, self._phase, self._complete = recording, phase, complete
         self._n = n = recording.environments
         self._learners = len(recording.agents)
@@ -94,7 +95,7 @@ class _Phase:
         self._findings = Findings()
         self._has_states = recording.kind == "step"
         self._start = int(recording.spaces["observation"]["start"]) if self._has_states else 0
-        self._blocks = Blocks(recording, phase, complete)
+        self._blocks = Blocks(recording, phase, complete, on_block)
 
     def check(self) -> Findings:
         """Check all steps, and what comes after the last."""
@@ -103,6 +104,8 @@ class _Phase:
             self._check_block(block)
         if self._complete:
             self._finish(self._blocks.steps)
+        self._blocks.resets.drain()
+        self._blocks.episodes.drain()
         return self._findings
 
     def _check_times(self, b: Block) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.recording.schema import NEVER
+from runner.recording.schema import NEVER, Topic
 
 _ROWS: Final = 4096
 """Messages of varying size that are compared together."""
@@ -20,6 +20,8 @@ _VALUES: Final = ("action", "observation", "next_observation", "seed", "seeded")
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
+OnBlock = Callable[[Topic, NDArray[np.void]], None]
+"""Called with each block of a fixed-width topic when it is read."""
 
 
 class Inconsistent(Exception):
@@ -73,13 +75,15 @@ class Blocks:
         recording: of a loop.
         phase: `train` or `eval`.
         complete: whether the recording was completed; else the blocks end at its last reset.
+        on_block: called with each block as it was recorded.
     """
 
-    def __init__(self, recording: Recording, phase: str, complete: bool) -> None:
+    def __init__(self, recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:
         self._recording, self._phase, self._complete = recording, phase, complete
         self._n = recording.environments
-        self.resets = Queue(records_of(recording, f"/{phase}/reset"))
-        self.episodes = Queue(records_of(recording, f"/{phase}/episode"))
+        self._steps = records_of(recording, f"/{phase}/step", on_block)
+        self.resets = Queue(records_of(recording, f"/{phase}/reset", on_block))
+        self.episodes = Queue(records_of(recording, f"/{phase}/episode", on_block))
         self.steps = 0
         """Steps in the blocks so far."""
 
@@ -96,7 +100,7 @@ class Blocks:
         """Yield the steps up to number `stop`, as many of each environment in every block."""
         left: NDArray[np.void] | None = None
         done = 0
-        for block in records_of(self._recording, f"/{self._phase}/step"):
+        for block in self._steps:
             rows = block if left is None or not len(left) else np.concatenate([left, block])
             if stop is not None:
                 rows = rows[: max(stop - done, 0)]
@@ -169,6 +173,12 @@ class Queue:
                 break
         return parts
 
+    def drain(self) -> None:
+        """Read all remaining records, and drop them."""
+        self._held = []
+        for _ in self._blocks:
+            pass
+
     def _read(self) -> bool:
         block = next(self._blocks, None)
         if block is not None:
@@ -176,17 +186,26 @@ class Queue:
         return block is not None
 
 
-def records_of(recording: Recording, name: str) -> Iterator[NDArray[np.void]]:
+def records_of(
+    recording: Recording, name: str, on_block: OnBlock = lambda *_: None
+) -> Iterator[NDArray[np.void]]:
     """Yield the records of a topic in blocks; of messages of varying size all but the values of spaces.
 
     Raises:
-        Inconsistent: messages of varying size are misnumbered, or have not one reward for each learner.
+        Inconsistent: messages are not numbered consecutively, or have not one reward for each learner.
     """
     topic = recording.topic(name)
-    if topic in recording.dtypes:
-        yield from recording.blocks(topic)
-        return
     learners, number = len(recording.agents), schema.NUMBERED_BY[topic.message]
+    if topic in recording.dtypes:
+        first = 0
+        for block in recording.blocks(topic):
+            on_block(topic, block)
+            if (wrong := np.flatnonzero(block[number] != first + np.arange(len(block)))).size:
+                found, expected = block[number][wrong[0]], first + wrong[0]
+                raise Inconsistent(f"{name}: found {number} {found}, expected {expected}")
+            yield block
+            first += len(block)
+        return
     kinds = {"rewards": ("f8", (learners,)), "terminated": "?", "truncated": "?"}
     names = [field.name for field in topic.message.fields if field.name not in _VALUES]
     dtype = np.dtype([*((name, kinds.get(name, "i8")) for name in names), ("log_time", "u8")])
