@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
+from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.recording.schema import EPISODE, RESET, STEP, TRANSITION, Field, MessageType, Topic
@@ -45,6 +46,7 @@ HEADER: Final = [
 HEADER_BYTES: Final = np.dtype(HEADER).itemsize
 RECORD_HEAD: Final = struct.Struct("<BQ")
 """The head of any MCAP record: opcode, and the length of its body."""
+MESSAGE: Final = int(Opcode.MESSAGE)
 MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 """`HEADER` for one message: opcode, length, channel, sequence, log time, publish time."""
 
@@ -105,8 +107,8 @@ def blank_records(topic: Topic, sizes: Sizes, n: int) -> NDArray[np.void]:
 def _blank_record(topic: Topic, sizes: Sizes) -> NDArray[np.void]:
     dtype = record_dtype(topic.message, sizes)
     one = np.zeros((), dtype=dtype)
-    one["opcode"] = 5
-    one["record_length"] = dtype.itemsize - 9
+    one["opcode"] = MESSAGE
+    one["record_length"] = dtype.itemsize - RECORD_HEAD.size
     one["channel_id"] = topic.channel
     for field, value in zip(topic.message.fields, _values(topic.message, sizes), strict=True):
         one[f"tag_{field.name}"] = list(_tag(field, value))
@@ -115,8 +117,8 @@ def _blank_record(topic: Topic, sizes: Sizes) -> NDArray[np.void]:
 
 def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:
     """Return the whole message record of one message, logged at a time in nanoseconds."""
-    length = HEADER_BYTES - 9 + len(payload)
-    return MESSAGE_HEAD.pack(5, length, topic.channel, 0, log_time, log_time) + payload
+    length = HEADER_BYTES - RECORD_HEAD.size + len(payload)
+    return MESSAGE_HEAD.pack(MESSAGE, length, topic.channel, 0, log_time, log_time) + payload
 
 
 def block_counts(

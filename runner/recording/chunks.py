@@ -182,7 +182,7 @@ def _refuse_many(body: memoryview, head: ChunkHead, where: str) -> None:
     if len(beginning) < MESSAGE_HEAD.size:
         raise RecordingError(f"{where}: holds no whole message")
     _, length, channel, *_ = MESSAGE_HEAD.unpack(beginning[: MESSAGE_HEAD.size])
-    messages = head.uncompressed_size // (9 + length)
+    messages = head.uncompressed_size // (RECORD_HEAD.size + length)
     if TOPIC_OF.get(channel) in ALL_BLOCK_TOPICS and messages > MAX_CHUNK_STEPS:
         raise RecordingError(f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_STEPS:,} at most")
 

@@ -45,8 +45,10 @@ MAX_RECORD_BYTES: Final = 1 << 16
 _PIECE: Final = 1 << 20
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
 _OFFSET_ENTRY: Final = struct.Struct("<HQ")
-_FOOTER_BYTES: Final = 9 + 20
-_TAIL_BYTES: Final = _FOOTER_BYTES + len(MCAP0_MAGIC)
+FOOTER_HEAD: Final = struct.Struct("<BQQQ")
+"""The part of the footer that its checksum covers: opcode, length, starts of summary and summary offsets."""
+FOOTER_BODY_BYTES: Final = 20
+_TAIL_BYTES: Final = RECORD_HEAD.size + FOOTER_BODY_BYTES + len(MCAP0_MAGIC)
 
 
 class ChunkEntry(NamedTuple):
@@ -90,7 +92,10 @@ class ChunkTable:
         if entry.length > MAX_CHUNK_BYTES or entry.uncompressed_size > MAX_CHUNK_BYTES:
             size = max(entry.length, entry.uncompressed_size)
             raise RecordingError(f"{where} declares {size:,} bytes, expected at most {MAX_CHUNK_BYTES:,}.")
-        if entry.length < 9 + CHUNK_HEAD.size + 8 or entry.uncompressed_size < MESSAGE_HEAD.size:
+        if (
+            entry.length < RECORD_HEAD.size + CHUNK_HEAD.size + 8
+            or entry.uncompressed_size < MESSAGE_HEAD.size
+        ):
             raise RecordingError(f"{where} declares fewer bytes than a chunk with a message has.")
         if len(self) and entry.offset < sum(self[len(self) - 1][:2]):
             raise RecordingError(f"{where} overlaps the one before it in the index.")
@@ -166,12 +171,12 @@ def checksum(stream: BinaryIO, start: int, end: int) -> int:
 
 def _check_beginning(stream: BinaryIO) -> None:
     stream.seek(0)
-    beginning = stream.read(len(MCAP0_MAGIC) + 9)
+    beginning = stream.read(len(MCAP0_MAGIC) + RECORD_HEAD.size)
     if not beginning:
         raise RecordingError("found an empty file, expected a recording.")
     if not beginning.startswith(MCAP0_MAGIC):
         raise RecordingError(f"found {beginning[:8]!r} at its start, expected an MCAP file.")
-    opcode, length = RECORD_HEAD.unpack(beginning[len(MCAP0_MAGIC) :].ljust(9, b"\0"))
+    opcode, length = RECORD_HEAD.unpack(beginning[len(MCAP0_MAGIC) :].ljust(RECORD_HEAD.size, b"\0"))
     header = _parse(Header, stream.read(min(length, 4096)), len(MCAP0_MAGIC))
     if opcode != Opcode.HEADER or header.profile != PROFILE:
         raise RecordingError(
@@ -186,9 +191,10 @@ def _footer(stream: BinaryIO, size: int) -> Footer | None:
         return None
     stream.seek(size - _TAIL_BYTES)
     tail = stream.read(_TAIL_BYTES)
-    if not tail.endswith(MCAP0_MAGIC) or RECORD_HEAD.unpack(tail[:9]) != (Opcode.FOOTER, 20):
+    head, body = tail[: RECORD_HEAD.size], tail[RECORD_HEAD.size :]
+    if not tail.endswith(MCAP0_MAGIC) or RECORD_HEAD.unpack(head) != (Opcode.FOOTER, FOOTER_BODY_BYTES):
         return None
-    return Footer.read(ReadDataStream(BytesIO(tail[9:])))
+    return Footer.read(ReadDataStream(BytesIO(body)))
 
 
 def _from_summary(stream: BinaryIO, footer: Footer, size: int) -> Index:
@@ -196,7 +202,7 @@ def _from_summary(stream: BinaryIO, footer: Footer, size: int) -> Index:
     start, end = footer.summary_start, size - _TAIL_BYTES
     if not len(MCAP0_MAGIC) < start <= footer.summary_offset_start <= end:
         raise RecordingError(f"the footer points to a summary at {start}, outside the file; try `repair`.")
-    fields = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, footer.summary_offset_start)
+    fields = FOOTER_HEAD.pack(Opcode.FOOTER, FOOTER_BODY_BYTES, start, footer.summary_offset_start)
     if zlib.crc32(fields, checksum(stream, start, end)) != footer.summary_crc:
         raise RecordingError(f"the summary at {start} does not match its checksum; try `repair`.")
     index = Index(finished=True, end=start)
@@ -242,16 +248,16 @@ def _note(index: Index, stream: BinaryIO, opcode: int, offset: int, length: int)
     if opcode == Opcode.CHUNK:
         head = stream.read(min(length, CHUNK_HEAD.size)).ljust(CHUNK_HEAD.size, b"\0")
         start, end, unpacked, _, _ = CHUNK_HEAD.unpack(head)
-        index.chunks.append(ChunkEntry(offset, 9 + length, unpacked, start, end, 0))
+        index.chunks.append(ChunkEntry(offset, RECORD_HEAD.size + length, unpacked, start, end, 0))
     elif opcode == Opcode.MESSAGE_INDEX:
         (channel,) = struct.unpack("<H", stream.read(min(length, 2)).ljust(2, b"\0"))
         index.chunks.set_channel(channel)
     elif opcode == Opcode.METADATA:
         name = _name(stream.read(min(length, 4 + MAX_NAME_BYTES)), 0, offset)
-        _put(index.metadata, name, (offset, 9 + length), "metadata")
+        _put(index.metadata, name, (offset, RECORD_HEAD.size + length), "metadata")
     elif opcode == Opcode.ATTACHMENT:
         name = _name(stream.read(min(length, 20 + MAX_NAME_BYTES)), 16, offset)
-        _put(index.attachments, name, (offset, 9 + length), "attachment")
+        _put(index.attachments, name, (offset, RECORD_HEAD.size + length), "attachment")
     elif opcode != Opcode.HEADER:
         _check_length(length, offset)
         _note_topic(index, opcode, offset, stream.read(length))
@@ -275,14 +281,15 @@ def _records(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int,
     """Yield (opcode, offset, body) of the records in a part of the file."""
     at = stream.seek(start)
     while at < end:
-        if at + 9 > end:
+        available = end - at - RECORD_HEAD.size
+        if available < 0:
             raise RecordingError(f"found {end - at} stray bytes at {at}, expected a record.")
-        opcode, length = RECORD_HEAD.unpack(stream.read(9))
-        if length > end - at - 9:
-            raise RecordingError(f"the record at {at} declares {length} bytes, {end - at - 9} are there.")
+        opcode, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
+        if length > available:
+            raise RecordingError(f"the record at {at} declares {length} bytes, {available} are there.")
         _check_length(length, at)
         yield opcode, at, stream.read(length)
-        at += 9 + length
+        at += RECORD_HEAD.size + length
 
 
 def _check_length(length: int, offset: int) -> None:
@@ -294,8 +301,9 @@ def _chunk_entry(body: bytes, offset: int) -> ChunkEntry:
     """Return the entry in a ChunkIndex record: there are thousands, so not by the library's reader."""
     try:
         start, end, chunk_offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(body)
-        channels = [channel for channel, _ in _OFFSET_ENTRY.iter_unpack(body[36 : 36 + map_bytes])]
-        at = 36 + map_bytes + 8
+        map_start, map_end = _CHUNK_INDEX_HEAD.size, _CHUNK_INDEX_HEAD.size + map_bytes
+        channels = [channel for channel, _ in _OFFSET_ENTRY.iter_unpack(body[map_start:map_end])]
+        at = map_end + 8
         (name_length,) = struct.unpack_from("<I", body, at)
         (uncompressed,) = struct.unpack_from("<Q", body, at + 4 + name_length + 8)
     except struct.error as error:
@@ -339,5 +347,5 @@ def _put(known: dict[K, T], key: K, value: T, what: str) -> None:
 
 
 def _within(what: str, offset: int, length: int, end: int) -> None:
-    if offset < len(MCAP0_MAGIC) or length < 9 or offset + length > end:
+    if offset < len(MCAP0_MAGIC) or length < RECORD_HEAD.size or offset + length > end:
         raise RecordingError(f"the index points to {what} of {length} bytes at {offset}, outside the data.")

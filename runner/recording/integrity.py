@@ -178,10 +178,13 @@ def _take_records(stream: BinaryIO, contents: Contents, keep_result: bool, repor
                     continue
                 if name == "config":
                     indexed = asks_for_indexes(entries)
-                _note(contents.metadata, MetadataIndex(offset=at, length=9 + len(body), name=name))
+                _note(
+                    contents.metadata,
+                    MetadataIndex(offset=at, length=RECORD_HEAD.size + len(body), name=name),
+                )
             elif opcode == Opcode.ATTACHMENT:
                 name, media_type, data = attachment_of(body, at)
-                entry = AttachmentIndex(at, 9 + len(body), 0, 0, len(data), name, media_type)
+                entry = AttachmentIndex(at, RECORD_HEAD.size + len(body), 0, 0, len(data), name, media_type)
                 _note(contents.attachments, entry)
             elif opcode == Opcode.CHANNEL:
                 contents.channels.append(struct.unpack_from("<H", body)[0])

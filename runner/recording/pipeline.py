@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.recording.blocks import HEADER_BYTES, MESSAGE_HEAD, RECORD_HEAD, message_record
+from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, message_record
 from runner.recording.chunks import Chunk, encode_chunk
 from runner.recording.digest import ContentHash
 from runner.recording.schema import Topic
@@ -258,7 +258,7 @@ class MessageBatches:
         """Add messages to their topic's batch."""
         pack, channel, head = MESSAGE_HEAD.pack, topic.channel, HEADER_BYTES - RECORD_HEAD.size
         records = [
-            pack(5, head + len(payload), channel, 0, time, time) + payload
+            pack(MESSAGE, head + len(payload), channel, 0, time, time) + payload
             for time, payload in zip(log_times, payloads, strict=True)
         ]
         size = sum(map(len, records))

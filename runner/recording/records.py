@@ -187,7 +187,9 @@ def _places(records: bytes, where: str) -> tuple[int, Times, Times]:
         starts, at = [], 0
         while at + HEADER_BYTES <= len(records):
             starts.append(at)
-            at += RECORD_HEAD.size + max(RECORD_HEAD.unpack_from(records, at)[1], HEADER_BYTES - 9)
+            at += RECORD_HEAD.size + max(
+                RECORD_HEAD.unpack_from(records, at)[1], HEADER_BYTES - RECORD_HEAD.size
+            )
         if at != len(records):
             raise RecordingError(f"{where}: its messages do not fill it")
         heads = b"".join(records[start : start + HEADER_BYTES] for start in starts)

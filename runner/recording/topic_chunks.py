@@ -8,17 +8,15 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, MESSAGE_HEAD
+from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.chunk_cache import RecordStore
 from runner.recording.index import ChunkEntry, ChunkTable, Index
 from runner.recording.schema import ALL_TOPICS, STEP_NANOSECONDS, Topic
 
-_MESSAGE: Final = int(Opcode.MESSAGE)
 _MANY: Final = 32
 """The least number of chunks of one size whose topic is inferred instead of unpacking them."""
 
@@ -196,9 +194,9 @@ class TopicChunks:
                 if at + HEADER_BYTES > len(data):
                     raise self._damaged(k, f"stray bytes at {at}")
                 opcode, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
-                end = at + 9 + length
+                end = at + RECORD_HEAD.size + length
                 whole = at + HEADER_BYTES <= end <= len(data)
-                if opcode != _MESSAGE or not whole or channel != self._topic.channel:
+                if opcode != MESSAGE or not whole or channel != self._topic.channel:
                     raise self._damaged(k, f"no message of {self._topic.name} at {at}")
                 yield log_time, data[at + HEADER_BYTES : end]
                 at = end
@@ -230,7 +228,7 @@ class TopicChunks:
         assert self._dtype is not None
         block = np.frombuffer(data, dtype=self._dtype)
         if (block["channel_id"] != self._topic.channel).any() or (
-            block["record_length"] != self._dtype.itemsize - 9
+            block["record_length"] != self._dtype.itemsize - RECORD_HEAD.size
         ).any():
             raise self._damaged(k, f"other messages than of {self._topic.name}")
         return block

@@ -7,7 +7,6 @@ of a recording consists of them.
 from __future__ import annotations
 
 import os
-import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -36,7 +35,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import StorageError
 from runner.recording.chunks import Chunk
-from runner.recording.index import checksum
+from runner.recording.index import FOOTER_BODY_BYTES, FOOTER_HEAD, checksum
 from runner.recording.messages import file_descriptor_set
 from runner.recording.records import Contents
 from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPICS, Topic
@@ -198,7 +197,9 @@ class RecordingFile:
         summary, offsets = self._summary(summary_start)
         offsets_start = summary_start + len(summary)
         crc = zlib.crc32(summary + offsets)
-        crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, offsets_start), crc)
+        crc = zlib.crc32(
+            FOOTER_HEAD.pack(Opcode.FOOTER, FOOTER_BODY_BYTES, summary_start, offsets_start), crc
+        )
         footer = Footer(summary_start=summary_start, summary_offset_start=offsets_start, summary_crc=crc)
         return b"".join((data_end, summary, offsets, _bytes_of(footer), MCAP0_MAGIC))
 
