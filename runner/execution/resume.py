@@ -38,7 +38,7 @@ from runner.learning.learner import Held, Learner
 from runner.recording import schema
 from runner.recording.integrity import may_be_cut, survey
 from runner.recording.liveness import owner
-from runner.recording.metadata import NEEDED
+from runner.recording.metadata import REQUIRED_RECORDS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Contents
 from runner.recording.reference import Reference
@@ -201,7 +201,7 @@ def _opened(
     path: Path, contents: Contents, job: Job, run: Run, learner: Learner, changes: Differences
 ) -> Iterator[RecordingFile]:
     """Open the file to continue: cut after its undamaged contents, or new if it has no description."""
-    described = bool(contents.chunks) and {entry.name for entry in contents.metadata} >= NEEDED
+    described = bool(contents.chunks) and {entry.name for entry in contents.metadata} >= REQUIRED_RECORDS
     with storage_errors(path):
         if not described:
             path.unlink(missing_ok=True)

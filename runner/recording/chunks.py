@@ -29,7 +29,9 @@ _PLAIN_BYTES: Final = 4 << 20
 """Chunks of up to this size are unpacked without checking their first message."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, size unpacked, its CRC, and the length of the name of the compression."""
-_NAME_BYTES: Final = 4
+_DATA_LENGTH: Final = struct.Struct("<Q")
+_MAX_NAME_BYTES: Final = 4
+"""The length of the longest name of a compression, `zstd`."""
 
 
 @dataclass(frozen=True)
@@ -65,18 +67,9 @@ def encode_chunk(
     name = "" if packing.compression == "none" else packing.compression
     data = _compress(records, packing)
     start, end, size = int(log_times[0]), int(log_times[-1]), len(records)
-    encoded_name = name.encode()
-    body = struct.pack(
-        f"<QQQII{len(encoded_name)}sQ",
-        start,
-        end,
-        size,
-        zlib.crc32(records),
-        len(encoded_name),
-        encoded_name,
-        len(data),
-    )
-    record = b"".join((RECORD_HEAD.pack(Opcode.CHUNK, len(body) + len(data)), body, data))
+    head = CHUNK_HEAD.pack(start, end, size, zlib.crc32(records), len(name)) + name.encode()
+    head += _DATA_LENGTH.pack(len(data))
+    record = b"".join((RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(data)), head, data))
     index = message_index(topic.channel, log_times, offsets) if packing.index == "message" else b""
     return Chunk(record, index, name, len(data), size, start, end, len(log_times))
 
@@ -138,19 +131,20 @@ def chunk_head(body: bytes | memoryview, length: int, where: str) -> ChunkHead:
     """
     try:
         start, end, size, crc, name_length = CHUNK_HEAD.unpack_from(body)
-        at = CHUNK_HEAD.size + min(name_length, _NAME_BYTES)
+        at = CHUNK_HEAD.size + min(name_length, _MAX_NAME_BYTES)
         name = bytes(body[CHUNK_HEAD.size : at])
-        (packed,) = struct.unpack_from("<Q", body, at)
+        (packed,) = _DATA_LENGTH.unpack_from(body, at)
+        data_at = at + _DATA_LENGTH.size
     except struct.error as error:
         raise RecordingError(f"{where}: the record cannot be read") from error
-    if name_length > _NAME_BYTES or name not in (b"zstd", b"lz4", b""):
+    if name_length > _MAX_NAME_BYTES or name not in (b"zstd", b"lz4", b""):
         raise RecordingError(f"{where}: found compression {name!r}, expected zstd, lz4 or none")
-    if packed != length - at - 8 or size > MAX_CHUNK_BYTES:
+    if packed != length - data_at or size > MAX_CHUNK_BYTES:
         raise RecordingError(
             f"{where}: declares {packed:,} bytes packed and {size:,} unpacked, "
-            f"expected {length - at - 8:,} and at most {MAX_CHUNK_BYTES:,}"
+            f"expected {length - data_at:,} and at most {MAX_CHUNK_BYTES:,}"
         )
-    return ChunkHead(start, end, size, crc, name.decode(), at + 8)
+    return ChunkHead(start, end, size, crc, name.decode(), data_at)
 
 
 def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes]:
@@ -162,26 +156,23 @@ def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes
     view = memoryview(body)
     head = chunk_head(view, len(view), where)
     if head.uncompressed_size > _PLAIN_BYTES:
-        _refuse_many(view, head, where)
+        _check_message_count(view, head, where)
     records = decompress(view[head.data_at :], head.compression, head.uncompressed_size, where)
     if zlib.crc32(records) != head.crc:
         raise RecordingError(f"{where}: its content does not match its checksum")
     return head, records
 
 
-def _refuse_many(body: memoryview, head: ChunkHead, where: str) -> None:
-    """Refuse a chunk that holds more messages than any of ours, judged by its first message alone.
+def _check_message_count(body: memoryview, head: ChunkHead, where: str) -> None:
+    """Check that a chunk can hold no more messages than a recorder writes, by its first message alone.
 
     A few kilobytes can unpack to the largest chunk there is; thousands of them would keep a reader busy for
     minutes before their messages were found to make no sense.
 
     Raises:
-        RecordingError: it is one, or holds no message.
+        RecordingError: it declares more, or holds no message.
     """
-    beginning, _ = _unpack(body[head.data_at :], head.compression, MESSAGE_HEAD.size, where)
-    if len(beginning) < MESSAGE_HEAD.size:
-        raise RecordingError(f"{where}: holds no whole message")
-    _, length, channel, *_ = MESSAGE_HEAD.unpack(beginning[: MESSAGE_HEAD.size])
+    length, channel = _first_message(body, head, where)
     messages = head.uncompressed_size // (RECORD_HEAD.size + length)
     if TOPIC_OF.get(channel) in ALL_BLOCK_TOPICS and messages > MAX_CHUNK_STEPS:
         raise RecordingError(f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_STEPS:,} at most")
@@ -194,12 +185,17 @@ def first_channel(body: bytes | memoryview, where: str) -> int:
         RecordingError: it is damaged, or holds no message.
     """
     view = memoryview(body)
-    head = chunk_head(view, len(view), where)
-    data = view[head.data_at :]
-    beginning = _unpack(data, head.compression, MESSAGE_HEAD.size, where)[0][: MESSAGE_HEAD.size]
+    _, channel = _first_message(view, chunk_head(view, len(view), where), where)
+    return channel
+
+
+def _first_message(body: memoryview, head: ChunkHead, where: str) -> tuple[int, int]:
+    """Return the record length and the channel of a chunk's first message."""
+    beginning, _ = _unpack(body[head.data_at :], head.compression, MESSAGE_HEAD.size, where)
     if len(beginning) < MESSAGE_HEAD.size:
         raise RecordingError(f"{where}: holds no whole message")
-    return int(MESSAGE_HEAD.unpack(beginning)[2])
+    _, length, channel, *_ = MESSAGE_HEAD.unpack_from(beginning)
+    return length, channel
 
 
 def decompress(data: bytes | memoryview, compression: str, size: int, where: str) -> bytes:

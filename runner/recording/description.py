@@ -20,7 +20,7 @@ from runner.recording.metadata import (
     lost_ranges,
     spaces_of,
 )
-from runner.recording.run_file import Summary, parse_summary
+from runner.recording.run_file import Summary, parse_result
 from runner.recording.schema import Topic
 
 
@@ -112,7 +112,7 @@ class RunDescription(ABC):
             RecordingError: it has a value that is not possible.
         """
         problems: list[str] = []
-        result = parse_summary(self.raw_result, "", problems)
+        result = parse_result(self.raw_result, problems)
         if problems:
             raise RecordingError(f"{self.path}: its result is damaged: {'; '.join(problems)}.")
         return result

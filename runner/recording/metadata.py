@@ -6,20 +6,16 @@ Anyone may have written a file that is read.
 from __future__ import annotations
 
 import json
-import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from io import BytesIO
 from typing import Any, Final
 
-import numpy as np
-import zstandard
 from numpy.typing import NDArray
 
 from runner.environments.mdp import MAX_AGENTS, MAX_ARRAYS_BYTES, MAX_EVENTS, Mdp, from_parts
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.arrays import pack_array, unpack_array
 from runner.recording.blocks import Sizes, block_counts
 from runner.recording.index import Index
 from runner.recording.records import MAX_METADATA_BYTES
@@ -29,21 +25,11 @@ from runner.recording.spaces import dtype_of, leaves_of
 from runner.recording.writer import RecordingFile, storage_error
 from runner.util.values import is_whole, without_surrogates
 
-NEEDED: Final = frozenset({"run", "config", "provenance"})
+REQUIRED_RECORDS: Final = frozenset({"run", "config", "provenance"})
 """The metadata records without which a recording's messages cannot be interpreted."""
-_RUN: Final = {
-    **dict.fromkeys(("run_id", "name", "job", "created", "agents")),
-    "seed": 2**64 - 1,
-    "learners": MAX_AGENTS,
-    "events": MAX_EVENTS,
-}
-"""The entries that every metadata record `run` has; of a number, the largest possible."""
-_MAX_WINDOW: Final = 1 << 27
-_HEAD_BYTES: Final = 1024
-_HEAD: Final = re.compile(
-    rb"\{'descr': '([<|][biuf][1248])', 'fortran_order': (False|True), "
-    rb"'shape': \(((?:\d{1,10}, ?){0,7}(?:\d{1,10})?)\), \} *\n"
-)
+_RUN_TEXTS: Final = ("run_id", "name", "job", "created", "agents")
+_RUN_COUNTS: Final = {"seed": 2**64 - 1, "learners": MAX_AGENTS, "events": MAX_EVENTS}
+"""The numbers that every metadata record `run` has, and the largest possible value of each."""
 
 Attachments = Mapping[str, tuple[str, bytes]]
 """Name -> media type and content."""
@@ -81,10 +67,10 @@ def run_metadata(
 
 
 def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
-    """Refuse a file that is of another version, or has other channels than its kind of recording.
+    """Check the metadata record `run` of a file, and that it has the channels of its kind of recording.
 
     Raises:
-        RecordingError: it is one.
+        RecordingError: it is of another version, is damaged, or has another channel.
     """
     check_run(run, path)
     topics = {topic.channel: topic.name for topic in schema.KINDS[kind_of(run)]}
@@ -97,10 +83,10 @@ def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
 
 
 def check_run(run: Mapping[str, str], path: str) -> None:
-    """Refuse a metadata record `run` of another version, or whose entries make no sense.
+    """Check that a metadata record `run` is of this version, with all entries and values that are possible.
 
     Raises:
-        RecordingError: an entry is missing, or makes no sense.
+        RecordingError: it is not.
     """
     version = run.get("format_version", "?")
     if version != str(schema.FORMAT_VERSION):
@@ -113,8 +99,10 @@ def check_run(run: Mapping[str, str], path: str) -> None:
         if not is_valid:
             raise RecordingError(f"{path}: is damaged: its run has {name} {run.get(name, '')[:200]!r}.")
 
-    for name, limit in _RUN.items():
-        require(name, bool(run.get(name)) and (not limit or _is_count(run[name], limit)))
+    for name in _RUN_TEXTS:
+        require(name, bool(run.get(name)))
+    for name, limit in _RUN_COUNTS.items():
+        require(name, _is_count(run.get(name, ""), limit))
     require("agents", _are_names(run["agents"], int(run["learners"])))
     if kind_of(run) not in schema.KINDS:
         raise RecordingError(
@@ -179,11 +167,11 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, Any]:
     """Return the JSON object in a text.
 
     Raises:
-        RecordingError: it holds none, or is too long; `what` is named.
+        RecordingError: it holds none, is too long or nested too deeply; the message names `what`.
     """
     try:
         if text is None or len(text) > MAX_METADATA_BYTES:
-            raise ValueError("none, or too long")
+            raise ValueError("it is missing, or too long")
         value = dict(without_surrogates(json.loads(text), text))
         if is_too_deep(value):
             raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
@@ -196,7 +184,7 @@ def lost_ranges(repair: Mapping[str, Any], path: str) -> dict[str, list[list[int
     """Return the messages that a repair could not save: by topic, ranges (first, stop) of their numbers.
 
     Raises:
-        RecordingError: its metadata record does not say it so.
+        RecordingError: the metadata record has no such ranges.
     """
 
     def are_ranges(value: Any) -> bool:
@@ -220,7 +208,7 @@ def environment_attachments(
     """Return the attachments that describe an environment: its description, and its arrays if it has any."""
     text = _indented(json.dumps({**description, "arrays": sorted(arrays)}, sort_keys=True))
     return {"environment.json": ("application/json", text.encode())} | {
-        f"environment/{name}.npy.zst": ("application/zstd", _pack_array(arrays[name]))
+        f"environment/{name}.npy.zst": ("application/zstd", pack_array(arrays[name]))
         for name in sorted(arrays)
     }
 
@@ -229,13 +217,6 @@ def environment_attachments(
 def _indented(text: str) -> str:
     """Return JSON with one value a line; cached, because a process often records one environment again."""
     return json.dumps(json.loads(text), indent=1, sort_keys=True)
-
-
-def _pack_array(array: NDArray[Any]) -> bytes:
-    """Return an array as a `.npy` file, compressed with zstd."""
-    buffer = BytesIO()
-    np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
-    return zstandard.ZstdCompressor(level=9).compress(buffer.getvalue())
 
 
 def environment_description(text: bytes, path: str) -> dict[str, Any]:
@@ -273,44 +254,8 @@ def environment_of(description: Mapping[str, Any], attachment: Callable[[str], b
     for name in description["arrays"]:
         data = attachment(f"environment/{name}.npy.zst")
         budget = MAX_ARRAYS_BYTES - sum(array.nbytes for array in arrays.values())
-        arrays[name] = _unpack_array(data, budget, f"{path}: environment/{name}")
+        arrays[name] = unpack_array(data, budget, f"{path}: environment/{name}")
     return from_parts(description, arrays)
-
-
-def _unpack_array(data: bytes, max_bytes: int, where: str) -> NDArray[Any]:
-    """Return the array in a compressed `.npy` file; never unpickles or takes more memory than it declares.
-
-    Raises:
-        RecordingError: it holds no array, or one of more than `max_bytes`.
-    """
-    try:
-        with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
-            return _read_array(stream, max_bytes, where)
-    except (zstandard.ZstdError, ValueError, TypeError) as error:
-        raise RecordingError(f"{where}: holds no array ({error}).") from error
-
-
-def _read_array(stream: Any, max_bytes: int, where: str) -> NDArray[Any]:
-    """Return the array in a `.npy` file of version 1.0, whose head is text in a fixed form."""
-    beginning = stream.read(10)
-    length = int.from_bytes(beginning[8:], "little")
-    head = _HEAD.fullmatch(stream.read(min(length, _HEAD_BYTES)))
-    if beginning[:8] != b"\x93NUMPY\x01\x00" or head is None:
-        raise RecordingError(f"{where}: found no `.npy` file of numbers, version 1.0.")
-    dtype, shape = np.dtype(head[1].decode()), tuple(int(n) for n in head[3].split(b",") if n.strip())
-    size = math.prod(shape) * dtype.itemsize
-    if size > max_bytes:
-        raise RecordingError(
-            f"{where}: found an array of {size:,} bytes, expected {max_bytes:,} at most: the arrays of an "
-            f"environment may take {MAX_ARRAYS_BYTES:,}."
-        )
-    flat = np.empty(math.prod(shape), dtype)
-    into, filled = flat.view(np.uint8).data, 0
-    while filled < size and (more := stream.readinto(into[filled:])):
-        filled += more
-    if filled != size or stream.read(1):
-        raise RecordingError(f"{where}: found an array of another size than the {size} bytes it declares.")
-    return flat.reshape(shape, order="F" if head[2] == b"True" else "C")
 
 
 # --- the file -----------------------------------------------------------------------------------------

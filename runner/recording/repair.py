@@ -22,7 +22,7 @@ from runner.errors import RecordingError, StorageError
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
 from runner.recording.integrity import check_integrity
-from runner.recording.metadata import NEEDED, check_run, json_object, kind_of, sizes_of
+from runner.recording.metadata import REQUIRED_RECORDS, check_run, json_object, kind_of, sizes_of
 from runner.recording.reader import open_recording
 from runner.recording.records import (
     Report,
@@ -179,7 +179,7 @@ class _Salvage:
         return self._done
 
     def _check_described(self, described: set[str]) -> None:
-        if missing := NEEDED - described:
+        if missing := REQUIRED_RECORDS - described:
             raise RecordingError(
                 f"{self._path}: its metadata {', '.join(sorted(missing))} is damaged or was never written: "
                 "its messages cannot be interpreted. `dualtaxi resume` does the run again."

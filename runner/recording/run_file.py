@@ -137,57 +137,61 @@ class RunFile:
     """The invalid values, a sentence each without its full stop."""
 
 
-def parse_run_file(stated: Mapping[str, Any]) -> RunFile:
+def parse_run_file(record: Mapping[str, Any]) -> RunFile:
     """Return the contents of a `run.json`; invalid values are named in `problems`.
 
     Args:
-        stated: the JSON object; its `run_id` must be one.
+        record: the JSON object; its `run_id` must be valid.
     """
     problems: list[str] = []
-    if is_too_deep(stated):
-        problems.append(f"found values nested more than {MAX_DEPTH} deep")
-        stated = {key: value for key, value in stated.items() if not is_too_deep(value, 1)}
-    known = _fitting(stated, _RUN, "", problems)
-    problems += [f"{key} is missing" for key in _NEEDED if key not in stated]
+    values = _valid(_without_deep_values(record, problems), _RUN, "", problems)
+    problems += [f"{key} is missing" for key in _REQUIRED if key not in record]
     return RunFile(
-        run_id=stated["run_id"],
-        name=known.get("name", stated["run_id"]),
-        seed=known.get("seed"),
-        status=known.get("status", "interrupted"),
-        created=_moment(known["created"]) if "created" in known else None,
-        owner=known.get("owner", {}),
-        config=known.get("config", {}),
-        summary=parse_summary(known.get("summary", {}), "summary.", problems),
-        archive=_archive(known.get("archive") or {}, problems),
-        provenance=known.get("provenance", {}),
-        proof=known.get("proof"),
-        recording=known.get("recording"),
+        run_id=record["run_id"],
+        name=values.get("name", record["run_id"]),
+        seed=values.get("seed"),
+        status=values.get("status", "interrupted"),
+        created=_moment(values["created"]) if "created" in values else None,
+        owner=values.get("owner", {}),
+        config=values.get("config", {}),
+        summary=_parse_summary(values.get("summary", {}), "summary.", problems),
+        archive=_archive(values.get("archive") or {}, problems),
+        provenance=values.get("provenance", {}),
+        proof=values.get("proof"),
+        recording=values.get("recording"),
         problems=tuple(problems),
     )
 
 
-def parse_summary(stated: Mapping[str, Any], where: str, problems: list[str]) -> Summary:
-    """Return a summary, or a recording's result; invalid values are left out.
+def parse_result(record: Mapping[str, Any], problems: list[str]) -> Summary:
+    """Return a recording's result; a line is appended to `problems` for each invalid value."""
+    return _parse_summary(_without_deep_values(record, problems), "", problems)
 
-    Args:
-        stated: the JSON object.
-        where: the prefix of its keys in problems, such as `summary.`.
-        problems: a line is appended for each invalid value.
-    """
-    if not where and is_too_deep(stated):
-        problems.append(f"found values nested more than {MAX_DEPTH} deep")
-        stated = {key: value for key, value in stated.items() if not is_too_deep(value, 1)}
-    known = _fitting(stated, _SUMMARY, where, problems)
-    if isinstance(known.get("last_evaluation"), dict):
-        known["last_evaluation"] = {
-            _RENAMED.get(key, key): value for key, value in known["last_evaluation"].items()
+
+def _parse_summary(record: Mapping[str, Any], prefix: str, problems: list[str]) -> Summary:
+    values = _valid(record, _SUMMARY, prefix, problems)
+    if isinstance(values.get("last_evaluation"), dict):
+        values["last_evaluation"] = {
+            _RENAMED.get(key, key): value for key, value in values["last_evaluation"].items()
         }
-    fields = {key: known[key] for key in _SUMMARY if known.get(key) is not None}
-    for key, record, checks in _RECORDS:
+    fields = {key: values[key] for key in _SUMMARY if values.get(key) is not None}
+    for key, make, checks in _NESTED:
         if key in fields:
-            known[key] = figures = _fitting(fields[key], checks, f"{where}{key}.", problems)
-            fields[key] = record({name: figures.get(name) for name in checks})
-    return Summary(**fields, values_by_key=known)
+            values[key] = figures = _valid(fields[key], checks, f"{prefix}{key}.", problems)
+            fields[key] = make({name: figures.get(name) for name in checks})
+    return Summary(**fields, values_by_key=values)
+
+
+def _without_deep_values(record: Mapping[str, Any], problems: list[str]) -> Mapping[str, Any]:
+    if not is_too_deep(record):
+        return record
+    problems.append(f"found values nested more than {MAX_DEPTH} deep")
+    return {key: value for key, value in record.items() if not is_too_deep(value, 1)}
+
+
+def run_title(name: str, seed: int | None) -> str:
+    """Return a run's name, and its seed if it has one: `patient, seed 3`."""
+    return name if seed is None else f"{name}, seed {seed}"
 
 
 def is_too_deep(value: Any, depth: int = 0) -> bool:
@@ -206,24 +210,24 @@ def is_too_deep(value: Any, depth: int = 0) -> bool:
     return False
 
 
-def _fitting(
-    stated: Mapping[str, Any], checks: Mapping[str, Check], where: str, problems: list[str]
+def _valid(
+    record: Mapping[str, Any], checks: Mapping[str, Check], prefix: str, problems: list[str]
 ) -> dict[str, Any]:
     """Return the valid values, and those without a check; name the others in `problems`."""
-    known = {}
-    for key, value in stated.items():
+    values = {}
+    for key, value in record.items():
         check = checks.get(key)
         if check is None or check.fits(value):
-            known[key] = value
+            values[key] = value
         else:
-            problems.append(f"{where}{key}: found {_quoted(value)}, expected {check.expected}")
-    return known
+            problems.append(f"{prefix}{key}: found {_quoted(value)}, expected {check.expected}")
+    return values
 
 
-def _archive(stated: Mapping[str, Any], problems: list[str]) -> ArchiveReference:
-    known = _fitting(stated, _ARCHIVE, "archive.", problems)
-    done = parse_summary(known.get("done") or {}, "archive.done.", problems)
-    return ArchiveReference(known.get("target", ""), known.get("digest") or "", done)
+def _archive(record: Mapping[str, Any], problems: list[str]) -> ArchiveReference:
+    values = _valid(record, _ARCHIVE, "archive.", problems)
+    done = _parse_summary(values.get("done") or {}, "archive.done.", problems)
+    return ArchiveReference(values.get("target", ""), values.get("digest") or "", done)
 
 
 def _quoted(value: Any) -> str:
@@ -306,7 +310,7 @@ _RECENT: Final = {
     "mean_length": _optional(_LENGTH),
     "mean_return": _optional(_NUMBER),
 }
-_RECORDS: Final = (
+_NESTED: Final = (
     ("last_evaluation", EvaluationMetrics.of, _EVALUATION),
     ("recent_training", lambda figures: RecentTraining(**figures), _RECENT),
 )
@@ -330,7 +334,7 @@ _SUMMARY: Final = {
     "error": _optional(_TEXT),
 }
 _ARCHIVE: Final = {"target": _TEXT, "digest": _optional(_TEXT), "done": _optional(_OBJECT)}
-_NEEDED: Final = ("name", "seed", "status", "created")
+_REQUIRED: Final = ("name", "seed", "status", "created")
 _RUN: Final = {
     "name": Check(
         lambda value: _is_text(value) and 0 < len(value) <= 1000, "a text of 1 to 1,000 characters"
@@ -346,8 +350,3 @@ _RUN: Final = {
     "proof": _optional(_DIGEST),
     "recording": _TEXT,
 }
-
-
-def run_title(name: str, seed: int | None) -> str:
-    """Return a run's name, and its seed if it has one: `patient, seed 3`."""
-    return name if seed is None else f"{name}, seed {seed}"
