@@ -20,7 +20,7 @@ from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_o
 from runner.errors import RecordingError
 from runner.recording.description import RunDescription
 from runner.recording.metadata import check_run, json_object
-from runner.recording.records import UNPACKED_A_BYTE
+from runner.recording.records import MAX_UNPACKED_RATIO
 from runner.recording.schema import Topic
 from runner.util.files import open_regular
 
@@ -186,7 +186,7 @@ class Archive(RunDescription):
         groups = [about.row_group(k) for k in range(about.num_row_groups)]
         if any(group.num_rows > MAX_ROWS_A_GROUP for group in groups):
             raise RecordingError(f"{path}: has a group of more than {MAX_ROWS_A_GROUP:,} rows.")
-        if rows * max(_ROW_BYTES, layout.row_bytes(columns)) > size * UNPACKED_A_BYTE + _UNPACKED_ANYWAY:
+        if rows * max(_ROW_BYTES, layout.row_bytes(columns)) > size * MAX_UNPACKED_RATIO + _UNPACKED_ANYWAY:
             raise RecordingError(f"{path}: {size:,} bytes declare {rows:,} rows; made to exhaust the disk.")
 
 

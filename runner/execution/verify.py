@@ -342,7 +342,7 @@ def _verify_loop(recording: Recording) -> Verification:
         "content_digest": digest.content(),
     }
     if recording.result.rewards_off_table is not None:
-        expected["rewards_off_table"] = sum(findings.unpaid for findings in phases.values())
+        expected["rewards_off_table"] = sum(findings.rewards_off_table for findings in phases.values())
     return _compare_result(found, recording, expected)
 
 
@@ -380,11 +380,12 @@ def _unusual(recording: Recording, phase: str, findings: Findings) -> Iterator[s
     Raises:
         Inconsistent: the environment cannot have done it.
     """
-    if findings.unpaid:
-        where = f"/{phase}/step, step {findings.first_unpaid}: rewards"
+    if findings.rewards_off_table:
+        where = f"/{phase}/step, step {findings.first_off_table}: rewards"
         if recording.result.rewards_off_table == 0:
             raise Inconsistent(f"{where}: found one that the environment's table excludes for this step")
-        yield f"{where}: {findings.unpaid:,} steps have rewards that are not in the environment's table"
+        count = findings.rewards_off_table
+        yield f"{where}: {count:,} steps have rewards that are not in the environment's table"
     if findings.begun_without:
         where = f"/{phase}/step, step {findings.first_without}"
         if findings.begun_by_reset >= findings.begun_without:

@@ -62,13 +62,13 @@ def record_dtype(message: MessageType, sizes: Sizes) -> np.dtype[np.void]:
     Fields named `tag…` hold protobuf's constant bytes (see `blank_records`).
     """
     layout: list[Any] = list(HEADER)
-    for field, value in zip(message.fields, _values(message, sizes), strict=True):
+    for field, value in zip(message.fields, _value_dtypes(message, sizes), strict=True):
         layout.append((f"tag_{field.name}", "u1", (len(_tag(field, value)),)))
         layout.append((field.name, value))
     return np.dtype(layout)
 
 
-def _values(message: MessageType, sizes: Sizes) -> list[np.dtype[Any]]:
+def _value_dtypes(message: MessageType, sizes: Sizes) -> list[np.dtype[Any]]:
     """Return the dtype of each field's value."""
     remaining = iter(sizes)
     values = []
@@ -110,7 +110,7 @@ def _blank_record(topic: Topic, sizes: Sizes) -> NDArray[np.void]:
     one["opcode"] = MESSAGE
     one["record_length"] = dtype.itemsize - RECORD_HEAD.size
     one["channel_id"] = topic.channel
-    for field, value in zip(topic.message.fields, _values(topic.message, sizes), strict=True):
+    for field, value in zip(topic.message.fields, _value_dtypes(topic.message, sizes), strict=True):
         one[f"tag_{field.name}"] = list(_tag(field, value))
     return one
 
@@ -121,7 +121,7 @@ def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:
     return MESSAGE_HEAD.pack(MESSAGE, length, topic.channel, 0, log_time, log_time) + payload
 
 
-def block_counts(
+def topic_sizes(
     topic: Topic,
     learners: int,
     events: int,

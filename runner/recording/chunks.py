@@ -127,7 +127,7 @@ def chunk_head(body: bytes | memoryview, length: int, where: str) -> ChunkHead:
         where: named in errors.
 
     Raises:
-        RecordingError: it contradicts itself, or declares more than any chunk of ours has.
+        RecordingError: it contradicts itself, or declares more than `MAX_CHUNK_BYTES`.
     """
     try:
         start, end, size, crc, name_length = CHUNK_HEAD.unpack_from(body)
@@ -151,7 +151,7 @@ def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes
     """Return the head of a chunk and its message records, after comparing their checksum.
 
     Raises:
-        RecordingError: it is damaged, or larger than any chunk of ours.
+        RecordingError: it is damaged, or larger than any that a recorder writes.
     """
     view = memoryview(body)
     head = chunk_head(view, len(view), where)

@@ -26,9 +26,9 @@ Expected = dict[str, NDArray[Any]]
 class Findings:
     """Facts about a consistent phase."""
 
-    unpaid: int = 0
+    rewards_off_table: int = 0
     """Steps whose reward the environment's table excludes."""
-    first_unpaid: int = 0
+    first_off_table: int = 0
     begun_by_reset: int = 0
     """Episodes after one that terminated or was truncated which began with a reset."""
     begun_without: int = 0
@@ -123,6 +123,7 @@ class _Phase:
         state, never, opening = self._state, b.never, b.opening
         if (wrong := np.flatnonzero(never & ~b.was_reset)).size:
             raise self._wrong(b.number[wrong[0]], "t", "that of a reset alone", "a reset before it")
+        # A step's `t` is the number of steps before it in its episode, of which a reset alone is none.
         counted = np.cumsum(~never)
         before = counted[b.heads] - ~never[b.heads]
         carried = np.where(b.continues, state.length[b.owner], 0)
@@ -130,9 +131,12 @@ class _Phase:
         self._compare(b.number, "t", b.rows["t"], t)
 
         lengths = counted[b.tails] - before + carried
+        # A segment's episode ends by its last step, or by a reset before the next segment; a reset before the
+        # first segment of an environment ends the episode that the block before left open.
         next_reset = np.append(b.was_reset[b.heads[1:]] & ~b.opens[b.heads[1:]], False)
         ended = b.ends[b.tails] | (next_reset & (lengths > 0))
         interrupted = opening & b.was_reset[b.heads] & (state.length[b.owner] > 0)
+        # The number of a segment's episode: that of its environment's first, and the episodes ended since.
         finished = np.cumsum(ended) - ended
         base = np.maximum.accumulate(np.where(opening, np.arange(len(b.heads)), 0))
         episodes = state.episode[b.owner] + finished - finished[base] + interrupted[base]
@@ -144,7 +148,7 @@ class _Phase:
 
         returns, counts = self._returns(b), self._counts(b)
         self._check_episodes(b, lengths, returns, counts, ended, interrupted)
-        final = np.flatnonzero((b.tails + 1) % b.times == 0)
+        final = np.flatnonzero((b.tails + 1) % b.times == 0)  # the last segment of each environment
         closed = ended[final]
         state.episode = episodes[final] + closed
         state.length = np.where(closed, 0, lengths[final])
@@ -229,9 +233,9 @@ class _Phase:
         paid = rows["rewards"][:, 0]
         counts, excluded = step_counts(self._mdp, paid, rows["state"], rows["action"], rows["next_state"])
         if excluded.any():
-            if not self._findings.unpaid:
-                self._findings.first_unpaid = int(b.number[excluded].min())
-            self._findings.unpaid += int(np.count_nonzero(excluded))
+            if not self._findings.rewards_off_table:
+                self._findings.first_off_table = int(b.number[excluded].min())
+            self._findings.rewards_off_table += int(np.count_nonzero(excluded))
         sums: Ints = np.add.reduceat(counts, b.heads, axis=0)
         return sums + np.where(b.continues[:, np.newaxis], self._state.counts[b.owner], 0)
 

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES
-from runner.recording.records import IN_DATA, MAX_NAME_BYTES, MAX_NAMED, record_heads, refuse_exhausting
+from runner.recording.records import IN_DATA, MAX_NAME_BYTES, MAX_NAMED, check_unpacked_size, record_heads
 from runner.recording.schema import ALL_TOPICS, PROFILE, TOPIC_OF
 
 K = TypeVar("K")
@@ -86,7 +86,7 @@ class ChunkTable:
         """Add a chunk after the last one.
 
         Raises:
-            RecordingError: it declares what no chunk of ours does.
+            RecordingError: no recorder writes a chunk of the size, or at the place, that it declares.
         """
         where = f"the chunk at {entry.offset}"
         if entry.length > MAX_CHUNK_BYTES or entry.uncompressed_size > MAX_CHUNK_BYTES:
@@ -100,20 +100,20 @@ class ChunkTable:
         if len(self) and entry.offset < sum(self[len(self) - 1][:2]):
             raise RecordingError(f"{where} overlaps the one before it in the index.")
         if len(self) == MAX_CHUNKS:
-            raise RecordingError(f"has more than {MAX_CHUNKS:,} chunks; too many to be ours.")
+            raise RecordingError(f"has more than {MAX_CHUNKS:,} chunks, the most that a recording may have.")
         self._packed += _ENTRY.pack(*entry)
 
     def set_channel(self, channel: int) -> None:
         """Set the channel of the last chunk's messages.
 
         Raises:
-            RecordingError: it was set before, or is no channel of ours.
+            RecordingError: it was set before, or no recording has such a channel.
         """
         last = self[len(self) - 1]
         if last.channel or channel not in TOPIC_OF:
             raise RecordingError(
                 f"chunk at {last.offset}: found messages of channel {channel}"
-                f"{f' and {last.channel}' if last.channel else ''}, expected those of one of ours."
+                f"{f' and {last.channel}' if last.channel else ''}, expected those of one topic."
             )
         self._packed[-_ENTRY.size :] = _ENTRY.pack(*last._replace(channel=channel))
 
@@ -144,7 +144,7 @@ def read_index(stream: BinaryIO, path: str) -> Index:
     """Return the index of a recording: by its summary if it is finished, else by walking its records.
 
     Raises:
-        RecordingError: it is no recording of ours, or is damaged before its first chunk.
+        RecordingError: it is not a dualtaxi recording, or is damaged before its first chunk.
     """
     size = stream.seek(0, 2)
     try:
@@ -156,7 +156,7 @@ def read_index(stream: BinaryIO, path: str) -> Index:
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
     unpacked = int(index.chunks.columns["uncompressed_size"].sum(dtype=np.uint64)) if index.chunks else 0
-    refuse_exhausting(size, unpacked, path)
+    check_unpacked_size(size, unpacked, path)
     return index
 
 
@@ -294,7 +294,9 @@ def _records(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int,
 
 def _check_length(length: int, offset: int) -> None:
     if length > MAX_RECORD_BYTES:
-        raise RecordingError(f"the record at {offset} declares {length:,} bytes; too large to be ours.")
+        raise RecordingError(
+            f"the record at {offset} declares {length:,} bytes, expected at most {MAX_RECORD_BYTES:,}."
+        )
 
 
 def _chunk_entry(body: bytes, offset: int) -> ChunkEntry:
@@ -310,7 +312,7 @@ def _chunk_entry(body: bytes, offset: int) -> ChunkEntry:
         raise RecordingError(f"the ChunkIndex record at {offset} cannot be read.") from error
     if len(channels) > 1 or channels == [0]:
         raise RecordingError(
-            f"the ChunkIndex record at {offset} names {len(channels)} channels, expected one of ours."
+            f"the ChunkIndex record at {offset} names {len(channels)} channels, expected that of one topic."
         )
     return ChunkEntry(chunk_offset, length, uncompressed, start, end, channels[0] if channels else 0)
 
@@ -340,7 +342,9 @@ def _put(known: dict[K, T], key: K, value: T, what: str) -> None:
     if key in known:
         raise RecordingError(f"has {what} {key!r} twice.")
     if len(known) == (len(ALL_TOPICS) if what == "channel" else MAX_NAMED):
-        raise RecordingError(f"has more than {len(known):,} {what} records; too many to be ours.")
+        raise RecordingError(
+            f"has more than {len(known):,} {what} records, the most that a recording may have."
+        )
     if isinstance(key, str) and len(key) > MAX_NAME_BYTES:
         raise RecordingError(f"has {what} with a name of {len(key):,} letters.")
     known[key] = value

@@ -32,13 +32,13 @@ from runner.recording.records import (
     Report,
     asks_for_indexes,
     attachment_of,
+    check_unpacked_size,
     declared_bytes,
     metadata_of,
     read_chunk,
-    refuse_exhausting,
     walk,
 )
-from runner.recording.writer import RecordingFile, schema_and_channel_bytes
+from runner.recording.writer import RecordingFile, schemas_and_channels
 from runner.util.files import open_regular
 
 N = TypeVar("N", AttachmentIndex, MetadataIndex)
@@ -96,7 +96,7 @@ def survey(path: Path, keep_result: bool = False, report: Report = lambda *_: No
     """
     with _reading(path) as stream:
         contents = Contents(size=stream.seek(0, 2))
-        refuse_exhausting(contents.size, declared_bytes(stream, contents.size, str(path)), str(path))
+        check_unpacked_size(contents.size, declared_bytes(stream, contents.size, str(path)), str(path))
         try:
             _check_beginning(stream)
             _take_records(stream, contents, keep_result, report)
@@ -135,7 +135,7 @@ def _reading(path: Path) -> Iterator[BinaryIO]:
 @cache
 def _beginnings() -> tuple[bytes, ...]:
     """Return what follows the header in recordings of each kind."""
-    return tuple(schema_and_channel_bytes(topics) for topics in schema.KINDS.values())
+    return tuple(b"".join(schemas_and_channels(topics)) for topics in schema.KINDS.values())
 
 
 def _check_beginning(stream: BinaryIO) -> None:
@@ -170,7 +170,7 @@ def _take_records(stream: BinaryIO, contents: Contents, keep_result: bool, repor
                 chunk = _checked_chunk(body, at)
                 if indexed:
                     continue
-                contents.chunks.append(chunk.part)
+                contents.chunks.append(chunk.summary)
                 chunk = None
             elif opcode == Opcode.METADATA:
                 name, entries = metadata_of(body)
@@ -199,7 +199,7 @@ def _take_records(stream: BinaryIO, contents: Contents, keep_result: bool, repor
 def _checked_chunk(body: bytes, at: int) -> ReadChunk:
     """Return a chunk whose times are those of its messages."""
     chunk = read_chunk(body, at)
-    found = chunk.part.index.message_start_time, chunk.part.index.message_end_time
+    found = chunk.summary.index.message_start_time, chunk.summary.index.message_end_time
     expected = int(chunk.times[0]), int(chunk.times[-1])
     if found != expected:
         raise RecordingError(
@@ -210,14 +210,14 @@ def _checked_chunk(body: bytes, at: int) -> ReadChunk:
 
 def _take_index(contents: Contents, chunk: ReadChunk, opcode: int, at: int, body: bytes) -> None:
     """Compare a message index with the chunk before it, and note the chunk."""
-    index = chunk.part.index
+    index = chunk.summary.index
     if opcode != Opcode.MESSAGE_INDEX:
         raise RecordingError(f"chunk at {index.chunk_start_offset}: has no message index")
-    if message_index(chunk.part.channel, chunk.times, chunk.offsets)[RECORD_HEAD.size :] != body:
+    if message_index(chunk.summary.channel, chunk.times, chunk.offsets)[RECORD_HEAD.size :] != body:
         raise RecordingError(f"the message index at {at} does not lead to the chunk's messages")
-    index.message_index_offsets[chunk.part.channel] = at
+    index.message_index_offsets[chunk.summary.channel] = at
     index.message_index_length = RECORD_HEAD.size + len(body)
-    contents.chunks.append(chunk.part)
+    contents.chunks.append(chunk.summary)
 
 
 def _note(entries: list[N], entry: N) -> None:

@@ -28,7 +28,7 @@ def owner() -> dict[str, Any]:
     }
 
 
-def lives(owner: Mapping[str, Any], heartbeat: Path) -> bool:
+def is_alive(owner: Mapping[str, Any], heartbeat: Path) -> bool:
     """Return whether an owner is alive: its process, if it is on this machine; else by its last heartbeat.
 
     Args:
@@ -51,7 +51,9 @@ def is_owned(folder: Path) -> bool:
         return False
     process = facts.get("owner")
     return (
-        facts.get("status") == "running" and isinstance(process, dict) and lives(process, folder / "run.json")
+        facts.get("status") == "running"
+        and isinstance(process, dict)
+        and is_alive(process, folder / "run.json")
     )
 
 

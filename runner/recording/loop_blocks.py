@@ -59,11 +59,16 @@ class Block:
         """Whether a reset came before a step."""
         self.was_reset[self.reset_rows] = True
         self.starts = self.opens | np.where(self.opens, False, np.roll(self.ends, 1)) | self.was_reset
+        """Whether a step is the first of a segment."""
         self.segment = np.cumsum(self.starts) - 1
+        """The segment of each step."""
         self.heads = np.flatnonzero(self.starts)
+        """The first step of each segment; `tails` is the last."""
         self.tails = np.append(self.heads[1:], len(self.rows)) - 1
         self.owner = self.environment[self.heads]
+        """The environment of each segment."""
         self.opening = self.opens[self.heads]
+        """Whether a segment is the first of its environment in the block."""
         self.continues = self.opening & ~self.was_reset[self.heads]
         """Whether a segment continues an episode of the block before."""
 

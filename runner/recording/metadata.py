@@ -16,7 +16,7 @@ from runner.environments.mdp import MAX_AGENTS, MAX_ARRAYS_BYTES, MAX_EVENTS, Md
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.arrays import pack_array, unpack_array
-from runner.recording.blocks import Sizes, block_counts
+from runner.recording.blocks import Sizes, topic_sizes
 from runner.recording.index import Index
 from runner.recording.records import MAX_METADATA_BYTES
 from runner.recording.run_file import MAX_DEPTH, is_too_deep
@@ -157,7 +157,7 @@ def sizes_of(run: Mapping[str, str], path: str) -> dict[Topic, Sizes]:
         if action is None or observation is None:
             raise RecordingError(f"{path}: has a space of variable width, expected fixed ones in its kind.")
     return {
-        topic: block_counts(topic, learners, events, action, observation)
+        topic: topic_sizes(topic, learners, events, action, observation)
         for topic in schema.KINDS[kind]
         if topic in schema.ALL_BLOCK_TOPICS
     }

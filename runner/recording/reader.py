@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
-from runner.recording.chunk_cache import RecordStore
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.description import RunDescription
 from runner.recording.index import read_index
@@ -33,6 +32,7 @@ from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
 from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
 from runner.recording.metadata import check_file, sizes_of
+from runner.recording.record_store import RecordStore
 from runner.recording.run_file import run_title
 from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
@@ -51,7 +51,7 @@ def open_recording(path: str | os.PathLike[str]) -> Recording:
     """Open a recording, finished or not.
 
     Raises:
-        RecordingError: it is missing, no recording of ours, of an unknown version, or damaged.
+        RecordingError: it is missing, not a dualtaxi recording, of an unknown version, or damaged.
     """
     return Recording(Path(path))
 
@@ -145,7 +145,9 @@ class Recording(RunDescription):
             RecordingError: there is none of that name, or it cannot be read.
         """
         if name not in self._index.metadata:
-            raise RecordingError(f"{self.path}: has no metadata {name!r}; it was cut off, or is not ours.")
+            raise RecordingError(
+                f"{self.path}: has no metadata {name!r}; it was cut off, or not written by dualtaxi."
+            )
         return self._store.metadata(name, *self._index.metadata[name])
 
     @property
@@ -165,7 +167,9 @@ class Recording(RunDescription):
             RecordingError: there is none of that name, or it is damaged.
         """
         if name not in self._index.attachments:
-            raise RecordingError(f"{self.path}: has no attachment {name!r}; it was cut off, or is not ours.")
+            raise RecordingError(
+                f"{self.path}: has no attachment {name!r}; it was cut off, or not written by dualtaxi."
+            )
         return self._store.attachment(name, *self._index.attachments[name])[1]
 
     # --- blocks ---------------------------------------------------------------------------------------
@@ -371,7 +375,7 @@ class Recording(RunDescription):
         for time, payload in self.messages(topic, first_chunk):
             try:
                 if len(payload) > max_bytes:
-                    raise RecordingError(f"found {len(payload):,} bytes; too many to be ours.")
+                    raise RecordingError(f"found {len(payload):,} bytes, expected at most {max_bytes:,}.")
                 message = parse(payload)
             except RecordingError as error:
                 raise RecordingError(f"{self.path}: {topic.name} at {time} ns: {error}") from error

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
-from runner.recording.blocks import Sizes, blank_records, block_counts, message_record, record_dtype
+from runner.recording.blocks import Sizes, blank_records, message_record, record_dtype, topic_sizes
 from runner.recording.digest import combine
 from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reference import Reference
@@ -96,7 +96,7 @@ class Recorder:
         self._chunk_steps = packing.chunk_steps
         self._first_records = _FIRST_RECORDS if before is not None else None
         self._reference = reference or Reference()
-        sizes = sizes or {topic: block_counts(topic, learners, events) for topic in schema.BLOCK_TOPICS}
+        sizes = sizes or {topic: topic_sizes(topic, learners, events) for topic in schema.BLOCK_TOPICS}
         self._lanes = {
             topic: self._lane(topic, own, record_steps or topic.message is not schema.STEP)
             for topic, own in sizes.items()
@@ -235,11 +235,11 @@ class Recorder:
         self._pipeline.raise_failure()
         return self._pipeline.hash.topics()
 
-    def totals(self, topics: Mapping[str, str]) -> dict[str, Any]:
-        """Return the totals in a result; `topics` are the hashes that `drain` returned."""
+    def totals(self, topic_digests: Mapping[str, str]) -> dict[str, Any]:
+        """Return the totals in a result; `topic_digests` is what `drain` returned."""
         return {
-            "content_digest": combine(topics),
-            "topic_digests": topics,
+            "content_digest": combine(topic_digests),
+            "topic_digests": topic_digests,
             "train_steps": self.steps["train"],
             "eval_steps": self.steps["eval"],
             "messages": {name: count for name, count in self.counts.items() if count},

@@ -35,9 +35,10 @@ MAX_METADATA_BYTES: Final = 4 << 20
 MAX_NAMED: Final = 4096
 """The most attachments, and the most metadata records; a resume adds one."""
 MAX_NAME_BYTES: Final = 256
-UNPACKED_A_BYTE: Final = 1000
+MAX_UNPACKED_RATIO: Final = 1000
 """How many bytes a byte of the file may declare to hold; files with more are made to exhaust memory."""
-_UNPACKED_ANYWAY: Final = 1 << 30
+_ALWAYS_UNPACKED: Final = 1 << 30
+"""Bytes that a file of any size may declare to hold."""
 UNREADABLE: Final = (struct.error, ValueError, KeyError, McapError)
 """What parsing damaged records raises."""
 IN_DATA: Final = frozenset(
@@ -49,14 +50,13 @@ IN_DATA: Final = frozenset(
 """The kinds of records in the data section; after any other, nothing can be relied on."""
 _CHUNK_TIMES: Final = struct.Struct("<QQ")
 
-Times = NDArray[np.uint64]
 Report = Callable[[int, int], None]
 """Called with the bytes that were read, and the size of the file."""
 
 
 @dataclass(frozen=True)
-class Part:
-    """A good chunk: its index entry, channel and number of messages."""
+class ChunkSummary:
+    """The index entry, channel and number of messages of an undamaged chunk."""
 
     index: ChunkIndex
     channel: int
@@ -64,14 +64,14 @@ class Part:
 
 
 class ReadChunk(NamedTuple):
-    """A good chunk and what it holds."""
+    """An undamaged chunk and its messages."""
 
-    part: Part
+    summary: ChunkSummary
     records: bytes
     """The message records."""
-    times: Times
+    times: NDArray[np.uint64]
     """Log times of the messages, in nanoseconds."""
-    offsets: Times
+    offsets: NDArray[np.uint64]
     """Where each message begins in `records`."""
 
 
@@ -85,7 +85,7 @@ class Contents:
     """Bytes of the file."""
     reason: str = ""
     """Why the survey stopped before the end of the data section; empty if it did not."""
-    chunks: list[Part] = field(default_factory=list)
+    chunks: list[ChunkSummary] = field(default_factory=list)
     attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[MetadataIndex] = field(default_factory=list)
     channels: list[int] = field(default_factory=list)
@@ -136,13 +136,13 @@ def declared_bytes(stream: BinaryIO, size: int, path: str) -> int:
     return declared
 
 
-def refuse_exhausting(size: int, unpacked: int, path: str) -> None:
-    """Refuse a file whose chunks declare to hold far more than those of any recording of its size.
+def check_unpacked_size(size: int, unpacked: int, path: str) -> None:
+    """Check that the chunks of a file do not declare far more bytes than those of any recording of its size.
 
     Raises:
         RecordingError: they do.
     """
-    if unpacked > size * UNPACKED_A_BYTE + _UNPACKED_ANYWAY:
+    if unpacked > size * MAX_UNPACKED_RATIO + _ALWAYS_UNPACKED:
         raise RecordingError(f"{path}: {size:,} bytes declare to hold {unpacked:,}; made to exhaust memory.")
 
 
@@ -154,7 +154,7 @@ def read_chunk(body: bytes, offset: int) -> ReadChunk:
     """
     where = f"chunk at {offset}"
     head, records = unpack_chunk(body, where)
-    channel, times, offsets = _places(records, where)
+    channel, times, offsets = _checked_messages(records, where)
     index = ChunkIndex(
         chunk_length=RECORD_HEAD.size + len(body),
         chunk_start_offset=offset,
@@ -166,16 +166,16 @@ def read_chunk(body: bytes, offset: int) -> ReadChunk:
         message_start_time=head.start_time,
         uncompressed_size=head.uncompressed_size,
     )
-    return ReadChunk(Part(index, channel, len(times)), records, times, offsets)
+    return ReadChunk(ChunkSummary(index, channel, len(times)), records, times, offsets)
 
 
-def _places(records: bytes, where: str) -> tuple[int, Times, Times]:
+def _checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint64], NDArray[np.uint64]]:
     """Return channel, times and offsets of a chunk's messages."""
     if len(records) < HEADER_BYTES:
         raise RecordingError(f"{where}: holds no whole message")
     _, length, channel, *_ = MESSAGE_HEAD.unpack_from(records)
     if channel not in schema.TOPIC_OF:
-        raise RecordingError(f"{where}: holds no messages of ours")
+        raise RecordingError(f"{where}: found messages of channel {channel}, which no recording has")
     size = RECORD_HEAD.size + length
     if schema.TOPIC_OF[channel] in schema.ALL_BLOCK_TOPICS:
         if size < HEADER_BYTES or len(records) % size:
@@ -217,17 +217,17 @@ def copied_chunk(chunk: ReadChunk, body: bytes, indexed: bool) -> Chunk:
         body: its record after the head.
         indexed: whether a message index follows it.
     """
-    part, start, end = chunk.part, int(chunk.times[0]), int(chunk.times[-1])
+    summary, start, end = chunk.summary, int(chunk.times[0]), int(chunk.times[-1])
     body = _CHUNK_TIMES.pack(start, end) + body[_CHUNK_TIMES.size :]  # no checksum covers them
     return Chunk(
         record=RECORD_HEAD.pack(Opcode.CHUNK, len(body)) + body,
-        index=message_index(part.channel, chunk.times, chunk.offsets) if indexed else b"",
-        compression=part.index.compression,
-        compressed_size=part.index.compressed_size,
-        uncompressed_size=part.index.uncompressed_size,
+        index=message_index(summary.channel, chunk.times, chunk.offsets) if indexed else b"",
+        compression=summary.index.compression,
+        compressed_size=summary.index.compressed_size,
+        uncompressed_size=summary.index.uncompressed_size,
         start_time=start,
         end_time=end,
-        messages=part.messages,
+        messages=summary.messages,
     )
 
 
@@ -251,7 +251,7 @@ def metadata_of(body: bytes) -> tuple[str, dict[str, str]]:
     """Return the name and entries of a metadata record.
 
     Raises:
-        RecordingError: it is larger than any of ours.
+        RecordingError: it is larger than `MAX_METADATA_BYTES`.
     """
     if len(body) > MAX_METADATA_BYTES:
         raise RecordingError(f"metadata of {len(body):,} bytes, expected {MAX_METADATA_BYTES:,} at most")

@@ -74,7 +74,7 @@ def repair(path: Path, report: Report = lambda *_: None) -> Repair:
         report: called with the bytes that were read, and the size of the file; it is read up to three times.
 
     Raises:
-        RecordingError: it is no recording of ours, or its description is damaged.
+        RecordingError: it is not a dualtaxi recording, or its description is damaged.
         StorageError: there is no space for the new file, or the folder cannot be written.
     """
     with contextlib.suppress(RecordingError):
@@ -205,7 +205,7 @@ class _Salvage:
     def _take_chunk(self, file: RecordingFile, offset: int, body: bytes) -> None:
         """Copy a good chunk and make its index again; note a hole before it."""
         chunk, where = read_chunk(body, offset), f"{self._path}: chunk at {offset}"
-        topic, count = schema.TOPIC_OF[chunk.part.channel], chunk.part.messages
+        topic, count = schema.TOPIC_OF[chunk.summary.channel], chunk.summary.messages
         if topic not in self._topics:
             raise RecordingError(f"{where}: found messages of another kind of run.")
         first = expected = self._next[topic]

@@ -67,7 +67,7 @@ def rewrite(
                 file.add_attachment(*attachment_of(body, offset))
             elif opcode == Opcode.CHUNK:
                 chunk = read_chunk(body, offset)
-                file.add_chunk(TOPIC_OF[chunk.part.channel], copied_chunk(chunk, body, indexed))
+                file.add_chunk(TOPIC_OF[chunk.summary.channel], copied_chunk(chunk, body, indexed))
         for name, added in (more or {}).items():
             file.add_metadata(name, added)
         file.finish("" if result is None else "result", result)
@@ -129,7 +129,7 @@ def _chunks(path: Path) -> Iterator[tuple[Topic, ReadChunk]]:
     for opcode, offset, body in _whole_records(path):
         if opcode == Opcode.CHUNK:
             chunk = read_chunk(body, offset)
-            yield TOPIC_OF[chunk.part.channel], chunk
+            yield TOPIC_OF[chunk.summary.channel], chunk
 
 
 def _whole_records(path: Path) -> Iterator[tuple[int, int, bytes]]:

@@ -27,9 +27,10 @@ _LIKE_A_CHUNK: Final = re.compile(
 )
 _LIKE_BYTES: Final = 64
 _PIECE: Final = 4 << 20
-_WASTED: Final = 4
+_MAX_WASTED_RATIO: Final = 4
 """How many times the file's size may be unpacked of what only looks like chunks."""
-_WASTED_ANYWAY: Final = 256 << 20
+_ALWAYS_WASTED: Final = 256 << 20
+"""Bytes of this kind that are unpacked of a file of any size."""
 
 
 class DamagedFile:
@@ -47,7 +48,7 @@ class DamagedFile:
         self._stream = stream
         self._path = path
         self.size = stream.seek(0, 2)
-        self._allowance = self.size * _WASTED + _WASTED_ANYWAY
+        self._allowance = self.size * _MAX_WASTED_RATIO + _ALWAYS_WASTED
         self.lost_bytes = 0
         """Bytes that belong to no good record, as far as the file was read."""
         self.torn_chunk: bytes | None = None

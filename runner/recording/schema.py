@@ -290,13 +290,13 @@ LOOP_TOPICS: Final = {
     ),
 }
 """The topics of steps and resets in the recording of a loop, by the kind of its spaces."""
-_LOOP_ANYWAY: Final = (
+_EVERY_LOOP: Final = (
     *(TRAIN_EPISODE, EVAL_EPISODE, TRAIN_INFO, EVAL_INFO),
     *(SCALAR_TOPIC, ARRAY_TOPIC, TRAIN_FRAME, EVAL_FRAME, LOG_TOPIC),
 )
 KINDS: Final = {
     "job": TOPICS,
-    **{kind: (*topics, *_LOOP_ANYWAY) for kind, topics in LOOP_TOPICS.items()},
+    **{kind: (*topics, *_EVERY_LOOP) for kind, topics in LOOP_TOPICS.items()},
 }
 """The topics of each kind of recording, as the metadata record `run` names it."""
 ALL_TOPICS: Final = tuple(

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.chunk_cache import RecordStore
 from runner.recording.index import ChunkEntry, ChunkTable, Index
+from runner.recording.record_store import RecordStore
 from runner.recording.schema import ALL_TOPICS, STEP_NANOSECONDS, Topic
 
 _MANY: Final = 32
@@ -44,7 +44,9 @@ def chunks_by_topic(
         channels = _with_inferred(index, store, dtypes, channels)
     _probe(np.flatnonzero(channels == 0), table, store, channels)
     for k in np.flatnonzero(~np.isin(channels, list(index.channels))).tolist():
-        raise _damaged(path, table[k], f"messages of channel {channels[k]}, expected one of ours")
+        raise _damaged(
+            path, table[k], f"messages of channel {channels[k]}, which the recording does not have"
+        )
     return {topic: np.flatnonzero(channels == topic.channel) for topic in ALL_TOPICS}
 
 

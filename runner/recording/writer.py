@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import BinaryIO, Literal, Self
 
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -41,7 +41,7 @@ from runner.recording.records import Contents
 from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPICS, Topic
 from runner.util.version import __version__
 
-LIBRARY = f"dualtaxi {__version__}"
+_LIBRARY = f"dualtaxi {__version__}"
 
 
 class RecordingFile:
@@ -59,7 +59,11 @@ class RecordingFile:
         """
         self._reset(path, path.open("xb", buffering=0), topics)
         try:
-            self._append(MCAP0_MAGIC + _bytes_of(Header(PROFILE, LIBRARY)) + schema_and_channel_bytes(topics))
+            self._append(
+                b"".join(
+                    (MCAP0_MAGIC, _bytes_of(Header(PROFILE, _LIBRARY)), *schemas_and_channels(tuple(topics)))
+                )
+            )
         except OSError:
             self._stream.close()
             path.unlink(missing_ok=True)
@@ -89,27 +93,27 @@ class RecordingFile:
         Raises:
             OSError: it cannot be written.
         """
-        file = cls.__new__(cls)
-        file._reset(path, path.open("r+b", buffering=0), contents.topics)
+        file = cls._existing(path, "r+b", contents)
         file._stream.truncate(contents.end)
-        file._take_over(contents)
         return file
 
     @classmethod
     def inspect(cls, path: Path, contents: Contents) -> RecordingFile:
         """Open a recording for reading, to compute its `tail`."""
-        file = cls.__new__(cls)
-        file._reset(path, path.open("rb", buffering=0), contents.topics)
-        file._take_over(contents)
-        return file
+        return cls._existing(path, "rb", contents)
 
-    def _take_over(self, contents: Contents) -> None:
-        self._crc = checksum(self._stream, 0, contents.end)
-        self._offset = self._stream.seek(contents.end)
-        self._attachments = list(contents.attachments)
-        self._metadata = list(contents.metadata)
-        for part in contents.chunks:
-            self._note_chunk(part.index, part.channel, part.messages)
+    @classmethod
+    def _existing(cls, path: Path, mode: Literal["rb", "r+b"], contents: Contents) -> RecordingFile:
+        """Open a recording as it was when the last of these records was written."""
+        file = cls.__new__(cls)
+        file._reset(path, path.open(mode, buffering=0), contents.topics)
+        file._crc = checksum(file._stream, 0, contents.end)
+        file._offset = file._stream.seek(contents.end)
+        file._attachments = list(contents.attachments)
+        file._metadata = list(contents.metadata)
+        for chunk in contents.chunks:
+            file._note_chunk(chunk.index, chunk.channel, chunk.messages)
+        return file
 
     @property
     def size(self) -> int:
@@ -224,7 +228,7 @@ class RecordingFile:
 
     def _summary(self, start: int) -> tuple[bytes, bytes]:
         """Return the summary section, which begins at `start`, and the summary offset section."""
-        schemas, channels = _schema_and_channel_bytes(self._topics)
+        schemas, channels = schemas_and_channels(self._topics)
         groups = [
             (Opcode.SCHEMA, schemas),
             (Opcode.CHANNEL, channels),
@@ -270,8 +274,9 @@ def create_recording(path: Path, topics: Sequence[Topic] = TOPICS) -> RecordingF
         ) from error
 
 
-def schemas_and_channels(topics: Sequence[Topic]) -> tuple[list[Schema], list[Channel]]:
-    """Return the schema and channel records of a recording with these topics."""
+@cache
+def schemas_and_channels(topics: tuple[Topic, ...]) -> tuple[bytes, bytes]:
+    """Return the schema and channel records of a recording with these topics, which follow its header."""
     used = {topic.message for topic in topics}
     schemas = [
         Schema(id=number, name=message.full_name, encoding="protobuf", data=file_descriptor_set(message))
@@ -288,7 +293,7 @@ def schemas_and_channels(topics: Sequence[Topic]) -> tuple[list[Schema], list[Ch
         )
         for topic in sorted(topics, key=lambda topic: topic.channel)
     ]
-    return schemas, channels
+    return _bytes_of(*schemas), _bytes_of(*channels)
 
 
 def storage_error(file: RecordingFile, error: OSError) -> StorageError:
@@ -298,17 +303,6 @@ def storage_error(file: RecordingFile, error: OSError) -> StorageError:
         f"{file.path}: writing failed ({reason}) after {file.size:,} bytes. What was written is kept and "
         "can be read; free some disk, or choose another --recordings."
     )
-
-
-@cache
-def _schema_and_channel_bytes(topics: tuple[Topic, ...]) -> tuple[bytes, bytes]:
-    schemas, channels = schemas_and_channels(topics)
-    return _bytes_of(*schemas), _bytes_of(*channels)
-
-
-def schema_and_channel_bytes(topics: Sequence[Topic]) -> bytes:
-    """Return the records after the header of a recording with these topics."""
-    return b"".join(_schema_and_channel_bytes(tuple(topics)))
 
 
 def _bytes_of(*records: McapRecord) -> bytes:

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.recording.labels import Labels, change_labels, read_labels
-from runner.recording.liveness import lives, owner
+from runner.recording.liveness import is_alive, owner
 from runner.recording.run_file import RUN_ID, ArchiveReference, RunFile, Summary, parse_run_file, run_title
 from runner.util.files import read_object, storage_errors, write_object
 from runner.util.values import as_utf8, checked_run_name, is_utf8
@@ -156,7 +156,7 @@ class Run:
         its recording is in an archive alone, and not restored.
         """
         status = self.file.status
-        if status == "running" and lives(self.file.owner, self.folder / RUN_FILE):
+        if status == "running" and is_alive(self.file.owner, self.folder / RUN_FILE):
             return status
         if self.file.problems:
             return "damaged"

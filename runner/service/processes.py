@@ -19,7 +19,7 @@ from multiprocessing import forkserver
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from runner.service.errors import Busy
-from runner.util.processes import CallFailed, ChildProcess, ProcessDied, start_method
+from runner.util.processes import CallFailed, ChildProcess, ProcessDied, process_context
 
 Args = ParamSpec("Args")
 Result = TypeVar("Result")
@@ -51,7 +51,7 @@ class ProcessPool:
 
     def __init__(self, processes: int, seconds: float, memory_bytes: int, keep_seconds: float = 0.0) -> None:
         self._seconds, self._memory_bytes, self._keep_seconds = seconds, memory_bytes, keep_seconds
-        self._context = start_method(PRELOADED)
+        self._context = process_context(PRELOADED)
         self._threads = ThreadPoolExecutor(processes, "processes")
         self._places = threading.Semaphore(processes + MAX_WAITING)
         self._lock = threading.Lock()

@@ -19,7 +19,7 @@ from runner.service.processes import PRELOADED
 from runner.service.settings import without_folders
 from runner.service.upload_model import RunDetails, RunLabels, Upload
 from runner.util.files import hash_of
-from runner.util.processes import CallFailed, ChildProcess, TimedOut, start_method
+from runner.util.processes import CallFailed, ChildProcess, TimedOut, process_context
 
 MAX_SECONDS: Final = 120.0
 BYTES_A_SECOND: Final = 2 << 20
@@ -48,7 +48,7 @@ class Verifier:
         """Return an upload after its verification, see `verify`; None if `stop` was called meanwhile."""
         seconds = MAX_SECONDS + (upload.size or 0) / BYTES_A_SECOND
         try:
-            with ChildProcess(MEMORY_BYTES, start_method(PRELOADED)) as child:
+            with ChildProcess(MEMORY_BYTES, process_context(PRELOADED)) as child:
                 with self._lock:
                     self._child = child
                     if self._is_stopping:

@@ -1,1 +1,1 @@
-"""General helpers that know nothing of runs: values, files, formatting, optional packages, processes."""
+"""What every package may use: values, names, files, formatting, optional packages, child processes."""

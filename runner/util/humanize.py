@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Final
 
 UNKNOWN: Final = "–"
-MOST_LISTED: Final = 6
+_MAX_LISTED: Final = 6
 
 
 def size(count: float) -> str:
@@ -62,6 +62,6 @@ def number(value: float | None, digits: int = 1) -> str:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return a list of names, shortened to the first few: `a, b, c, d, e, f and 3 more`."""
-    more = len(names) - MOST_LISTED
-    return ", ".join(names[:MOST_LISTED]) + (f" and {more:,} more" if more > 0 else "")
+    """Return names as text, shortened to the first few: `a, b, c, d, e, f and 3 more`."""
+    more = len(names) - _MAX_LISTED
+    return ", ".join(names[:_MAX_LISTED]) + (f" and {more:,} more" if more > 0 else "")

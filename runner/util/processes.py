@@ -64,11 +64,11 @@ def _without_main_module() -> Iterator[None]:
             sys.modules["__main__"] = main
 
 
-def start_method(preload: Sequence[str] = ()) -> Any:
-    """Return the context that starts processes: forked from one that has loaded modules, where possible.
+def process_context(preload: Sequence[str] = ()) -> Any:
+    """Return the multiprocessing context that starts processes, from a fork server where there is one.
 
     Args:
-        preload: the modules.
+        preload: modules that the fork server imports once, for all processes.
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
@@ -82,7 +82,7 @@ class ChildProcess:
 
     Args:
         memory_bytes: how much its calls may allocate; not limited on Windows.
-        context: how to start it; by default `start_method()`.
+        context: how to start it; by default `process_context()`.
         on_progress: called with what functions pass to `report_progress`.
 
     Raises:
@@ -94,7 +94,7 @@ class ChildProcess:
     ) -> None:
         self._memory_bytes = memory_bytes
         self._on_progress = on_progress
-        context = context or start_method()
+        context = context or process_context()
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, memory_bytes), daemon=True)
         try:
@@ -151,7 +151,7 @@ class ChildProcess:
         return result  # type: ignore[no-any-return]
 
     def is_alive(self) -> bool:
-        """Return whether the process lives."""
+        """Return whether the process is running."""
         return bool(self._process.is_alive())
 
     def kill(self) -> None:
@@ -213,7 +213,7 @@ def _allocated_bytes() -> int:
 
 
 def _rebuilt(kind: type[Exception], args: tuple[Any, ...], attributes: dict[str, Any]) -> Exception:
-    """Return an error as it was in the other process."""
+    """Return an error as it was in the other process; its constructor may take other arguments."""
     error = kind.__new__(kind, *args)
     vars(error).update(attributes)
     return error

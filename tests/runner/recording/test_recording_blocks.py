@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.chunk_cache import RecordStore
 from runner.recording.reader import open_recording
+from runner.recording.record_store import RecordStore
 from tests.runner.recording.making import LAKE, make_run
 
 topics = st.sampled_from(schema.BLOCK_TOPICS)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from runner.recording import topic_chunks
-from runner.recording.chunk_cache import RecordStore
 from runner.recording.reader import open_recording
+from runner.recording.record_store import RecordStore
 from tests.runner.recording.making import LAKE, make_run
 
 CHUNKED = {"recording": {"index": "chunk", "chunk_steps": 256}}

@@ -1,4 +1,4 @@
-"""The records of an open recording: read, unpacked, compared with their checksums; the last few are kept.
+"""The records of an open recording: read, unpacked, compared with their checksums; the last few are cached.
 
 Reading is safe from several threads, so the next chunks are unpacked while one is in use.
 """
@@ -20,7 +20,7 @@ from runner.recording.chunks import MAX_CHUNK_BYTES, first_channel, unpack_chunk
 from runner.recording.index import ChunkEntry
 from runner.recording.records import MAX_METADATA_BYTES, UNREADABLE, attachment_of, metadata_of
 
-_MAX_KEPT_BYTES: Final = 16 << 20
+_MAX_CACHED_BYTES: Final = 16 << 20
 _THREADS: Final = 2
 _AHEAD: Final = 4
 """The number of chunks that are unpacked before they are needed, if they are small."""
@@ -39,8 +39,8 @@ class RecordStore:
         self._stream = stream
         self._path = path
         self._lock = threading.Lock()
-        self._kept: OrderedDict[int, bytes] = OrderedDict()
-        self._kept_bytes = 0
+        self._cached: OrderedDict[int, bytes] = OrderedDict()
+        self._cached_bytes = 0
 
     def close(self) -> None:
         """Close the file."""
@@ -56,7 +56,8 @@ class RecordStore:
         """
         if length > max_bytes:
             raise RecordingError(
-                f"{self._path}: the record at {offset} declares {length:,} bytes; too large to be ours."
+                f"{self._path}: the record at {offset} declares {length:,} bytes, "
+                f"expected at most {max_bytes:,}."
             )
         try:
             with self._lock:
@@ -105,15 +106,15 @@ class RecordStore:
         return media_type, data
 
     def chunk(self, entry: ChunkEntry) -> bytes:
-        """Return a chunk's message records, after comparing its checksum; keeps the last few.
+        """Return a chunk's message records, after comparing its checksum; the last few are cached.
 
         Raises:
             RecordingError: it is damaged.
         """
-        if entry.offset in self._kept:
-            self._kept.move_to_end(entry.offset)
-            return self._kept[entry.offset]
-        return self._keep(entry, self._unpacked(entry))
+        if entry.offset in self._cached:
+            self._cached.move_to_end(entry.offset)
+            return self._cached[entry.offset]
+        return self._cache(entry, self._unpacked(entry))
 
     def chunks(self, entries: Iterable[ChunkEntry]) -> Iterator[bytes]:
         """Yield the message records of chunks in order; the next ones are unpacked meanwhile.
@@ -124,7 +125,7 @@ class RecordStore:
         pending: deque[tuple[ChunkEntry, Future[bytes] | None]] = deque()
         for k, entry in enumerate(entries):
             small = entry.uncompressed_size + entry.length <= _SMALL
-            ahead = k > 1 and small and entry.offset not in self._kept
+            ahead = k > 1 and small and entry.offset not in self._cached
             pending.append((entry, self._threads.submit(self._unpacked, entry) if ahead else None))
             if len(pending) > _AHEAD:
                 yield self._result(*pending.popleft())
@@ -144,14 +145,14 @@ class RecordStore:
         return ThreadPoolExecutor(_THREADS, thread_name_prefix="unpack")
 
     def _result(self, entry: ChunkEntry, unpacked: Future[bytes] | None) -> bytes:
-        return self.chunk(entry) if unpacked is None else self._keep(entry, unpacked.result())
+        return self.chunk(entry) if unpacked is None else self._cache(entry, unpacked.result())
 
-    def _keep(self, entry: ChunkEntry, records: bytes) -> bytes:
-        """Keep what was unpacked last; little of it, unless it is one large chunk."""
-        self._kept_bytes += len(records) - len(self._kept.pop(entry.offset, b""))
-        self._kept[entry.offset] = records
-        while self._kept_bytes > _MAX_KEPT_BYTES and len(self._kept) > 1:
-            self._kept_bytes -= len(self._kept.popitem(last=False)[1])
+    def _cache(self, entry: ChunkEntry, records: bytes) -> bytes:
+        """Cache a chunk and drop the oldest beyond the limit, but keep one that is larger."""
+        self._cached_bytes += len(records) - len(self._cached.pop(entry.offset, b""))
+        self._cached[entry.offset] = records
+        while self._cached_bytes > _MAX_CACHED_BYTES and len(self._cached) > 1:
+            self._cached_bytes -= len(self._cached.popitem(last=False)[1])
         return records
 
     def _unpacked(self, entry: ChunkEntry) -> bytes:
