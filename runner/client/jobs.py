@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from runner.client.connection import FIRST_PAUSE, ServerUnavailable
 from runner.errors import RunnerError
@@ -17,6 +17,56 @@ if TYPE_CHECKING:
 
 OVER: Final = ("finished", "failed", "cancelled")
 """The states of a job in which nothing more happens unless a user resumes it."""
+
+EventKind = Literal["state", "run", "log", "progress"]
+"""What happened to a job: a change of its state, the start of a run, a line of its log, or progress."""
+
+
+@dataclass(frozen=True)
+class RunProgress:
+    """The progress of a configuration's job: the run that it is at."""
+
+    run_id: str
+    seed: int
+    run: int
+    """The place of the run among those of the job, from 1."""
+    runs: int
+    episode: int
+    episodes: int
+    """Training episodes of the run."""
+    train_steps: int
+    eval_steps: int
+    bytes: int
+    """Size of its recording."""
+    last_evaluation: dict[str, float | None] | None
+    """Its episode, and the value of each metric; None before the first."""
+
+
+@dataclass(frozen=True)
+class BestTrial:
+    """The best trial of a sweep so far."""
+
+    trial: int
+    value: float | None
+    """None for a level that was never reached."""
+    values: dict[str, Any]
+    """The parameters of the trial."""
+
+
+@dataclass(frozen=True)
+class SweepProgress:
+    """The progress of a sweep's job, in runs."""
+
+    done: int
+    runs: int
+    running: int
+    pruned: int
+    failed: int
+    bytes: int
+    best: BestTrial | None
+
+
+JobProgress = RunProgress | SweepProgress
 
 
 @dataclass(frozen=True)
@@ -59,9 +109,9 @@ class RemoteJob:
 
 @dataclass(frozen=True)
 class JobEvent:
-    """An event of a job: its kind (`state`, `run`, `log`, `progress`) and data."""
+    """An event of a job."""
 
-    kind: str
+    kind: EventKind
     data: dict[str, Any]
     id: str = ""
     """Where to continue from; empty for progress."""
@@ -104,5 +154,6 @@ def parse_events(lines: Iterable[str]) -> Iterator[JobEvent]:
             fields[key] = value.removeprefix(" ")
             continue
         if "data" in fields:
-            yield JobEvent(fields.get("event", ""), json.loads(fields["data"]), fields.get("id", ""))
+            kind: Any = fields.get("event", "")
+            yield JobEvent(kind, json.loads(fields["data"]), fields.get("id", ""))
         fields = {}

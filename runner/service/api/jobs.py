@@ -1,4 +1,4 @@
-"""JobPool: submitted, listed, watched, cancelled, resumed."""
+"""Jobs: submitted, listed, watched, cancelled, resumed."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator, Mapping
+from dataclasses import asdict
 from http import HTTPStatus
 from typing import Annotated, Any, Final
 
@@ -14,6 +15,7 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, Field
 
+from runner.client.jobs import EventKind, JobProgress
 from runner.service.dependencies import JobsOf
 from runner.service.errors import JobNotFound, Refused
 from runner.service.jobs.checking import DEFAULT_SOURCE
@@ -51,9 +53,7 @@ class JobResponse(BaseModel):
     started: str
     ended: str
     error: str
-    progress: dict[str, Any] | None = Field(
-        description="As last reported by its worker, while it is running."
-    )
+    progress: JobProgress | None = Field(description="As last reported by its worker, while it is running.")
     begun: list[RunOfJob] = Field(description="Started runs; those of a sweep have the tag sweep=NAME.")
 
 
@@ -262,7 +262,7 @@ async def _events(jobs: JobPool, number: int, last: int, stopping: asyncio.Event
             events, last = await run_sync(jobs.store.events, number, last)
             has_moved = progress is not None and progress is not before
             if progress is not None and has_moved:
-                yield _event("progress", progress)
+                yield _event("progress", asdict(progress))
             for event in events:
                 yield _event(event.kind, event.data, event.id)
             if not events and job.is_over:
@@ -280,7 +280,7 @@ async def _events(jobs: JobPool, number: int, last: int, stopping: asyncio.Event
         jobs.watchers -= 1
 
 
-def _event(kind: str, data: Mapping[str, Any], id_: int | None = None) -> str:
+def _event(kind: EventKind, data: Mapping[str, Any], id_: int | None = None) -> str:
     """Return a server-sent event."""
     head = "" if id_ is None else f"id: {id_}\n"
     return f"{head}event: {kind}\ndata: {json.dumps(data, ensure_ascii=False)}\n\n"

@@ -15,6 +15,7 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any, Final, Self
 
+from runner.client.jobs import JobProgress
 from runner.config import from_mapping
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
@@ -101,7 +102,7 @@ class JobPool:
         self.watchers = 0
         """Number of open event streams."""
         self._busy: dict[int, _Worker] = {}
-        self._progress: dict[int, dict[str, Any]] = {}
+        self._progress: dict[int, JobProgress] = {}
         """The last progress that each job's worker sent, also when the job is over."""
         self._lock = threading.RLock()
         self._start_problem, self._retry_at = "", 0.0
@@ -188,7 +189,7 @@ class JobPool:
             options = {"accept_changes": accept_changes, "retry": True}
             return self._update(number, state="queued", error="", ended="", deaths=0, **options)
 
-    def progress(self, number: int) -> dict[str, Any] | None:
+    def progress(self, number: int) -> JobProgress | None:
         """Return the progress that a job's worker last sent, also when it is over; None if none did."""
         with self._lock:
             return self._progress.get(number)

@@ -29,7 +29,7 @@ from peewee import (
     TextField,
 )
 
-from runner.client.jobs import OVER
+from runner.client.jobs import OVER, EventKind
 from runner.config.document import read_yaml, write_yaml
 from runner.errors import RunnerError, StorageError
 from runner.runs.locking import acquired
@@ -80,10 +80,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Event:
-    """An event of a job: `state`, `run` (one was started) or `log`."""
+    """A stored event of a job: of progress, only the latest is of interest, and none is stored."""
 
     id: int
-    kind: str
+    kind: EventKind
     data: dict[str, Any]
 
 
@@ -262,7 +262,7 @@ class JobStore:
                     self._insert_state(job)
             return job
 
-    def add_events(self, number: int, kind: str, data: Sequence[EventData]) -> None:
+    def add_events(self, number: int, kind: EventKind, data: Sequence[EventData]) -> None:
         """Add events to a job; those that the disk or the limit has no room for are dropped."""
         with self._lock, contextlib.suppress(StorageError), self._transaction():
             room = max(0, MAX_EVENTS - self._event_counts[number])
@@ -352,7 +352,7 @@ class JobStore:
         row = {"job": number, "seed": str(seed), "run_id": run_id, "started": started}
         _RunRow.insert(row).on_conflict_replace().execute(self._database)
 
-    def _insert_events(self, number: int, kind: str, data: Sequence[EventData]) -> None:
+    def _insert_events(self, number: int, kind: EventKind, data: Sequence[EventData]) -> None:
         rows = [{"job": number, "kind": kind, "data": json.dumps(each)} for each in data]
         if rows:
             _EventRow.insert_many(rows).execute(self._database)

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 
+from runner.client.jobs import BestTrial, SweepProgress
 from runner.service.jobs.channel import (
     OTHER_OWNER_SECONDS,
     REPORT_SECONDS,
@@ -155,10 +156,18 @@ class _SweepReporter:
             self._best = best.number
             text = f"trial {best.number} is the best so far: {best.value:g}"
             self._channel.send("log", [{"text": text}])
-        keys = ("done", "runs", "running", "pruned", "failed", "bytes")
-        progress = {key: getattr(status, key) for key in keys} | {"best": None}
+        shown = None
         if best is not None:
             # A level that was never reached is infinite or None; JSON has no infinity.
             value = best.value if best.value is not None and math.isfinite(best.value) else None
-            progress["best"] = {"trial": best.number, "value": value, "values": best.values}
+            shown = BestTrial(best.number, value, best.values)
+        progress = SweepProgress(
+            done=status.done,
+            runs=status.runs,
+            running=status.running,
+            pruned=status.pruned,
+            failed=status.failed,
+            bytes=status.bytes,
+            best=shown,
+        )
         self._channel.send("progress", progress)

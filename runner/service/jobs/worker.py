@@ -10,6 +10,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
+from runner.client.jobs import RunProgress
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.errors import RunnerError
@@ -103,11 +104,12 @@ class Reporter:
 
     def __init__(self, channel: JobChannel, run_id: str, seed: int, number: int, runs: int) -> None:
         self._channel = channel
-        self._run = {"run_id": run_id, "seed": seed}
-        self._position = {"run": number + 1, "runs": runs}
+        self._run_id, self._seed, self._number, self._runs = run_id, seed, number, runs
+        self._source = {"run_id": run_id, "seed": seed}
+        """What an event says of the run that it comes from."""
         self._sent, self._logged = 0.0, 0
         self._progress: Progress | None = None
-        channel.send("run", self._run)
+        channel.send("run", self._source)
 
     def report(self, progress: Progress) -> None:
         """Accept the run's progress."""
@@ -121,18 +123,21 @@ class Reporter:
         if (progress := self._progress) is None:
             return
         if lines := progress.log[self._logged :]:
-            self._channel.send("log", [self._run | {"text": text[:MAX_TEXT]} for text in lines])
+            self._channel.send("log", [self._source | {"text": text[:MAX_TEXT]} for text in lines])
         self._logged = len(progress.log)
-        last = evaluation_brief(progress.evaluations[-1]) if progress.evaluations else None
-        facts = {
-            "episode": progress.episode,
-            "episodes": progress.episodes,
-            "train_steps": progress.train_steps,
-            "eval_steps": progress.eval_steps,
-            "bytes": progress.bytes_written,
-            "last_evaluation": last,
-        }
-        self._channel.send("progress", self._run | self._position | facts)
+        sent = RunProgress(
+            run_id=self._run_id,
+            seed=self._seed,
+            run=self._number + 1,
+            runs=self._runs,
+            episode=progress.episode,
+            episodes=progress.episodes,
+            train_steps=progress.train_steps,
+            eval_steps=progress.eval_steps,
+            bytes=progress.bytes_written,
+            last_evaluation=evaluation_brief(progress.evaluations[-1]) if progress.evaluations else None,
+        )
+        self._channel.send("progress", sent)
 
 
 def run_seed_on_ray(

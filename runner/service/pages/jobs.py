@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
+from runner.client.jobs import SweepProgress
 from runner.export.reports.rendering import View
 from runner.service.addresses import Paging
 from runner.service.api.jobs import JobResponse, Number, job_response
@@ -121,12 +122,11 @@ def shown_job(job: Job, jobs: JobPool) -> ShownJob:
     now = facts.progress
     if not now or job.state != "running":
         return ShownJob(facts, None, "")
-    if job.kind == "sweep":
-        share = now["done"] / max(1, now["runs"])
-        return ShownJob(facts, share, f"{now['done']:,} of {now['runs']:,} runs")
-    share = (now["run"] - 1 + now["episode"] / max(1, now["episodes"])) / now["runs"]
-    run = f", run {now['run']} of {now['runs']}" if now["runs"] > 1 else ""
-    return ShownJob(facts, share, f"{now['episode']:,} of {now['episodes']:,} episodes{run}")
+    if isinstance(now, SweepProgress):
+        return ShownJob(facts, now.done / max(1, now.runs), f"{now.done:,} of {now.runs:,} runs")
+    share = (now.run - 1 + now.episode / max(1, now.episodes)) / now.runs
+    run = f", run {now.run} of {now.runs}" if now.runs > 1 else ""
+    return ShownJob(facts, share, f"{now.episode:,} of {now.episodes:,} episodes{run}")
 
 
 def _rows(jobs: JobPool, number: int) -> tuple[list[ShownJob], QueueStatus, bool, Paging]:

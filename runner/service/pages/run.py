@@ -15,6 +15,7 @@ from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.evaluations import evaluation_record, evaluation_records
+from runner.client.jobs import RunProgress
 from runner.config.document import write_yaml
 from runner.errors import RecordingError, RunnerError
 from runner.export.reports.evaluations import EvaluationTable, evaluation_table
@@ -294,8 +295,9 @@ def _job_of(run: Run, jobs: JobPool) -> tuple[int | None, dict[str, Any]]:
     """Return the job that makes a run, or will resume it, and the run's progress in it."""
     for job in jobs.store.jobs():
         if not job.is_over and run.run_id in jobs.store.run_ids(job.number).values():
-            progress = (jobs.progress(job.number) or {}) if job.state == "running" else {}
-            return job.number, progress if progress.get("run_id") == run.run_id else {}
+            progress = jobs.progress(job.number) if job.state == "running" else None
+            is_at_run = isinstance(progress, RunProgress) and progress.run_id == run.run_id
+            return job.number, vars(progress) if is_at_run else {}
     return None, {}
 
 

@@ -250,13 +250,18 @@ def test_a_broken_connection_leaves_what_was_received(server, run):
         with socket.create_connection(("127.0.0.1", server.port)) as connection:
             connection.sendall(head.encode() + data[:1000])
             time.sleep(0.2)
-            with pytest.raises(ServerError, match="another request") as refused:
-                client.append_upload(sent, run.recording, len(data))
-            assert refused.value.status == 409
         now = until(lambda now: now.offset, lambda: client.upload_status(sent))
         assert now.offset == 1000
+        with socket.create_connection(("127.0.0.1", server.port)) as stalled:
+            stalled.sendall(head.replace("Offset: 0", "Offset: 1000").encode() + data[1000:2000])
+            time.sleep(0.2)
+            whole = client.append_upload(now, run.recording, len(data))
+            assert whole.offset == len(data), "a connection that stalled holds nobody up"
+        with pytest.raises(ServerError, match=f"expected {len(data):,}") as refused:
+            client.append_upload(now, run.recording, len(data))
+        assert refused.value.status == 409
         with pytest.raises(ServerError, match="expected the"):
-            client.complete_upload(now, UploadSource(run.recording), len(data), "0" * 64)
+            client.complete_upload(now, UploadSource(run.recording), len(data) + 5, "0" * 64)
         client.delete_upload(now)
         with pytest.raises(ServerError, match="no such upload"):
             client.upload_status(now)
