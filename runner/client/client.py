@@ -11,7 +11,7 @@ Bytes that were sent before a connection broke are not sent again; the same run 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,6 +20,7 @@ from runner.client.connection import READ_BYTES, Connection, Report, ServerError
 from runner.client.jobs import JobEvent, RemoteJob, watch
 from runner.client.pull import pull
 from runner.errors import RunnerError
+from runner.recording.labels import as_json
 from runner.runs.run import Run
 from runner.util.files import hash_of
 
@@ -53,17 +54,18 @@ class UploadSource:
             raise RunnerError(
                 f"run {run.run_id} is {run.status}; only one that is over and here can be pushed."
             )
-        known = (run.recording, run.name, run.run_id, run.summary.content_digest)
+        source = cls(run.recording, run.name, run.run_id, run.summary.content_digest)
         if run.stands_alone:  # an exported recording carries its own record of the run
-            return cls(*known)
-        details: dict[str, str | float | None] = {
+            return source
+        details = {
             "name": run.file.name,
             "status": run.status,
             "proof": run.file.proof,
+            "seconds": run.summary.seconds,
+            "error": run.summary.error,
         }
-        details |= {"proof": run.file.proof, "seconds": run.summary.seconds, "error": run.summary.error}
-        labels = {"name": run.labels.name, "tags": list(run.labels.tags), "note": run.labels.note}
-        return cls(*known, {key: value for key, value in details.items() if value is not None}, labels)
+        known = {key: value for key, value in details.items() if value is not None}
+        return replace(source, run=known, labels=as_json(run.labels))
 
 
 @dataclass(frozen=True)
@@ -154,14 +156,21 @@ class Client(Connection):
     def _deliver(
         self, source: UploadSource, size: int, digest: str, report: Report, upload: UploadStatus | None
     ) -> UploadStatus:
-        """Return the upload of a file when it is stored or refused; a step that fails is retried."""
+        """Take the next step of an upload until it is stored or refused, and return it.
+
+        A step that fails for now is repeated, after a look at what the server has (`is_stale`).
+        """
         is_stale, furthest, backoff = upload is not None, -1, self.backoff()
         while upload is None or upload.state not in ("stored", "refused"):
             try:
                 if upload is None:
-                    known = {"name": source.name, "run_id": source.run_id}
-                    known["content_digest"] = source.content_digest or ""
-                    upload = self.begin_upload(digest=digest, size=size, **known)
+                    upload = self.begin_upload(
+                        digest=digest,
+                        size=size,
+                        name=source.name,
+                        run_id=source.run_id,
+                        content_digest=source.content_digest,
+                    )
                 elif is_stale:
                     upload = self.upload_status(upload)
                 elif upload.state == "verifying":
@@ -178,11 +187,12 @@ class Client(Connection):
                     upload = self.complete_upload(upload, source, size, digest)
                 is_stale = False
             except ServerError as error:
-                lost = error.status == HTTPStatus.NOT_FOUND
-                if not (lost or isinstance(error, ServerUnavailable) or error.status == HTTPStatus.CONFLICT):
+                is_lost = error.status == HTTPStatus.NOT_FOUND
+                is_behind = error.status == HTTPStatus.CONFLICT
+                if not (is_lost or is_behind or isinstance(error, ServerUnavailable)):
                     raise
                 backoff.wait(error)
-                upload, is_stale = None if lost else upload, True
+                upload, is_stale = None if is_lost else upload, True
                 continue
             if upload.offset > furthest:
                 furthest = upload.offset

@@ -38,8 +38,8 @@ class RunProgress:
     eval_steps: int
     bytes: int
     """Size of its recording."""
-    last_evaluation: dict[str, float | None] | None
-    """Its episode, and the value of each metric; None before the first."""
+    last_evaluation: dict[str, Any] | None
+    """Its episode, and the value of each metric by name; None before the first."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import dataclasses
 import io
 import json
 import math
+import os
 import tempfile
 from collections.abc import Sequence
 from http import HTTPStatus
@@ -51,21 +52,25 @@ def curves(path: Path, metrics: Sequence[str], start: int, stop: int | None, poi
     """
     with open_recording(path) as recording:
         series = read_series(recording)
-    found = {}
-    for (metric, line), (episodes, values) in _lines(series).items():
+    found = []
+    for (metric, line), (episodes, values) in _points_by_curve(series).items():
         if metrics and metric not in metrics:
             continue
         inside = (episodes >= start) & (episodes < (math.inf if stop is None else stop))
-        chosen = thinned(values[inside], points)
+        chosen = np.flatnonzero(inside)[thinned(values[inside], points)]
         title, unit = title_of(metric)
-        found[metric, line] = {
-            **{"metric": metric, "line": line, "title": title, "unit": unit},
-            "episodes": episodes[inside][chosen].tolist(),
-            "values": values[inside][chosen].tolist(),
+        curve = {
+            "metric": metric,
+            "line": line,
+            "title": title,
+            "unit": unit,
+            "episodes": episodes[chosen].tolist(),
+            "values": values[chosen].tolist(),
             "of": int(inside.sum()),
             "thinned": bool(len(chosen) < inside.sum()),
         }
-    return as_json({"run_id": series.run_id, "curves": list(found.values())})
+        found.append(curve)
+    return as_json({"run_id": series.run_id, "curves": found})
 
 
 def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> bytes:
@@ -78,10 +83,11 @@ def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> 
     with open_recording(path) as recording:
         if kind == "optimality":
             found = list(recording.optimality())
+        elif kind == "evaluations":
+            found = evaluation_records(recording)
         else:
-            if kind != "evaluations":
-                recording.require_job("a report of training", "Its metrics can be had all the same.")
-            found = (evaluation_records if kind == "evaluations" else training_records)(recording)
+            recording.require_job("a report of training", "Its metrics can be had all the same.")
+            found = training_records(recording)
         shown = found[start:stop]
         if len(shown) > limit:
             raise too_many(len(shown), limit)
@@ -97,17 +103,17 @@ def too_many(found: int, limit: int) -> Refused:
     )
 
 
-def _lines(series: RunSeries) -> dict[tuple[str, str], tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def _points_by_curve(
+    series: RunSeries,
+) -> dict[tuple[str, str], tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Return the episodes and values of each curve, by metric and line."""
-    found: dict[tuple[str, str], dict[int, float]] = {}
+    curves: dict[tuple[str, str], dict[int, float]] = {}
     for episode, readings in (*series.training, *series.evaluation):
         for metric, lines in readings.items():
             for line, value in lines.items():
-                found.setdefault((metric, line), {})[episode] = value
-    return {
-        key: (np.array(sorted(points), np.float64), np.array([points[at] for at in sorted(points)]))
-        for key, points in found.items()
-    }
+                curves.setdefault((metric, line), {})[episode] = value
+    ordered = {key: np.array(sorted(points.items()), np.float64) for key, points in curves.items()}
+    return {key: (points[:, 0], points[:, 1]) for key, points in ordered.items()}
 
 
 def thinned(values: NDArray[np.float64], points: int) -> NDArray[np.intp]:
@@ -213,8 +219,8 @@ def comparison(
     return as_json(dataclasses.asdict(compare(groups, metrics_of(groups, names), moment, notes)))
 
 
-def replay(runs: Sequence[Run], request: Request) -> Path:
-    """Return an export for the Rerun viewer, from the user's cache or new.
+def replay(runs: Sequence[Run], request: Request) -> bytes:
+    """Return the path of an export for the Rerun viewer, from the user's cache or new.
 
     Raises:
         MissingExtra: Rerun is not installed.
@@ -224,7 +230,7 @@ def replay(runs: Sequence[Run], request: Request) -> Path:
     require_rerun("a replay")
     from runner.export.rerun.writing import cached_export  # loads Rerun
 
-    return cached_export(runs, request)[0]
+    return os.fsencode(cached_export(runs, request)[0])
 
 
 def as_json(value: Any) -> bytes:

@@ -49,10 +49,6 @@ class Announcement(_Model):
     name: Text = ""
     content_digest: Digest | None = None
 
-    def is_same(self, other: Announcement) -> bool:
-        """Return whether both announce the same bytes."""
-        return (self.digest, self.size) == (other.digest, other.size)
-
 
 class RunDetails(_Model):
     """What `run.json` has of a run and its recording does not."""

@@ -121,13 +121,14 @@ class Uploads:
         """
         self._forget()
         with self._begin_lock:
+            same = (owner, announced.digest, announced.size)
             for known in self.all() if announced.digest else ():
-                if known.owner != owner or known.state == "refused" or not known.announced.is_same(announced):
+                if (known.owner, known.announced.digest, known.announced.size) != same:
                     continue
-                if known.state != "stored":
+                if not known.is_over:
                     return known, False
-                if run_of_id(known.run_id, self._recordings) is not None:  # else the run was removed
-                    return known.model_copy(update={"already": True}), False
+                if known.state == "stored" and run_of_id(known.run_id, self._recordings) is not None:
+                    return known.stored(known.run_id, already=True), False
             created = datetime.now(UTC).isoformat(timespec="milliseconds")
             upload = Upload(
                 upload_id=secrets.token_hex(16), owner=owner, created=created, announced=announced

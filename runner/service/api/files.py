@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from http import HTTPStatus
 from pathlib import Path
@@ -91,13 +92,8 @@ async def replay_of(
     """
     request = Request(_ranges(episodes), evaluations, every)
     key = ("replay", *map(recording_state, runs), request)
-    return Path(
-        (await cache.get_or_await(key, lambda: _made(processes, runs, request), max_seconds=0)).decode()
-    )
-
-
-async def _made(processes: ProcessesOf, runs: list[Run], request: Any) -> bytes:
-    return bytes(await processes(computed.replay, runs, request))
+    path = await cache.get_or_await(key, lambda: processes(computed.replay, runs, request), max_seconds=0)
+    return Path(os.fsdecode(path))
 
 
 def tag_of(run: Run) -> str:
@@ -116,7 +112,7 @@ def _file(path: Path, name: str, tag: str, if_none_match: str | None) -> Respons
 
 def _ranges(text: str) -> tuple[tuple[int, int | None], ...]:
     """Return (start, stop) of each range of episodes; a single number is that one, an open end None."""
-    found: list[tuple[int, int | None]] = []
+    ranges: list[tuple[int, int | None]] = []
     for part in filter(None, text.split(",")):
         if not _RANGES.fullmatch(part) or len(part) > 40:
             raise Refused(
@@ -125,5 +121,5 @@ def _ranges(text: str) -> tuple[tuple[int, int | None], ...]:
             )
         start, colon, stop = part.partition(":")
         first = int(start or 0)
-        found.append((first, (int(stop) if stop else None) if colon else first + 1))
-    return tuple(found)
+        ranges.append((first, (int(stop) if stop else None) if colon else first + 1))
+    return tuple(ranges)

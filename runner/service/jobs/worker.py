@@ -59,25 +59,25 @@ def run_config_job(spec: JobSpec, channel: JobChannel) -> Outcome:
         RunnerError: a run failed or cannot be resumed.
     """
     config = from_mapping(spec.values)
-    for number, seed in enumerate(config.seeds):
-        run = run_seed if spec.ray is None else run_seed_on_ray
-        if channel.stop() or run(spec, channel, config, seed, number) != "finished":
+    run = run_seed if spec.ray is None else run_seed_on_ray
+    for seed in config.seeds:
+        if channel.stop() or run(spec, channel, config, seed) != "finished":
             return Outcome("interrupted")
     return Outcome("finished")
 
 
-def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed: int, number: int) -> str:
+def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed: int) -> str:
     """Start or resume a job's run of one seed; return its status."""
     run = _existing_run(spec.recordings / spec.run_ids[seed])
     if run is not None and run.status == "finished":
         return run.status
     if run is not None:
         wait_for_owners([run], channel.stop)
-        reporter = Reporter(channel, run.run_id, seed, number, len(config.seeds))
+        reporter = Reporter(channel, run.run_id, config, seed)
         run = resume(run, spec.accept_changes, reporter.report, channel.stop)
     else:
         run = create_run(spec.recordings, config, seed, run_id=spec.run_ids[seed])
-        reporter = Reporter(channel, run.run_id, seed, number, len(config.seeds))
+        reporter = Reporter(channel, run.run_id, config, seed)
         run = run_job(Job(config, seed), run, reporter.report, channel.stop)
     reporter.end()
     return run.status
@@ -97,14 +97,13 @@ class Reporter:
     Args:
         channel: where to send it.
         run_id: the run's id.
+        config: the job's configuration.
         seed: the run's seed.
-        number: how many runs of the job came before it.
-        runs: the number of runs of the job.
     """
 
-    def __init__(self, channel: JobChannel, run_id: str, seed: int, number: int, runs: int) -> None:
+    def __init__(self, channel: JobChannel, run_id: str, config: ExperimentConfig, seed: int) -> None:
         self._channel = channel
-        self._run_id, self._seed, self._number, self._runs = run_id, seed, number, runs
+        self._run_id, self._seed, self._seeds = run_id, seed, config.seeds
         self._source = {"run_id": run_id, "seed": seed}
         """What an event says of the run that it comes from."""
         self._sent, self._logged = 0.0, 0
@@ -128,8 +127,8 @@ class Reporter:
         sent = RunProgress(
             run_id=self._run_id,
             seed=self._seed,
-            run=self._number + 1,
-            runs=self._runs,
+            run=self._seeds.index(self._seed) + 1,
+            runs=len(self._seeds),
             episode=progress.episode,
             episodes=progress.episodes,
             train_steps=progress.train_steps,
@@ -140,9 +139,7 @@ class Reporter:
         self._channel.send("progress", sent)
 
 
-def run_seed_on_ray(
-    spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed: int, number: int
-) -> str:
+def run_seed_on_ray(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed: int) -> str:
     """Run a seed in a Ray actor, and forward its messages; return the run's status.
 
     Raises:
@@ -151,7 +148,7 @@ def run_seed_on_ray(
     ray = connect(spec.ray)
     try:
         actor = start_actor(ray)
-        result = actor.run.remote(_run_seed_in_actor, spec, config.to_mapping(), seed, number)
+        result = actor.run.remote(_run_seed_in_actor, spec, config.to_mapping(), seed)
         is_over = False
         while not is_over:
             is_over = bool(ray.wait([result], timeout=REPORT_SECONDS)[0])
@@ -169,11 +166,9 @@ def run_seed_on_ray(
     return str(status)
 
 
-def _run_seed_in_actor(
-    actor: RayActor, spec: JobSpec, values: dict[str, Any], seed: int, number: int
-) -> tuple[str, str]:
+def _run_seed_in_actor(actor: RayActor, spec: JobSpec, values: dict[str, Any], seed: int) -> tuple[str, str]:
     """Run the seed; return the run's status, and the error message if it failed."""
     try:
-        return run_seed(spec, actor, from_mapping(values), seed, number), ""
+        return run_seed(spec, actor, from_mapping(values), seed), ""
     except RunnerError as error:
         return "failed", str(error)
