@@ -13,7 +13,7 @@ import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from platformdirs import user_state_path
 
@@ -35,6 +35,14 @@ _SENT: Final = ".sent-"
 _MAX_FILE: Final = 1 << 16
 
 
+class _Push(NamedTuple):
+    """Where a run of the outbox goes."""
+
+    server: str = ""
+    upload: str = ""
+    """The id of the upload that has begun; empty before."""
+
+
 def is_server(recordings: object) -> bool:
     """Return whether the value for a recordings folder is the address of a server."""
     return isinstance(recordings, str) and recordings.startswith(("http://", "https://"))
@@ -54,8 +62,7 @@ def waiting(outbox: Path) -> list[tuple[Run, str]]:
     for sent in outbox.glob(f"{_SENT}*"):
         shutil.rmtree(sent, ignore_errors=True)
     runs = [run for run in reversed(list_runs(outbox)) if run.status != "running"]
-    servers = [(run, str(_read_push_file(run).get("server", ""))) for run in runs]
-    return [(run, server) for run, server in servers if server]
+    return [(run, push.server) for run in runs if (push := _read_push_file(run)).server]
 
 
 def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> UploadStatus:
@@ -66,9 +73,10 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Uploa
         RunnerError: another process has it.
     """
     with locked(run) as own:
-        known = _read_push_file(own)
-        begun = known.get("upload") if known.get("server") == client.url else None
-        upload = client.push(own, report, UploadStatus(str(begun), "receiving", 0) if begun else None)
+        push, begun = _read_push_file(own), None
+        if push.upload and push.server == client.url:
+            begun = UploadStatus(push.upload, "receiving", offset=0)
+        upload = client.push(own, report, begun)
         sent = own.folder.with_name(f"{_SENT}{own.folder.name}")
         own.folder.rename(sent)
     shutil.rmtree(sent, ignore_errors=True)
@@ -87,7 +95,7 @@ class Follower:
     def __init__(self, client: Client, run: Run, size: Callable[[], int]) -> None:
         self._client, self._run, self._size = client, run, size
         self._over = threading.Event()
-        _write_push_file(run, client.url, None)
+        _write_push_file(run, _Push(client.url))
         self._thread = threading.Thread(target=self._follow, name="push", daemon=True)
         self._thread.start()
 
@@ -118,7 +126,7 @@ class Follower:
             try:
                 if upload is None:
                     upload = self._client.begin_upload(name=self._run.name, run_id=self._run.run_id)
-                    _write_push_file(self._run, self._client.url, upload.id)
+                    _write_push_file(self._run, _Push(self._client.url, upload.id))
                 if is_stale:
                     upload, is_stale = self._client.upload_status(upload), False
                 while upload.offset < (size := self._size()) and not self._over.is_set():
@@ -139,12 +147,13 @@ def connect(url: str) -> Client:
     return Client(url, find_token(), LAST_SECONDS)
 
 
-def _write_push_file(run: Run, server: str, upload: str | None) -> None:
+def _write_push_file(run: Run, push: _Push) -> None:
     with contextlib.suppress(OSError):  # without it, everything is sent again
-        write_object(run.folder / PUSH_FILE, {"server": server, "upload": upload})
+        write_object(run.folder / PUSH_FILE, push._asdict())
 
 
-def _read_push_file(run: Run) -> dict[str, object]:
+def _read_push_file(run: Run) -> _Push:
     with contextlib.suppress(OSError, ValueError):
-        return read_object(run.folder / PUSH_FILE, _MAX_FILE)
-    return {}
+        values = read_object(run.folder / PUSH_FILE, _MAX_FILE)
+        return _Push(str(values.get("server") or ""), str(values.get("upload") or ""))
+    return _Push()

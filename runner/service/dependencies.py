@@ -92,7 +92,7 @@ def recording_state(run: Run) -> tuple[str, int, int]:
 
 
 def timed_recording_state(run: Run) -> tuple[str, int, int, str]:
-    """Return the same and how long the run took, which `run.json` alone has, at times later."""
+    """Return `recording_state` and the duration, which `run.json` may get after the recording is closed."""
     return *recording_state(run), str(run.summary.seconds)
 
 

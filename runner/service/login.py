@@ -47,7 +47,7 @@ def login(request: Request, sent: Form) -> Response:
         session = sessions.begin(token)
     except RunnerError as error:
         return page(request, LoginView(target, message_of(error, request)), status_of(error))
-    # No other site, however it is written.
+    # Only a path of this service: browsers take `//host` and `/\host` for addresses of other sites.
     is_local = target.startswith("/") and not target.startswith(("//", "/\\")) and target.isprintable()
     response = RedirectResponse(target if is_local else "/", HTTPStatus.SEE_OTHER)
     response.set_cookie(COOKIE, session, max_age=SESSION_SECONDS, **_cookie_options(request))

@@ -162,9 +162,8 @@ class Uploads:
         with self._exclusive(upload_id, owner) as upload:
             received = self.offset(upload)
             if upload.state != "receiving" or offset != received:
-                raise UploadConflict(
-                    f"found bytes from {offset:,} on, expected {received:,} ({upload.state})."
-                )
+                found = f"found bytes from {offset:,} on"
+                raise UploadConflict(f"{found}, expected {received:,} ({upload.state}).")
             limit = self.limits.max_bytes if upload.size is None else upload.size
             if (end := offset + len(data) + more) > limit:
                 raise UploadTooLarge(f"found {end:,} bytes, expected at most {limit:,}.")

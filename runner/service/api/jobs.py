@@ -131,9 +131,9 @@ async def submit(
     def add() -> JobResponse:
         return job_response(jobs.add(text, checked), jobs)
 
-    answer = await run_sync(add)
-    response.headers["location"] = f"{request.url.path}/{answer.number}"
-    return answer
+    job = await run_sync(add)
+    response.headers["location"] = f"{request.url.path}/{job.number}"
+    return job
 
 
 @router.post(
@@ -144,8 +144,8 @@ async def submit(
 )
 async def check(jobs: JobsOf, text: Text, source: Source = DEFAULT_SOURCE) -> CheckResponse:
     """Check the text without queueing it."""
-    found = await jobs.checker.check(text, source)
-    return CheckResponse(kind=found.kind, name=found.name, runs=found.runs, bytes=found.bytes)
+    checked = await jobs.checker.check(text, source)
+    return CheckResponse(kind=checked.kind, name=checked.name, runs=checked.runs, bytes=checked.bytes)
 
 
 @router.get("/jobs", response_model=JobsPage, summary="List the jobs, the newest first.")
@@ -156,10 +156,10 @@ def list_jobs(
     offset: Annotated[int, Query(ge=0, lt=2**31)] = 0,
 ) -> JobsPage:
     """List the jobs, and return the state of the queue."""
-    found = [job for job in reversed(jobs.store.jobs()) if not state or job.state in state]
+    matching = [job for job in reversed(jobs.store.jobs()) if not state or job.state in state]
     return JobsPage(
-        jobs=[job_response(job, jobs) for job in found[offset : offset + limit]],
-        total=len(found),
+        jobs=[job_response(job, jobs) for job in matching[offset : offset + limit]],
+        total=len(matching),
         offset=offset,
         limit=limit,
         queue=jobs.status(),

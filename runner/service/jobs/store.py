@@ -263,10 +263,10 @@ class JobStore:
             return job
 
     def add_events(self, number: int, kind: EventKind, data: Sequence[EventData]) -> None:
-        """Add events to a job; those that the disk or the limit has no room for are dropped."""
+        """Add events to a job; those beyond the limit, or that cannot be written, are dropped."""
         with self._lock, contextlib.suppress(StorageError), self._transaction():
-            room = max(0, MAX_EVENTS - self._event_counts[number])
-            self._insert_events(number, kind, data[:room])
+            limit = max(0, MAX_EVENTS - self._event_counts[number])
+            self._insert_events(number, kind, data[:limit])
 
     def events(self, number: int, after: int = 0) -> tuple[list[Event], int]:
         """Return a job's next events, not all if there are many, and the id of the last one.
@@ -285,8 +285,8 @@ class JobStore:
             if after and not self._tuples(own.where(_EventRow.id == after)):
                 after = 0
             query = own.where(_EventRow.id > after).order_by(_EventRow.id).limit(EVENTS_PER_READ)
-            found = [Event(id_, kind, json.loads(data)) for id_, kind, data in self._tuples(query)]
-            return found, found[-1].id if found else after
+            events = [Event(id_, kind, json.loads(data)) for id_, kind, data in self._tuples(query)]
+            return events, events[-1].id if events else after
 
     def last_events(self, number: int, limit: int) -> tuple[list[Event], int]:
         """Return the last events of a job, and the id of the last one.
