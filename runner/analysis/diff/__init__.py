@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, TypedDict
 
-from runner.analysis.diff.causes import Cause, Row, Update, find_cause, find_kind
+from runner.analysis.diff.causes import Cause, Row, find_cause, find_kind
 from runner.analysis.diff.divergence import (
     Divergence,
     evaluation_divergences,
@@ -51,7 +51,6 @@ __all__ = [
     "StateVisits",
     "TableDiff",
     "TransitionChange",
-    "Update",
     "VisitsDiff",
     "as_json",
     "can_compare_steps",

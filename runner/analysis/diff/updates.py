@@ -1,0 +1,173 @@
+"""The first update by which the tables of two runs came to differ, found by replaying both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from runner.analysis.diff.tables import own_actions_in_words
+from runner.config import from_mapping
+from runner.environments.naming import states_in_words
+from runner.learning.learner import Held
+from runner.learning.schedules import compile_schedule, schedule_value
+from runner.recording import schema
+from runner.recording.reader import Recording
+from runner.replay.tables import TableReplay
+
+_BATCH_STEPS: Final = 1 << 16
+
+
+@dataclass(frozen=True)
+class Update:
+    """The first update by which two runs' tables came to differ."""
+
+    step: int
+    episode: int
+    state: str
+    action: str
+    agent: str
+    a: float
+    b: float
+    """The value after the update, in each run."""
+    rewards_a: list[float]
+    rewards_b: list[float]
+    reasons: list[str] = field(default_factory=list)
+    """Descriptions of the inputs of the update that differ."""
+
+
+def replay_to(a: Recording, b: Recording, stop: int) -> tuple[list[TableReplay], Update | None]:
+    """Return both runs' tables at a step up to which they took the same steps, and the first other update.
+
+    Raises:
+        RecordingError: the tables cannot be restored.
+    """
+    start = _last_equal_snapshot(a, b, stop)
+    replays = [TableReplay(recording, start) for recording in (a, b)]
+    update = None
+    if _are_equal(replays):
+        for step in range(start, stop, _BATCH_STEPS):
+            found = _first_other_update(replays, step, min(step + _BATCH_STEPS, stop))
+            if found is not None:
+                update = _describe_update(a, b, found, replays)
+                break
+    for replay in replays:
+        replay.advance(stop)
+    return replays, update
+
+
+def _last_equal_snapshot(a: Recording, b: Recording, stop: int) -> int:
+    """Return the last step before `stop` at which both runs have snapshots, all of them equal; or 0."""
+    last = step = 0
+    equal = True
+    for left, right in zip(a.snapshots(), b.snapshots(), strict=False):
+        if left.step != right.step or left.step > stop:
+            break
+        if left.step != step:
+            last, step = (step if equal else last), left.step
+        equal = equal and np.array_equal(left.values, right.values)
+        if not equal:
+            break
+    return last
+
+
+def _first_other_update(replays: Sequence[TableReplay], start: int, stop: int) -> int | None:
+    """Replay both up to `stop`; return the step whose update made them differ first, by bisection.
+
+    If there is one, both are left before that step.
+    """
+    before = [_copy(replay) for replay in replays]
+    for replay in replays:
+        replay.advance(stop)
+    if _are_equal(replays):
+        return None
+    while stop - start > 1:
+        middle = (start + stop) // 2
+        for replay, contents in zip(replays, before, strict=True):
+            replay.rewind(start, contents)
+            replay.advance(middle)
+        if _are_equal(replays):
+            start, before = middle, [_copy(replay) for replay in replays]
+        else:
+            stop = middle
+    for replay, contents in zip(replays, before, strict=True):
+        replay.rewind(start, contents)
+    return start
+
+
+def _copy(replay: TableReplay) -> list[Held]:
+    """Return a copy of all that the learners hold now."""
+    return [{name: array.copy() for name, array in one.items()} for one in replay.held]
+
+
+def _are_equal(replays: Sequence[TableReplay]) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(replays[0].tables, replays[1].tables, strict=True))
+
+
+def _describe_update(a: Recording, b: Recording, step: int, replays: Sequence[TableReplay]) -> Update:
+    """Return the update of a step that makes the tables differ; both replays are before it."""
+    records = [next(recording.blocks(schema.TRAIN_STEP, step, step + 1))[0] for recording in (a, b)]
+    for replay in replays:
+        replay.advance(step + 1)
+    state = int(records[0]["state"])
+    ours, theirs = (replay.tables for replay in replays)
+    learner, action = next(
+        (
+            (learner, int(np.argmax(left[state] != right[state])))
+            for learner, (left, right) in enumerate(zip(ours, theirs, strict=True))
+            if (left[state] != right[state]).any()
+        ),
+        (0, 0),
+    )
+    return Update(
+        step=step,
+        episode=int(records[0]["episode"]),
+        state=str(states_in_words(a.mdp)[state]),
+        action=own_actions_in_words(a.mdp, learner, ours[learner].shape[1])[action],
+        agent=replays[0].agents[learner],
+        a=float(ours[learner][state, action]),
+        b=float(theirs[learner][state, action]),
+        rewards_a=records[0]["rewards"].tolist(),
+        rewards_b=records[1]["rewards"].tolist(),
+        reasons=_reasons(a, b, records),
+    )
+
+
+def _reasons(a: Recording, b: Recording, records: Sequence[np.void]) -> list[str]:
+    """Return descriptions of the inputs of an update that differ."""
+    configs = [from_mapping(recording.config) for recording in (a, b)]
+    episode, step = int(records[0]["episode"]), int(records[0]["step"])
+    reasons = []
+    rewards = [record["rewards"].tolist() for record in records]
+    if rewards[0] != rewards[1]:
+        reasons.append(
+            f"the reward was {_rewards_in_words(rewards[0])} in A, {_rewards_in_words(rewards[1])} in B"
+        )
+    for name in ("step_size", "discount"):
+        schedules = [compile_schedule(getattr(config, name)) for config in configs]
+        x, y = (float(schedule_value(schedule, episode, step)) for schedule in schedules)
+        if x != y:
+            reasons.append(f"the {name.replace('_', ' ')} was {x:g} in A, {y:g} in B")
+    for name, text, matters in (
+        (
+            "second_table_uses_first_action",
+            "updated the second agent's table at the first agent's action",
+            True,
+        ),
+        (
+            "bootstrap_after_termination",
+            "added the value of the next state although the episode had ended",
+            records[0]["terminated"],
+        ),
+    ):
+        has = [getattr(config.quirks, name) for config in configs]
+        if matters and has[0] != has[1]:
+            reasons.append(f"{'A' if has[0] else 'B'} {text} (quirks.{name})")
+    return reasons
+
+
+def _rewards_in_words(rewards: Sequence[float]) -> str:
+    """Return the rewards of all learners in a step: `-1 and 20`."""
+    return " and ".join(f"{reward:g}" for reward in rewards)
