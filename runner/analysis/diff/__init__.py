@@ -7,10 +7,9 @@ print(difference.divergence, difference.cause)
 
 from __future__ import annotations
 
-import dataclasses
 import fnmatch
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, TypedDict
 
 from runner.analysis.diff.causes import Cause, Row, find_cause, find_kind
@@ -131,32 +130,58 @@ def diff(
         costs=changes["costs"],
         alike=alike,
     )
-    if not jobs:
-        return dataclasses.replace(difference, **_diff_loops(a, b, same))
-    facts: dict[str, Any] = {"notes": _notes(a, b)}
-    seen = None
-    if not same and can_compare_steps(a, b):
+    if jobs:
+        return _diff_jobs(difference, a, b, targets or {}, first)
+    return _diff_loops(difference, a, b)
+
+
+def _diff_jobs(
+    difference: RunDiff, a: Recording, b: Recording, targets: Mapping[str, float], first: bool
+) -> RunDiff:
+    """Add to the difference of two jobs where and why they diverge, their tables and their metrics."""
+    difference = replace(difference, notes=_notes(a, b))
+    if difference.same_content:
+        return difference
+    visits = None
+    if can_compare_steps(a, b):
         divergence = training_divergence(a, b)
         cause = None if divergence is None else (find_kind if first else find_cause)(divergence, a, b)
-        facts |= {"divergence": divergence, "cause": cause}
+        difference = replace(difference, divergence=divergence, cause=cause)
         if not first:
-            facts["overlap"], visits = training_overlap(a, b)
-            facts["visits"] = visits_diff(a.mdp, *visits)
-            seen = visits[0] + visits[1]
+            overlap, (visits_a, visits_b) = training_overlap(a, b)
+            visits = visits_a + visits_b
+            difference = replace(difference, overlap=overlap, visits=visits_diff(a.mdp, visits_a, visits_b))
             known = None if divergence is None or cause is None else (divergence, cause)
             if (found := next(evaluation_divergences(a, b), None)) is not None:
-                facts["evaluation_divergence"] = found
-                facts["evaluation_cause"] = find_cause(found, a, b, known)
-    if not same and not first:
-        facts["tables"] = list(table_diffs(a, b, seen)) if _same_sizes(a, b) else []
-        facts["metrics"] = metric_diffs(a, b, targets or {})
-    return dataclasses.replace(difference, **facts)
+                why = find_cause(found, a, b, known)
+                difference = replace(difference, evaluation_divergence=found, evaluation_cause=why)
+    if first:
+        return difference
+    tables = list(table_diffs(a, b, visits)) if _same_sizes(a, b) else []
+    return replace(difference, tables=tables, metrics=metric_diffs(a, b, targets))
+
+
+def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
+    """Add to the difference of two runs, of which one is a loop, where they diverge."""
+    notes = ["recorded from a loop: what it learned is unknown, so neither a cause nor tables are reported"]
+    train = evaluation = None
+    if not have_same_spaces(a, b):
+        notes.append("the environments have other spaces: no steps are compared")
+    elif not difference.same_content:
+        train, evaluation = (loop_divergence(a, b, phase) for phase in ("train", "eval"))
+        digests = [recording.result.topic_digests for recording in (a, b)]
+        if train is evaluation is None and all(digests):
+            names = sorted(digests[0].keys() | digests[1].keys())
+            differing = [name for name in names if digests[0].get(name) != digests[1].get(name)]
+            if differing:
+                notes.append(f"all steps are the same; what differs is in {', '.join(differing)}")
+    return replace(difference, divergence=train, evaluation_divergence=evaluation, notes=notes)
 
 
 def with_seconds(difference: RunDiff, a: Run, b: Run) -> RunDiff:
     """Return the difference with the duration of the runs, which recordings do not hold."""
     seconds = [{"seconds": run.summary.get("seconds")} for run in (a, b)]
-    return dataclasses.replace(difference, costs=[*difference.costs, *changes_in(*seconds)])
+    return replace(difference, costs=[*difference.costs, *changes_in(*seconds)])
 
 
 def without_ignored(difference: RunDiff, ignore: Sequence[str], everything: bool = False) -> RunDiff:
@@ -181,12 +206,12 @@ def without_ignored(difference: RunDiff, ignore: Sequence[str], everything: bool
         if everything
     }
     ignored = [change.path for some in changes.values() for change in some if is_ignored(change.path)]
-    return dataclasses.replace(difference, **facts, ignored=ignored)
+    return replace(difference, **facts, ignored=ignored)
 
 
 def as_json(difference: RunDiff) -> dict[str, Any]:
     """Return the difference as JSON can hold it, without the whole records of steps."""
-    facts = dataclasses.asdict(difference)
+    facts = asdict(difference)
     for divergence in (facts["divergence"], facts["evaluation_divergence"]):
         if divergence is not None:
             del divergence["a_step"], divergence["b_step"]
@@ -200,24 +225,6 @@ def can_compare_steps(a: Recording, b: Recording) -> bool:
 
 def _same_sizes(a: Recording, b: Recording) -> bool:
     return a.mdp.next_state.shape[:2] == b.mdp.next_state.shape[:2]
-
-
-def _diff_loops(a: Recording, b: Recording, same: bool) -> dict[str, Any]:
-    """Return what else differs of two runs of which one is a loop."""
-    notes = ["recorded from a loop: what it learned is unknown, so neither a cause nor tables are reported"]
-    comparable = have_same_spaces(a, b)
-    if not comparable:
-        notes.append("the environments have other spaces: no steps are compared")
-    train, evaluation = (
-        loop_divergence(a, b, phase) if comparable and not same else None for phase in ("train", "eval")
-    )
-    digests = [recording.result.topic_digests for recording in (a, b)]
-    if comparable and train is evaluation is None and all(digests):
-        names = digests[0].keys() | digests[1].keys()
-        differing = sorted(name for name in names if digests[0].get(name) != digests[1].get(name))
-        if differing:
-            notes.append(f"all steps are the same; what differs is in {', '.join(differing)}")
-    return {"divergence": train, "evaluation_divergence": evaluation, "notes": notes}
 
 
 def _identity(recording: Recording) -> Identity:
