@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from runner.analysis.series import RunSeries, is_loop
+from runner.analysis.series import RunSeries
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRICS, SHARES
 from runner.util.humanize import listed
@@ -167,7 +167,7 @@ def _group(label: str, runs: Sequence[RunSeries]) -> Group:
     best: dict[Hashable, RunSeries] = {}
     for run in runs:
         # A job follows from its seed; loops need their content, as workers of one training share a seed.
-        identity = run.content_digest or run.run_id if is_loop(run) else run.seed
+        identity = run.content_digest or run.run_id if run.is_loop else run.seed
         key = (_content(run), identity)
         if key not in best or run.finished >= best[key].finished:
             best[key] = run

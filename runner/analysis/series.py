@@ -54,18 +54,18 @@ class RunSeries:
         """Whether the run is finished."""
         return self.status == "finished"
 
+    @property
+    def is_loop(self) -> bool:
+        """Whether the run was recorded from a loop, whose training is read at even numbers of episodes."""
+        return "made_by" in self.config
 
-def is_loop(run: RunSeries) -> bool:
-    """Return whether a run was recorded from a loop, whose training is read at even numbers of episodes."""
-    return "made_by" in run.config
+    @property
+    def has_goal(self) -> bool:
+        """Whether the run's episodes have a goal, which is better reached sooner.
 
-
-def has_goal(run: RunSeries) -> bool:
-    """Return whether a run's episodes have a goal, which is better reached sooner.
-
-    That is known of a loop if its environment defines success: a pole is to be held for as long as possible.
-    """
-    return not is_loop(run) or any("success_percent" in readings for _, readings in run.evaluation)
+        A loop has one if its environment defines success: a pole is to be held for as long as possible.
+        """
+        return not self.is_loop or any("success_percent" in readings for _, readings in self.evaluation)
 
 
 def values_left_out(runs: Iterable[RunSeries]) -> list[str]:
@@ -107,7 +107,7 @@ def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[int
             every run of a configuration; all of them if the run has no evaluation.
     """
     source = run.training if metric.startswith("training.") else run.evaluation
-    at_evaluations = set() if is_loop(run) else {episode for episode, _ in run.evaluation}
+    at_evaluations = set() if run.is_loop else {episode for episode, _ in run.evaluation}
     missing = 0.0 if metric == SHARES else np.nan
     points = {
         episode: readings[metric].get(line, missing)

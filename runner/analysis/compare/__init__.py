@@ -19,7 +19,7 @@ from runner.analysis.compare import statistics
 from runner.analysis.compare.moments import Moment, higher_is_better, value_of
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.groups import Group
-from runner.analysis.series import RunSeries, is_loop, points_of, title_of
+from runner.analysis.series import RunSeries, points_of, title_of
 from runner.util.humanize import listed
 
 THRESHOLDS: Final = 101
@@ -148,7 +148,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]]) -> Itera
         group.label: run.config["env"]["id"]
         for group in groups
         for run in group.runs
-        if not is_loop(run) and "env" in run.config
+        if not run.is_loop and "env" in run.config
     }
     if len(set(environments.values())) > 1:
         where = ", ".join(f"{env_id} in {label}" for label, env_id in environments.items())
@@ -167,7 +167,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]]) -> Itera
     few = [group for group in groups if seeds[group.label] < statistics.FEW_SEEDS]
     if few:
         listed_groups = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
-        loops = all(is_loop(run) for group in few for run in group.runs)
+        loops = all(run.is_loop for group in few for run in group.runs)
         more = "record more, each with a seed of its own" if loops else "`--set 'seeds={count: 10}'` runs ten"
         yield (
             f"fewer than {statistics.FEW_SEEDS} seeds in {listed_groups}: bootstrap intervals of so few are "
@@ -190,15 +190,15 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
     sign = -1.0 if better is False else 1.0
     thresholds = _thresholds([value for values in present.values() for _, value in values.values()], sign)
     return MetricResult(
-        metric,
-        line,
-        title,
-        unit,
-        better,
-        [_group(label, values, thresholds, sign) for label, values in present.items()],
-        [_pair(*a, *b, sign) for a, b in itertools.combinations(present.items(), 2)],
-        thresholds.tolist(),
-        notes,
+        metric=metric,
+        line=line,
+        title=title,
+        unit=unit,
+        higher_is_better=better,
+        groups=[_group(label, values, thresholds, sign) for label, values in present.items()],
+        pairs=[_pair(*a, *b, sign) for a, b in itertools.combinations(present.items(), 2)],
+        thresholds=thresholds.tolist(),
+        notes=notes,
     )
 
 
@@ -269,15 +269,15 @@ def _group(label: str, values: Measured, thresholds: Values, sign: float) -> Gro
         column.tolist() for column in statistics.share_at_least(sign * own, sign * thresholds)
     )
     return GroupResult(
-        label,
-        list(values),
-        [run_id for run_ids, _ in values.values() for run_id in run_ids],
-        [statistics.bounded(value) for value in own.tolist()],
-        statistics.median(own),
-        statistics.interquartile_mean(own),
-        share,
-        low,
-        high,
+        label=label,
+        seeds=list(values),
+        run_ids=[run_id for run_ids, _ in values.values() for run_id in run_ids],
+        values=[statistics.bounded(value) for value in own.tolist()],
+        median=statistics.median(own),
+        iqm=statistics.interquartile_mean(own),
+        profile=share,
+        profile_low=low,
+        profile_high=high,
     )
 
 
@@ -287,17 +287,17 @@ def _pair(a: str, ours: Measured, b: str, theirs: Measured, sign: float) -> Pair
     difference = left - right
     none = Estimate(np.nan, np.nan, np.nan)
     return PairResult(
-        a,
-        b,
-        seeds,
-        sorted(ours.keys() - theirs.keys(), key=_order),
-        sorted(theirs.keys() - ours.keys(), key=_order),
-        statistics.median(difference) if seeds else np.nan,
-        statistics.interquartile_mean(difference),
-        none,
-        statistics.improvement(sign * left, sign * right) if seeds else none,
-        int((sign * difference > 0).sum()),
-        int((difference == 0).sum()),
-        int((sign * difference < 0).sum()),
-        difference.tolist(),
+        a=a,
+        b=b,
+        seeds=seeds,
+        left_out_a=sorted(ours.keys() - theirs.keys(), key=_order),
+        left_out_b=sorted(theirs.keys() - ours.keys(), key=_order),
+        median=statistics.median(difference) if seeds else np.nan,
+        iqm=statistics.interquartile_mean(difference),
+        simultaneous=none,
+        improvement=statistics.improvement(sign * left, sign * right) if seeds else none,
+        wins=int((sign * difference > 0).sum()),
+        ties=int((difference == 0).sum()),
+        losses=int((sign * difference < 0).sum()),
+        differences=difference.tolist(),
     )

@@ -5,19 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final, Literal
 
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
-from runner.analysis.series import RunSeries, first_crossing, has_goal, mean_height, parse_target, points_of
+from runner.analysis.series import RunSeries, first_crossing, mean_height, parse_target, points_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF
 
+Kind = Literal["last", "best", "area", "episode", "crossing"]
+_OF_WHOLE_RUNS: Final[tuple[Kind, ...]] = ("last", "best", "area")
+
 
 def higher_is_better(metric: str, groups: Sequence[Group]) -> bool | None:
-    """Return what is better of a metric; None where nobody can say it in general."""
+    """Return whether higher values of a metric are better; None where neither is, in general."""
     better = METRIC_OF[metric].better if metric in METRIC_OF else None
     if better == "lower_to_goal":
-        return False if all(has_goal(run) for group in groups for run in group.runs) else None
+        return False if all(run.has_goal for group in groups for run in group.runs) else None
     return None if better is None else better == "higher"
 
 
@@ -30,22 +34,24 @@ class Moment:
     crossing: after how many episodes the curve is first at `level`, coming from the other side.
     """
 
-    kind: str
+    kind: Kind
     number: int = 0
     level: float | None = None
 
     @property
     def described(self) -> str:
         """A description of the moment."""
-        return {
-            "last": "at the last evaluation",
-            "best": "at each run's best evaluation",
-            "area": "the mean over training, by area under the curve",
-            "episode": f"after {self.number:,} training episodes",
-            "crossing": f"training episodes until it is first at {self.level:g}"
-            if self.level is not None
-            else "",
-        }[self.kind]
+        match self.kind:
+            case "last":
+                return "at the last evaluation"
+            case "best":
+                return "at each run's best evaluation"
+            case "area":
+                return "the mean over training, by area under the curve"
+            case "episode":
+                return f"after {self.number:,} training episodes"
+            case "crossing":
+                return f"training episodes until it is first at {self.level:g}"
 
 
 def moment_of(at: str, target: str | None, chosen: Sequence[str]) -> tuple[Moment, Sequence[str]]:
@@ -66,9 +72,10 @@ def moment_of(at: str, target: str | None, chosen: Sequence[str]) -> tuple[Momen
         return Moment("crossing", level=level), (metric,)
     if at.isascii() and at.isdecimal():
         return Moment("episode", number=int(at)), chosen
-    if at not in ("last", "best", "area"):
-        raise RunnerError(f"at: found {at!r}, expected last, best, area, or a number of training episodes.")
-    return Moment(at), chosen
+    for kind in _OF_WHOLE_RUNS:
+        if at == kind:
+            return Moment(kind), chosen
+    raise RunnerError(f"at: found {at!r}, expected last, best, area, or a number of training episodes.")
 
 
 def value_of(
@@ -85,17 +92,11 @@ def value_of(
         return None, "not finished; --at EPISODE takes it as far as it got"
     if moment.kind == "area":
         return _area(points, _shared_episodes(metric, line, groups))
-    return _of_curve(points, higher_is_better(metric, groups), moment), ""
-
-
-def _of_curve(points: dict[int, float], higher: bool | None, moment: Moment) -> float:
     if moment.level is not None:
         at = first_crossing(points, moment.level)
-        return NEVER if at is None else float(at)
-    if moment.kind == "best":
-        best = min if higher is False else max
-        return best(points.values())
-    return points[max(points)]
+        return NEVER if at is None else float(at), ""
+    best = min if higher_is_better(metric, groups) is False else max
+    return best(points.values()) if moment.kind == "best" else points[max(points)], ""
 
 
 def _shared_episodes(metric: str, line: str, groups: Sequence[Group]) -> list[int]:

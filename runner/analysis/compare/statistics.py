@@ -60,7 +60,8 @@ def interquartile_mean(values: Values) -> Estimate:
     """Return the mean of the middle half of the values, and its interval; nan for fewer than four."""
     if len(values) < FEWEST_FOR_IQM:
         return Estimate(np.nan, np.nan, np.nan)
-    return _estimate((values,), _iqm, 1)
+    low, high = _interval(values, _iqm)
+    return Estimate(bounded(float(_iqm(values, -1))), bounded(float(low)), bounded(float(high)))
 
 
 def improvement(a: Values, b: Values) -> Estimate:
@@ -132,15 +133,14 @@ def _standard_error(values: Values) -> Values:
 def share_at_least(values: Values, thresholds: Values) -> tuple[Values, Values, Values]:
     """Return the share of values that are at least each threshold, and its interval: (share, low, high)."""
     above = (values >= thresholds[:, np.newaxis]).astype(np.float64)
+    share = above.mean(axis=1)
     if len(values) < 2:
-        share = above.mean(axis=1)
         return share, np.full_like(share, np.nan), np.full_like(share, np.nan)
-    interval = _interval((above,), np.mean, above.size)
-    return above.mean(axis=1), interval[0], interval[1]
+    return share, *_interval(above, np.mean)
 
 
 def bounded(value: float) -> float:
-    """Return a value, infinite if it comes of `NEVER`."""
+    """Return a value, infinite if it was computed from `NEVER`."""
     return float(np.copysign(np.inf, value)) if abs(value) > NEVER / 1e6 else value
 
 
@@ -168,25 +168,14 @@ def _highest_probability(value: float, m: int, n: int) -> float:
     return float(brentq(contradiction, start, 1.0)) if contradiction(start) < 0 else 1.0
 
 
-def _estimate(data: tuple[Values, ...], statistic: Callable[..., Values], times: int) -> Estimate:
-    value = float(statistic(*data, axis=-1))
-    if len(data[0]) < 2:
-        return Estimate(bounded(value), np.nan, np.nan)
-    low, high = _interval(data, statistic, data[0].size * times)
-    return Estimate(bounded(value), bounded(float(low)), bounded(float(high)))
-
-
-def _interval(
-    data: tuple[Values, ...], statistic: Callable[..., Values], values_each: int
-) -> tuple[Values, Values]:
-    """Return the percentile bootstrap interval of a statistic over the last axis of paired samples."""
+def _interval(values: Values, statistic: Callable[..., Values]) -> tuple[Values, Values]:
+    """Return the percentile bootstrap interval of a statistic over the last axis."""
     result = require_scipy().bootstrap(
-        data,
+        (values,),
         statistic,
         n_resamples=RESAMPLES,
-        batch=max(1, _BATCH // values_each),
+        batch=max(1, _BATCH // values.size),
         vectorized=True,
-        paired=len(data) > 1,
         axis=-1,
         confidence_level=CONFIDENCE,
         method="percentile",

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from runner.analysis.groups import Group
-from runner.analysis.series import is_loop, values_left_out
+from runner.analysis.series import values_left_out
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.errors import RunnerError
@@ -95,7 +95,7 @@ def footnote(groups: Sequence[Group]) -> str:
     """Return what lines and bands mean, and which values are not drawn."""
     runs = [run for group in groups for run in group.runs]
     left_out = "".join(f" {sentence}" for sentence in values_left_out(runs))
-    loops = any(is_loop(run) for run in runs)
+    loops = any(run.is_loop for run in runs)
     greedy = "" if loops else " Evaluation trials follow the greedy policy: no exploring."
     if max(len(group.runs) for group in groups) == 1:
         return f"Each line is one run, as reported.{greedy}{left_out}"
