@@ -239,7 +239,7 @@ def _verify_job(recording: Recording, job: Job, rerun: bool, report: Report) -> 
         ended = session.run()
         topics = recorder.drain()
         if complete or ended:
-            reference.check_over()
+            reference.check_exhausted()
         if rerun:
             description = json.loads(json.dumps(mdp.description()))
             for key in sorted(description):

@@ -207,29 +207,29 @@ def _from_summary(stream: BinaryIO, footer: Footer, size: int) -> Index:
         raise RecordingError(f"the summary at {start} does not match its checksum; try `repair`.")
     index = Index(finished=True, end=start)
     for opcode, offset, body in _records(stream, start, end):
-        _note_summary(index, opcode, offset, body, start)
+        _add_summary_record(index, opcode, offset, body, start)
     return index
 
 
-def _note_summary(index: Index, opcode: int, offset: int, body: bytes, data_end: int) -> None:
-    """Take one record of the summary into the index."""
+def _add_summary_record(index: Index, opcode: int, offset: int, body: bytes, data_end: int) -> None:
+    """Add one record of the summary to the index."""
     if opcode == Opcode.CHUNK_INDEX:
         chunk = _chunk_entry(body, offset)
-        _within("chunk", chunk.offset, chunk.length, data_end)
+        _check_place("chunk", chunk.offset, chunk.length, data_end)
         index.chunks.append(chunk._replace(channel=0))
         if chunk.channel:
             index.chunks.set_channel(chunk.channel)
     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-        _note_topic(index, opcode, offset, body)
+        _add_schema_or_channel(index, opcode, offset, body)
     elif opcode == Opcode.STATISTICS:
         index.message_counts = dict(_parse(Statistics, body, offset).channel_message_counts)
     elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
         is_metadata = opcode == Opcode.METADATA_INDEX
         entry = _parse(MetadataIndex if is_metadata else AttachmentIndex, body, offset)
         what = "metadata" if is_metadata else "attachment"
-        _within(what, entry.offset, entry.length, data_end)
+        _check_place(what, entry.offset, entry.length, data_end)
         places = index.metadata if is_metadata else index.attachments
-        _put(places, entry.name, (entry.offset, entry.length), what)
+        _add_once(places, entry.name, (entry.offset, entry.length), what)
 
 
 def _from_records(stream: BinaryIO, size: int) -> Index:
@@ -238,13 +238,13 @@ def _from_records(stream: BinaryIO, size: int) -> Index:
     for opcode, offset, length in record_heads(stream, size):
         if opcode not in IN_DATA or (opcode == Opcode.MESSAGE_INDEX and not index.chunks):
             break
-        _note(index, stream, opcode, offset, length)
+        _add_record(index, stream, opcode, offset, length)
         index.end = offset + RECORD_HEAD.size + length
     return index
 
 
-def _note(index: Index, stream: BinaryIO, opcode: int, offset: int, length: int) -> None:
-    """Take one record of the data section into the index; the stream is at its body."""
+def _add_record(index: Index, stream: BinaryIO, opcode: int, offset: int, length: int) -> None:
+    """Add one record of the data section to the index; the stream is at its body."""
     if opcode == Opcode.CHUNK:
         head = stream.read(min(length, CHUNK_HEAD.size)).ljust(CHUNK_HEAD.size, b"\0")
         start, end, unpacked, _, _ = CHUNK_HEAD.unpack(head)
@@ -254,22 +254,22 @@ def _note(index: Index, stream: BinaryIO, opcode: int, offset: int, length: int)
         index.chunks.set_channel(channel)
     elif opcode == Opcode.METADATA:
         name = _name(stream.read(min(length, 4 + MAX_NAME_BYTES)), 0, offset)
-        _put(index.metadata, name, (offset, RECORD_HEAD.size + length), "metadata")
+        _add_once(index.metadata, name, (offset, RECORD_HEAD.size + length), "metadata")
     elif opcode == Opcode.ATTACHMENT:
         name = _name(stream.read(min(length, 20 + MAX_NAME_BYTES)), 16, offset)
-        _put(index.attachments, name, (offset, RECORD_HEAD.size + length), "attachment")
+        _add_once(index.attachments, name, (offset, RECORD_HEAD.size + length), "attachment")
     elif opcode != Opcode.HEADER:
         _check_length(length, offset)
-        _note_topic(index, opcode, offset, stream.read(length))
+        _add_schema_or_channel(index, opcode, offset, stream.read(length))
     elif offset != len(MCAP0_MAGIC):
         raise RecordingError(f"found a second header at {offset}.")
 
 
-def _note_topic(index: Index, opcode: int, offset: int, body: bytes) -> None:
-    """Take a schema or a channel into the index."""
+def _add_schema_or_channel(index: Index, opcode: int, offset: int, body: bytes) -> None:
+    """Add a schema or a channel to the index."""
     if opcode == Opcode.CHANNEL:
         channel = _parse(Channel, body, offset)
-        _put(index.channels, channel.id, channel, "channel")
+        _add_once(index.channels, channel.id, channel, "channel")
         return
     schema = _parse(Schema, body, offset)
     if schema.id in index.schemas:
@@ -337,8 +337,8 @@ def _name(body: bytes, at: int, offset: int) -> str:
     raise RecordingError(f"the record at {offset} declares a name of {length:,} bytes.")
 
 
-def _put(known: dict[K, T], key: K, value: T, what: str) -> None:
-    """Add what a file may have once."""
+def _add_once(known: dict[K, T], key: K, value: T, what: str) -> None:
+    """Add an entry; a file may have one of each key, and not too many."""
     if key in known:
         raise RecordingError(f"has {what} {key!r} twice.")
     if len(known) == (len(ALL_TOPICS) if what == "channel" else MAX_NAMED):
@@ -350,6 +350,6 @@ def _put(known: dict[K, T], key: K, value: T, what: str) -> None:
     known[key] = value
 
 
-def _within(what: str, offset: int, length: int, end: int) -> None:
+def _check_place(what: str, offset: int, length: int, end: int) -> None:
     if offset < len(MCAP0_MAGIC) or length < RECORD_HEAD.size or offset + length > end:
         raise RecordingError(f"the index points to {what} of {length} bytes at {offset}, outside the data.")

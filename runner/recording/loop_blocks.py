@@ -129,9 +129,8 @@ class Blocks:
         opens[::times] = True
         over = rows["terminated"] | rows["truncated"]
         ends = over.copy()
-        if (
-            len(self._recording.agents) > 1 and n == 1
-        ):  # a game may end without an agent's end: its episode says so
+        # A game of several agents may end without the end of any of them: its episode record says so.
+        if len(self._recording.agents) > 1 and n == 1:
             for block in self.episodes.peek_while("last_step", first + count):
                 silent = ~(block["terminated"] | block["truncated"]) & (block["last_step"] >= first)
                 ends[block["last_step"][silent] - first] = True

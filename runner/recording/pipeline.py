@@ -29,13 +29,16 @@ from runner.recording.writer import RecordingFile, storage_error
 from runner.util.packing import Packing
 
 ENCODERS: Final = 2
+"""Threads that compress."""
 MAX_PENDING: Final = 32
+"""Pieces of work that wait for the writer's thread before the sender waits."""
 MAX_HELD: Final = 4
 """Pieces of work that are held before threads are started; fewer than a topic has buffers."""
 SYNC_SECONDS: Final = 5.0
 """Interval at which what was written is synced to disk."""
 MAX_BATCH_BYTES: Final = 1 << 18
 MAX_BATCH_MESSAGES: Final = 4096
+"""A batch of messages is sent before it has more than either."""
 _BEAT_SECONDS: Final = 1.0
 
 Send = Callable[[Topic, memoryview, NDArray[np.uint64], NDArray[np.uint64]], None]
@@ -92,7 +95,7 @@ class Pipeline:
 
     def _start(self) -> None:
         self._encoders = ThreadPoolExecutor(ENCODERS, thread_name_prefix="encoder")
-        self._writer = threading.Thread(target=self._run, name="recording-writer", daemon=True)
+        self._writer = threading.Thread(target=self._write_queue, name="recording-writer", daemon=True)
         self._writer.start()
 
     def send(
@@ -117,7 +120,7 @@ class Pipeline:
         encode = None
         if write and self._file is not None:
             encode = partial(encode_chunk, topic, records, log_times, offsets, self._packing)
-        self._submit(_Work(topic, records, encode, done))
+        self._enqueue(_Work(topic, records, encode, done))
 
     def submit(self, topic: Topic, make: Callable[[], bytes], log_time: int) -> None:
         """Send one message of a topic that an encoder thread makes; waits while too much is pending.
@@ -134,7 +137,7 @@ class Pipeline:
             times = np.array([log_time], np.uint64)
             return encode_chunk(topic, record, times, np.zeros(1, np.uint64), self._packing)
 
-        self._submit(_Work(topic, memoryview(b""), encode if self._file is not None else None, lambda: None))
+        self._enqueue(_Work(topic, memoryview(b""), encode if self._file is not None else None, lambda: None))
 
     def release(self, threads: bool = True) -> None:
         """Write what is held, and hold nothing from now on; `threads` False does so without threads.
@@ -153,7 +156,7 @@ class Pipeline:
         if threads:
             self._start()
         for work in held:
-            self._submit(work)
+            self._enqueue(work)
 
     @property
     def is_open(self) -> bool:
@@ -183,7 +186,7 @@ class Pipeline:
             if self._encoders is not None:
                 self._encoders.shutdown(cancel_futures=True)
 
-    def _submit(self, work: _Work) -> None:
+    def _enqueue(self, work: _Work) -> None:
         if self._held is not None:
             self._held.append(work)
             if len(self._held) == MAX_HELD:
@@ -197,7 +200,7 @@ class Pipeline:
                     chunk = self._encoders.submit(work.encode)
             self._queue.put((work, chunk))
 
-    def _run(self) -> None:
+    def _write_queue(self) -> None:
         while True:
             try:
                 work = self._queue.get(timeout=_BEAT_SECONDS)
@@ -237,6 +240,8 @@ class Pipeline:
 
 @dataclass
 class _Batch:
+    """Message records of one topic that wait for a chunk."""
+
     records: list[bytes] = field(default_factory=list)
     times: list[int] = field(default_factory=list)
     size: int = 0

@@ -4,8 +4,8 @@
         for block in recording.blocks(TRAIN_STEP):      # NumPy records, some thousands at a time
             print(block["rewards"].mean())
 
-A block is the file's own bytes seen through the dtype of `record_dtype`: no message is parsed one
-by one. All other parts of the project read recordings through it.
+A block is the file's own bytes seen through the dtype of `record_dtype`: no message is parsed by itself. All
+other parts of the project read recordings through this module.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Recording(RunDescription):
         except BaseException:
             self.close()
             raise
-        self._known_chunks: dict[Topic, TopicChunks] = {}
+        self._topic_chunks: dict[Topic, TopicChunks] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -133,9 +133,10 @@ class Recording(RunDescription):
             "train_steps": schema.TRAIN_STEP,
             "eval_steps": schema.EVAL_STEP,
         }
-        stated = {key: getattr(self.result, key) for key in topics}
+        recorded = {key: getattr(self.result, key) for key in topics}
         return {
-            key: self.count(topic) if stated[key] is None else stated[key] for key, topic in topics.items()
+            key: self.count(topic) if recorded[key] is None else recorded[key]
+            for key, topic in topics.items()
         }
 
     def metadata(self, name: str) -> dict[str, str]:
@@ -188,9 +189,9 @@ class Recording(RunDescription):
         Raises:
             RecordingError: a recording of its kind has none.
         """
-        if name not in self._own:
+        if name not in self._topics_by_name:
             raise RecordingError(f"{self.path}: has no topic {name!r}: it is of the kind {self.kind!r}.")
-        return self._own[name]
+        return self._topics_by_name[name]
 
     @property
     def has_steps(self) -> bool:
@@ -242,10 +243,10 @@ class Recording(RunDescription):
             RecordingError: the recording has no such episode, or no steps.
         """
         topic, episodes = self.topic(f"/{phase}/step"), self.topic(f"/{phase}/episode")
-        stride, phased = self.environments, schema.PHASE_NAMES[phase]
+        stride, phase_name = self.environments, schema.PHASE_NAMES[phase]
         total, ended = self.count(topic), self.count(episodes)
         if not total:
-            raise RecordingError(f"{self.path}: has no {phased} steps.")
+            raise RecordingError(f"{self.path}: has no {phase_name} steps.")
         start = stop = 0
         if 0 <= episode < ended and len(records := self.episodes(phase, episode, episode + 1)):
             stop = int(records[0]["last_step"]) + 1
@@ -255,16 +256,16 @@ class Recording(RunDescription):
             start, stop = int(last[0]["last_step"]) + 1 if len(last) else 0, total
         if not 0 <= start < stop <= total:
             raise RecordingError(
-                f"{self.path}: has no {phased} episode {episode}; there are {ended}, from 0."
+                f"{self.path}: has no {phase_name} episode {episode}; there are {ended}, from 0."
             )
         if (stop - start) * self.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
             raise RecordingError(
-                f"{self.path}: {phased} episode {episode} has {stop - start:,} steps, too many for an array; "
-                f"read them in blocks, from {start}."
+                f"{self.path}: {phase_name} episode {episode} has {stop - start:,} steps, too many for an "
+                f"array; read them in blocks, from {start}."
             )
         blocks = list(self.blocks(topic, start, stop))
         if not blocks:
-            raise RecordingError(f"{self.path}: the steps of {phased} episode {episode} were lost.")
+            raise RecordingError(f"{self.path}: the steps of {phase_name} episode {episode} were lost.")
         return np.concatenate(blocks)[::stride]
 
     # --- messages, parsed -----------------------------------------------------------------------------
@@ -385,25 +386,25 @@ class Recording(RunDescription):
 
     def _chunks(self, topic: Topic) -> TopicChunks:
         """Return the chunks of a topic, or of this recording's own topic of that name: the kinds differ."""
-        own = self._own.get(topic.name, topic)
-        if own not in self._known_chunks:
-            self._known_chunks[own] = TopicChunks(
+        own = self._topics_by_name.get(topic.name, topic)
+        if own not in self._topic_chunks:
+            self._topic_chunks[own] = TopicChunks(
                 own,
-                self._places[own],
+                self._chunk_numbers[own],
                 self._index.chunks,
                 self._store,
                 self.dtypes.get(own),
                 self.lost.get(own.name, []),
                 str(self.path),
             )
-        return self._known_chunks[own]
+        return self._topic_chunks[own]
 
     @cached_property
-    def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
-        """The chunks of the file that hold each topic."""
+    def _chunk_numbers(self) -> Mapping[Topic, NDArray[np.intp]]:
+        """The numbers of the chunks of the file that hold each topic."""
         return chunks_by_topic(self._index, self._store, self.dtypes, str(self.path))
 
     @cached_property
-    def _own(self) -> Mapping[str, Topic]:
+    def _topics_by_name(self) -> Mapping[str, Topic]:
         """The topics that a recording of its kind has, by name."""
         return {topic.name: topic for topic in self.topics}

@@ -51,11 +51,17 @@ class _Lane:
     topic: Topic
     sizes: Sizes
     capacity: int
+    """Records of a whole block."""
     write: bool
+    """Whether its records go into the file, or into the digest alone."""
     open: _Block | None = None
+    """The block that is being filled."""
     free: queue.SimpleQueue[_Block] = field(default_factory=queue.SimpleQueue)
+    """Blocks that were written and can be filled again."""
     made: int = 0
-    is_used: bool = False
+    """Number of whole blocks, at most `MAX_BLOCKS`."""
+    has_started: bool = False
+    """Whether it had its first block, which may be smaller."""
 
 
 class Recorder:
@@ -281,13 +287,13 @@ class Recorder:
 
     def _open(self, topic: Topic) -> _Block:
         block = self._lanes[topic].open
-        assert block is not None, "commit without block"
+        assert block is not None, "records were committed before `block` was called"
         return block
 
     def _take_block(self, lane: _Lane) -> _Block:
         """Return a block to fill: one that was used before, or a new one while there may be more."""
-        if self._first_records is not None and not lane.is_used:
-            lane.is_used = True
+        if self._first_records is not None and not lane.has_started:
+            lane.has_started = True
             return _Block(blank_records(lane.topic, lane.sizes, min(self._first_records, lane.capacity)))
         if lane.made < MAX_BLOCKS and lane.free.empty():
             lane.made += 1

@@ -95,16 +95,16 @@ class Reference:
         return True
 
     def check_new(self, topic: Topic, records: NDArray[np.void]) -> None:
-        """Refuse records that the recording does not hold if it should be complete.
+        """Check that records which the recording does not hold may be new.
 
         Raises:
-            Diverged: it should.
+            Diverged: the recording should be complete.
         """
         if self.complete and topic not in self._unrecorded and len(records):
             raise Diverged(topic.name, "message", "none", "one more", **_place(records[0]))
 
-    def check_over(self) -> None:
-        """Refuse a recording that holds more than the run gave, which is over.
+    def check_exhausted(self) -> None:
+        """Check, after the run, that the recording holds no more than the run gave.
 
         Raises:
             Diverged: it does.

@@ -67,16 +67,14 @@ def _with_inferred(
     """Return the channels of all chunks, those of full chunks inferred; as they were if the counts disagree.
 
     A chunk size that occurs often belongs to the one fixed-width topic whose records divide it and which has
-    enough messages. Where training and evaluation both do, chunks of steps that follow each other without
-    a gap in time are of one phase if the first and the last of them are: the first steps of an evaluation go
-    into a chunk of their own. A wrong inference would give a topic more messages than the summary counts.
+    enough messages. Where training and evaluation both do, `_infer_phases` tells them apart. A wrong
+    inference would give a topic more messages than the summary counts.
     """
-    columns = index.chunks.columns
-    sizes, times = columns["uncompressed_size"], (columns["start_time"], columns["end_time"])
+    sizes = index.chunks.columns["uncompressed_size"]
     inferred = channels.copy()
-    chosen = set()
-    found = np.unique(sizes[channels == 0], return_counts=True)
-    for size, count in zip(*(numbers.tolist() for numbers in found), strict=True):
+    candidates: set[Topic] = set()
+    unknown_sizes = np.unique(sizes[channels == 0], return_counts=True)
+    for size, count in zip(*(numbers.tolist() for numbers in unknown_sizes), strict=True):
         fitting = [
             topic
             for topic, dtype in dtypes.items()
@@ -88,23 +86,35 @@ def _with_inferred(
         places = np.flatnonzero((channels == 0) & (sizes == size))
         if len(fitting) == 1:
             inferred[places] = fitting[0].channel
-            chosen.update(fitting)
+            candidates.update(fitting)
         elif {topic.message for topic in fitting} <= {schema.STEP, schema.TRANSITION}:
-            span = np.uint64((size // dtypes[fitting[0]].itemsize - 1) * STEP_NANOSECONDS)
-            places = places[times[1][places] - times[0][places] == span]
-            breaks = times[0][places][1:] != times[1][places][:-1] + np.uint64(STEP_NANOSECONDS)
-            for chain in np.split(places, np.flatnonzero(breaks) + 1):
-                if len(chain):
-                    _probe(chain[[0, -1]], index.chunks, store, inferred)
-                    if inferred[chain[0]] == inferred[chain[-1]]:
-                        inferred[chain] = inferred[chain[0]]
-            chosen.update(fitting)
+            _infer_phases(places, size // dtypes[fitting[0]].itemsize, index.chunks, store, inferred)
+            candidates.update(fitting)
     _probe(np.flatnonzero(inferred == 0), index.chunks, store, inferred)
-    for topic in chosen:
+    for topic in candidates:
         messages = int(sizes[inferred == topic.channel].sum(dtype=np.uint64)) // dtypes[topic].itemsize
         if messages != index.message_counts.get(topic.channel, 0):
             return channels
     return inferred
+
+
+def _infer_phases(
+    places: NDArray[np.intp], steps: int, table: ChunkTable, store: RecordStore, channels: NDArray[np.uint16]
+) -> None:
+    """Set the channels of chunks of `steps` steps each, which may be of training or of evaluation.
+
+    Chunks that follow each other without a gap in time are of one phase if the first and the last of them
+    are: the first steps of an evaluation go into a chunk of their own.
+    """
+    starts, ends = (table.columns[name] for name in ("start_time", "end_time"))
+    without_gap = ends[places] - starts[places] == np.uint64((steps - 1) * STEP_NANOSECONDS)
+    places = places[without_gap]
+    breaks = starts[places][1:] != ends[places][:-1] + np.uint64(STEP_NANOSECONDS)
+    for chain in np.split(places, np.flatnonzero(breaks) + 1):
+        if len(chain):
+            _probe(chain[[0, -1]], table, store, channels)
+            if channels[chain[0]] == channels[chain[-1]]:
+                channels[chain] = channels[chain[0]]
 
 
 class TopicChunks:
@@ -144,7 +154,7 @@ class TopicChunks:
         return len(self._places)
 
     def entry(self, k: int) -> ChunkEntry:
-        """Return the place of chunk number k, and what it declares."""
+        """Return the entry of chunk number k in the file's table."""
         return self._table[int(self._places[k])]
 
     def count(self) -> int:
@@ -173,7 +183,9 @@ class TopicChunks:
         start, stop = np.uint64(max(start_time, 0)), np.uint64(max(stop_time, 0))
         times = self._table.columns[self._places]
         first, end = np.searchsorted(times["end_time"], start), np.searchsorted(times["start_time"], stop)
-        for block in self.blocks(int(firsts[first]), int(ends[end - 1])) if first < end else ():
+        if first >= end:
+            return
+        for block in self.blocks(int(firsts[first]), int(ends[end - 1])):
             low, high = (int(np.searchsorted(block["log_time"], time)) for time in (start, stop))
             if low < high:
                 yield block[low:high]
@@ -205,20 +217,21 @@ class TopicChunks:
 
     @cached_property
     def _numbers(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The number of each chunk's first message, and after its last."""
+        """The number of each chunk's first message, and the number after its last."""
         if self._dtype is None:
             raise RecordingError(
                 f"{self._path}: the messages of {self._topic.name} vary in size; read them one by one."
             )
-        size = self._dtype.itemsize
+        width = self._dtype.itemsize
         sizes = np.empty(0, np.int64)
         if len(self):
             sizes = self._table.columns["uncompressed_size"][self._places].astype(np.int64)
-        if (odd := np.flatnonzero(sizes % size)).size:
+        if (odd := np.flatnonzero(sizes % width)).size:
             k = int(odd[0])
-            raise self._damaged(k, f"{self.entry(k).uncompressed_size} bytes, not a multiple of {size}")
-        ends = np.cumsum(sizes // size)
-        firsts = ends - sizes // size
+            raise self._damaged(k, f"{sizes[k]} bytes, not a multiple of {width}")
+        counts = sizes // width
+        ends = np.cumsum(counts)
+        firsts = ends - counts
         for start, stop in self._lost:
             after = firsts >= start
             firsts[after] += stop - start

@@ -25,7 +25,9 @@ def run(request, tmp_path):
 def places(run):
     """Return what each topic's chunks are."""
     with open_recording(run.recording) as recording:
-        return {topic.name: chunks.tolist() for topic, chunks in recording._places.items() if len(chunks)}
+        return {
+            topic.name: chunks.tolist() for topic, chunks in recording._chunk_numbers.items() if len(chunks)
+        }
 
 
 def test_few_chunks_of_a_long_recording_are_unpacked_to_learn_their_topic(run, monkeypatch):
@@ -52,7 +54,9 @@ def test_counts_that_the_inferred_chunks_do_not_give_make_all_be_unpacked(run, m
         counts = recording._index.message_counts
         for channel in counts:
             counts[channel] += 7
-        found = {topic.name: chunks.tolist() for topic, chunks in recording._places.items() if len(chunks)}
+        found = {
+            topic.name: chunks.tolist() for topic, chunks in recording._chunk_numbers.items() if len(chunks)
+        }
     assert found == expected
 
 
