@@ -89,7 +89,7 @@ def _processor() -> str:
 
 def _git() -> dict[str, str]:
     """Return commit and state of the source tree this code runs from; nothing outside one."""
-    root = Path(__file__).resolve().parent.parent
+    root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return {}
     command = ["git", "-C", os.fspath(root), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
