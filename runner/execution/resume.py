@@ -53,7 +53,7 @@ DECISIVE: Final = (
     *("package.numpy", "package.numba", "package.llvmlite"),
 )
 """Provenance that must be the same at the beginning of a run and when it is resumed."""
-_ANEW: Final = ".anew"
+_REPLACEMENT: Final = ".anew"
 """The suffix of a recording that replaces a damaged one."""
 
 
@@ -156,14 +156,14 @@ def _place(run: Run, described: bool) -> tuple[Path, Contents]:
         run: the run.
         described: whether the recording has the job's description.
     """
-    anew = run.recording.with_suffix(_ANEW)
     if not run.recording.is_file():
         return run.recording, Contents()
     contents = survey(run.recording)
     if may_be_cut(run.recording, contents) and (described or not contents.chunks):
         return run.recording, contents
-    contents = survey(anew) if anew.is_file() else Contents()
-    return anew, contents if may_be_cut(anew, contents) else Contents()
+    replacement = run.recording.with_suffix(_REPLACEMENT)
+    contents = survey(replacement) if replacement.is_file() else Contents()
+    return replacement, contents if may_be_cut(replacement, contents) else Contents()
 
 
 def _job(run: Run) -> tuple[Job, bool]:
@@ -222,7 +222,7 @@ def _opened(
 
 
 def _complete(run: Run, path: Path) -> Run:
-    """Compare a finished recording's digest with the one it once had; let a replacement replace the old file.
+    """Compare a finished recording's digest with the one it once had; move a replacement into place.
 
     Raises:
         Diverged: the digests differ; the damaged recording stays.

@@ -96,27 +96,26 @@ def import_recording(
         found = exported.get("labels")
         labels = labels_from(found) if isinstance(found, dict) else Labels()
     digest, anonymous = content_of(recording), exported.get("anonymous") is True
-    run_id = new_run_id(recordings) if as_new else str(facts["run_id"])
-    try:
-        run = None if as_new else _same_run(run_id, digest, recordings)
-    except Occupied as occupied:
-        with _staging_folder(recordings, recording) as folder:
-            _place(recording, folder / RECORDING_FILE, facts, rewritten=bool(exported))
-            run, already = _continue_or_keep(occupied, folder / RECORDING_FILE, facts, labels)
-        return Imported(run, digest, already, anonymous)
-    if run is not None:
-        return Imported(_finish(run, facts), digest, already=True, anonymous=anonymous)
+    if as_new:
+        facts["run_id"] = new_run_id(recordings)
+    target = recordings / facts["run_id"]
+    existing = None if as_new else _existing_run(target)
+    if existing is not None and _has_content(existing, digest):
+        return Imported(_finish(existing, facts), digest, already=True, anonymous=anonymous)
     with _staging_folder(recordings, recording) as folder:
-        facts["run_id"] = run_id
         _place(recording, folder / RECORDING_FILE, facts, rewritten=as_new or bool(exported))
+        if existing is not None:
+            occupied = Occupied(existing, recordings)
+            run, already = _continue_or_keep(occupied, folder / RECORDING_FILE, facts, labels)
+            return Imported(run, digest, already, anonymous)
         write_object(folder / RUN_FILE, facts)
         if labels != Labels():
             write_object(folder / LABELS_FILE, as_json(labels))
         for path in (*folder.iterdir(), folder):
             sync(path)
-        folder.rename(recordings / run_id)
+        folder.rename(target)
         sync(recordings)
-    return Imported(run_at(recordings / run_id), digest, already=False, anonymous=anonymous)
+    return Imported(run_at(target), digest, already=False, anonymous=anonymous)
 
 
 def run_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str, Any]:
@@ -182,28 +181,29 @@ def _checked_facts(recording: Recording, details: Mapping[str, Any]) -> dict[str
     return facts | {"provenance": {key: made_by[key] for key in MADE_BY if key in made_by}}
 
 
-def _same_run(run_id: str, content_digest: str, recordings: Path) -> Run | None:
-    """Return the run of this id and content in the folder; None if the id is free.
+def _existing_run(target: Path) -> Run | None:
+    """Return the run whose id a folder is to have as its name; None if there is none.
 
     Raises:
-        Occupied: a run of this id has other content.
-        StorageError: something that is not a run has its name.
+        StorageError: something that is not a run has the folder's name.
     """
-    found = run_with_id(run_id, recordings)
-    if found is None:
-        if os.path.lexists(recordings / run_id):
-            raise StorageError(f"{recordings / run_id}: exists and is not a run; move it away.")
-        return None
-    with contextlib.suppress(RecordingError):
-        if content_of(found.recording) == content_digest:
-            return found
-    raise Occupied(found, recordings)
+    found = run_with_id(target.name, target.parent)
+    if found is None and os.path.lexists(target):
+        raise StorageError(f"{target}: exists and is not a run; move it away.")
+    return found
+
+
+def _has_content(run: Run, content_digest: str) -> bool:
+    try:
+        return content_of(run.recording) == content_digest
+    except RecordingError:
+        return False
 
 
 def _continue_or_keep(
     occupied: Occupied, recording: Path, facts: Mapping[str, Any], labels: Labels
 ) -> tuple[Run, bool]:
-    """Return the existing run, and whether it already has all of the recording.
+    """Return the existing run of `occupied`, and whether it already has all of the recording.
 
     If it did not finish and the recording continues it, the recording replaces its own. If that is
     interrupted, `_finish` completes it when the same recording is imported again.

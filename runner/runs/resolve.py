@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from runner.errors import RunNotFound, nearest
 from runner.recording.run_file import RUN_ID, run_title
-from runner.runs.run import Run, recordings_folder, run_at, runs_in
+from runner.runs.run import Run, listed_run, recordings_folder, run_at, run_in
 from runner.util.values import RUN_NAME_PATTERN
 
 if TYPE_CHECKING:
@@ -47,9 +47,7 @@ class Candidate(NamedTuple):
         Raises:
             RunNotFound: it was removed in the meantime.
         """
-        for run in runs_in(Path(self.root, self.entry)):
-            return run
-        raise RunNotFound(f"run {self.run_id} was removed just now.")
+        return listed_run(Path(self.root, self.entry), self.run_id)
 
 
 def find_run(
@@ -94,7 +92,8 @@ def run_of_id(run_id: str, recordings: Path) -> Run | None:
     """Return the run in the folder with this name and id; None if there is none, or it is not an id."""
     if not RUN_ID.fullmatch(run_id) or not run_id.strip("."):
         return None
-    return next((run for run in runs_in(recordings / run_id) if run.run_id == run_id), None)
+    run = run_in(recordings / run_id)
+    return run if run and run.run_id == run_id else None
 
 
 def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> list[Run]:
@@ -121,7 +120,7 @@ def run_with_id(run_id: str, recordings: Path) -> Run | None:
 
     found = look([recordings], lambda index: matching(run_id, index), depth=Depth.FOLDERS)
     place = next((Path(run.root, run.entry) for run in found if run.run_id == run_id), None)
-    return next(runs_in(place), None) if place else None
+    return run_in(place) if place else None
 
 
 def matching(name: str, index: Index, exclude: str = "") -> list[Candidate]:

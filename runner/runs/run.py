@@ -293,7 +293,7 @@ def list_runs(recordings: str | os.PathLike[str] | None = None) -> list[Run]:
         StorageError: the folder is there and cannot be read.
     """
     folder = recordings_folder(recordings)
-    runs = [run for entry in run_entries(folder) for run in runs_in(folder / entry)]
+    runs = [run for entry in run_entries(folder) if (run := run_in(folder / entry))]
     return sorted(runs, key=lambda run: (run.created, run.run_id), reverse=True)
 
 
@@ -320,7 +320,7 @@ def run_at(path: Path) -> Run:
         RecordingError: the recording cannot be read.
     """
     if path.is_dir():
-        for run in runs_in(path):
+        if run := run_in(path):
             return run
         raise RunNotFound(f"{path}: found a folder without {RUN_FILE} or {RECORDING_FILE}, expected a run.")
     if not path.is_file():
@@ -330,16 +330,28 @@ def run_at(path: Path) -> Run:
     return _from_recording(path)
 
 
-def runs_in(folder: Path) -> Iterator[Run]:
-    """Yield the run in a folder, if there is one; from its recording when `run.json` is gone."""
+def run_in(folder: Path) -> Run | None:
+    """Return the run in a folder, from its recording when `run.json` is gone; None if there is none."""
     with contextlib.suppress(OSError, ValueError):
         facts = read_object(folder / RUN_FILE, MAX_RUN_FILE_BYTES)
         if _is_run(facts):
-            yield Run(folder, facts)
-            return
+            return Run(folder, facts)
     if (folder / RECORDING_FILE).is_file():
         with contextlib.suppress(RecordingError):
-            yield _from_recording(folder / RECORDING_FILE)
+            return _from_recording(folder / RECORDING_FILE)
+    return None
+
+
+def listed_run(folder: Path, run_id: str) -> Run:
+    """Return the run in a folder, which had this id when the folder was listed.
+
+    Raises:
+        RunNotFound: it was removed in the meantime.
+    """
+    run = run_in(folder)
+    if run is None:
+        raise RunNotFound(f"run {run_id} was removed just now.")
+    return run
 
 
 def label(

@@ -25,7 +25,7 @@ from runner.cli.output import aligned, console, draw, print_json, printable, say
 from runner.cli.runs import find
 from runner.errors import RunnerError
 from runner.runs.catalogue.columns import STATUSES
-from runner.runs.run import recordings_folder, runs_in
+from runner.runs.run import recordings_folder, run_in
 from runner.util.humanize import UNKNOWN, age, number, size
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def prune_command(
         removals = [plan_row(row, force) for row in rows]
     else:
         places = [(Path(row["root"]), row["entry"]) for row in rows]
-        removals = [plan(run, root, force) for root, entry in places for run in runs_in(root / entry)]
+        removals = [plan(run, root, force) for root, entry in places if (run := run_in(root / entry))]
     kept = {each.run_id: each.refusal for each in removals if each.refusal}
     for run_id, reason in kept.items():
         say(f"Run {run_id} stays: {reason}.")
@@ -162,9 +162,9 @@ def _carry_out(
     Raises:
         RunnerError: confirmation is needed, and there is no terminal.
     """
-    from runner.runs.catalogue.removal import clean, remove, total
+    from runner.runs.catalogue.removal import clean, remove
 
-    freed = total(removals)
+    freed = sum(removal.freed for removal in removals)
     if removals and not as_json:
         _draw(removals)
     if removals and not dry_run:

@@ -118,19 +118,3 @@ def write_rows(database: SqliteDatabase, rows: Sequence[Mapping[str, Any]]) -> N
     values = [[field.db_value(row[field.name]) for field in fields] for row in rows]
     statement = f"INSERT OR REPLACE INTO {Row._meta.table_name} ({columns}) VALUES ({places})"
     database.connection().executemany(statement, values)  # type: ignore[no-untyped-call]
-
-
-def store_usage(database: SqliteDatabase, values: Sequence[tuple[Any, ...]]) -> None:
-    """Store the disk usage of folders, unless they changed in the meantime.
-
-    Args:
-        database: the index.
-        values: bytes of the recording, of all else, left over, and freed by removal; then root, entry, mark
-            and fingerprint of the folder.
-    """
-    statement = (
-        f"UPDATE {Row._meta.table_name} SET used_recording=?, used_other=?, used_left_over=?, used_freed=? "
-        "WHERE root=? AND entry=? AND mark=? AND fingerprint=?"
-    )
-    with database.atomic("IMMEDIATE"):
-        database.connection().executemany(statement, values)  # type: ignore[no-untyped-call]

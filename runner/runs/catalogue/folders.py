@@ -19,7 +19,7 @@ from peewee import SqliteDatabase, chunked
 from runner.recording.labels import LABELS_FILE
 from runner.runs.catalogue.database import tuples_of, write_rows
 from runner.runs.catalogue.rows import Row, row_of
-from runner.runs.run import RECORDING_FILE, RUN_FILE, run_entries, runs_in
+from runner.runs.run import RECORDING_FILE, RUN_FILE, run_entries, run_in
 
 _STABLE_NS: Final = 2 * 10**9
 """Files that changed this recently may change again with the same time: they are read again next time."""
@@ -55,7 +55,14 @@ class Difference:
 
 
 class Folders:
-    """Some recordings folders, compared with the index."""
+    """Some recordings folders, compared with the index.
+
+    Args:
+        database: the index.
+        roots: absolute paths of recordings folders.
+        depth: which changes are detected.
+        rebuild: read every run, changed or not.
+    """
 
     def __init__(
         self,
@@ -64,14 +71,6 @@ class Folders:
         depth: Depth = Depth.FILES,
         rebuild: bool = False,
     ) -> None:
-        """Begin a comparison.
-
-        Args:
-            database: the index.
-            roots: absolute paths of recordings folders.
-            depth: which changes are detected.
-            rebuild: read every run, changed or not.
-        """
         self._database = database
         self._roots = roots
         self._depth = depth
@@ -169,7 +168,7 @@ class Folders:
         self._tokens[root][entry] = mark if self._depth is Depth.FOLDERS else seen.fingerprint
         self._read[root].add(entry)
         place = {"root": root, "entry": entry, "fingerprint": seen.fingerprint, "mark": mark}
-        for run in runs_in(Path(root, entry)):
+        if run := run_in(Path(root, entry)):
             return _EMPTY | place | {"stable": stable} | row_of(run, seen.size)
         problem = f"{Path(root, entry)}: neither {RUN_FILE} nor {RECORDING_FILE} can be read as a run."
         return _EMPTY | place | {"stable": stable, "problem": problem}
@@ -210,7 +209,8 @@ def _mark(root: str, entry: str) -> tuple[str, int]:
 
 
 def _is_running(root: str, entry: str) -> bool:
-    return any(run.status == "running" for run in runs_in(Path(root, entry)))
+    run = run_in(Path(root, entry))
+    return run is not None and run.status == "running"
 
 
 _EMPTY: Final[dict[str, Any]] = dict.fromkeys(Row._meta.sorted_field_names)

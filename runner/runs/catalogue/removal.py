@@ -12,13 +12,12 @@ import secrets
 import shutil
 import time
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from runner.errors import RunnerError, RunNotFound, StorageError
+from runner.errors import RunnerError, StorageError
 from runner.recording.labels import KEEP, LABELS_FILE, are_readable
 from runner.runs.catalogue.columns import moment
 from runner.runs.catalogue.filters import ANY_RUN, Filter
@@ -26,10 +25,11 @@ from runner.runs.catalogue.index import Index, Rows
 from runner.runs.catalogue.rows import Row, row_of
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
 from runner.runs.locking import locked
-from runner.runs.run import Run, runs_in
+from runner.runs.run import Run, listed_run
 from runner.util.humanize import listed
 
 _STRAY_SECONDS: Final = 60
+"""The rest of a removal that is older than this is deleted: no other process is at it any more."""
 _COLUMNS: Final = (
     *("root", "entry", "id", "name", "seed", "config", "status", "tags"),
     *("success_percent", "created", "archive"),
@@ -64,9 +64,7 @@ class Removal:
         Raises:
             RunNotFound: it was removed in the meantime.
         """
-        for run in runs_in(self.folder):
-            return run
-        raise RunNotFound(f"run {self.run_id} was removed just now.")
+        return listed_run(self.folder, self.run_id)
 
 
 def plan(run: Run, root: Path, force: bool = False) -> Removal:
@@ -252,8 +250,3 @@ def _delete(folder: Path, force: bool) -> None:
         elif force or belongs(entry.name):
             Path(entry.path).unlink(missing_ok=True)
     folder.rmdir()
-
-
-def total(removals: Sequence[Removal]) -> int:
-    """Return the bytes that removals free."""
-    return sum(removal.freed for removal in removals)

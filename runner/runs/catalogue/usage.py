@@ -10,12 +10,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 from peewee import Case, DatabaseError, Value, chunked, fn
 
 from runner.recording.labels import KEEP, LABELS_FILE, LOCK_FILE
-from runner.runs.catalogue.database import open_index, store_usage
+from runner.runs.catalogue.database import open_index
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import Index, Rows
 from runner.runs.catalogue.rows import Row
@@ -100,18 +100,7 @@ def cached(part: str) -> Counter[str]:
     return found
 
 
-class _Sized(Protocol):
-    @property
-    def recording(self) -> int: ...
-    @property
-    def exports(self) -> int: ...
-    @property
-    def restored(self) -> int: ...
-    @property
-    def other(self) -> int: ...
-
-
-def sizes(usages: Sequence[_Sized]) -> dict[str, int]:
+def sizes(usages: Sequence[Usage | Sums]) -> dict[str, int]:
     """Return the bytes that runs use together, by kind, and their total."""
     found = {kind: sum(getattr(usage, kind) for usage in usages) for kind in KINDS}
     return found | {"total": sum(found.values())}
@@ -283,7 +272,11 @@ def _summed(index: Index) -> list[Any]:
 
 
 def _store(measured: Sequence[tuple[Mapping[str, Any], Contents]]) -> None:
-    """Store what was measured in the index, if it can be written."""
+    """Store what was measured in the index, if it can be written; not of folders that changed since."""
+    statement = (
+        f"UPDATE {Row._meta.table_name} SET used_recording=?, used_other=?, used_left_over=?, used_freed=? "
+        "WHERE root=? AND entry=? AND mark=? AND fingerprint=?"
+    )
     values = [
         (
             *(contents.recording, contents.other, contents.left_over, contents.freed),
@@ -294,8 +287,9 @@ def _store(measured: Sequence[tuple[Mapping[str, Any], Contents]]) -> None:
     with (
         contextlib.suppress(DatabaseError, OSError),
         contextlib.closing(open_index(lambda _: None)) as database,
+        database.atomic("IMMEDIATE"),
     ):
-        store_usage(database, values)
+        database.connection().executemany(statement, values)  # type: ignore[no-untyped-call]
 
 
 def strays(root: Path) -> list[Path]:

@@ -168,7 +168,7 @@ def test_every_table_is_read_by_others(loop):
         assert duckdb.execute(f"SELECT count(*) FROM '{file}'").fetchall() == [(expected,)]
 
 
-def test_the_numbers_of_a_pole_have_a_column_each(tmp_path):
+def test_every_number_of_an_observation_has_a_column(tmp_path):
     path = LOOPS["pole"](tmp_path)
     folder = archived(path, tmp_path / "archive")
     steps = pq.read_table(folder / layout.STEPS)
@@ -194,7 +194,7 @@ def test_the_numbers_of_a_pole_have_a_column_each(tmp_path):
     assert (run["kind"], run["env_id"], run["environments"]) == ("transition", "CartPole-v1", 1)
 
 
-def test_values_of_nested_spaces_are_named_by_the_way_to_them(tmp_path):
+def test_values_of_nested_spaces_are_named_by_their_path(tmp_path):
     texts = pq.read_table(archived(LOOPS["texts"](tmp_path), tmp_path / "archive") / layout.STEPS)
     names = set(texts.schema.names)
     assert {"next_observation_position_1", "next_observation_room_1_0", "action_go"} <= names

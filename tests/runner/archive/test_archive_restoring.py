@@ -113,8 +113,8 @@ def test_a_snapshot_that_the_steps_do_not_make_is_kept_whole(run, tmp_path):
         return list(zip(times, map(bytes, payloads), strict=True))
 
     def without_digests(entries):
-        said = json.loads(entries["json"])
-        return {"json": json.dumps(said | {"topic_digests": {}, "content_digest": None})}
+        stored = json.loads(entries["json"])
+        return {"json": json.dumps(stored | {"topic_digests": {}, "content_digest": None})}
 
     odd = altered(
         run.recording, tmp_path / "odd.mcap", schema.Q_TABLE_TOPIC, with_other_cell, result=without_digests
@@ -160,9 +160,9 @@ def forged(archive, folder, name, table, **options):
 def sealed(folder, change=lambda manifest: manifest):
     """Write the manifest that belongs to the files there are, changed."""
     path = folder / layout.MANIFEST
-    said = json.loads(path.read_bytes())
-    topics = {name: Entry(**entry) for name, entry in said["topics"].items()}
-    manifest = Manifest(said["run"], topics, entries_of(folder))
+    stored = json.loads(path.read_bytes())
+    topics = {name: Entry(**entry) for name, entry in stored["topics"].items()}
+    manifest = Manifest(stored["run"], topics, entries_of(folder))
     path.write_bytes(change(manifest).to_json())
     return folder
 
@@ -259,7 +259,7 @@ def test_reading_a_table_keeps_nothing_of_the_groups_before(tmp_path):
 
 @pytest.mark.parametrize("name", ["manifest.json", "run.parquet", "steps.parquet"])
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
-def test_a_pipe_in_place_of_a_file_is_refused_and_not_waited_for(taxis, tmp_path, name):
+def test_a_pipe_in_place_of_a_file_is_refused_and_does_not_block(taxis, tmp_path, name):
     recordings, archive = tmp_path / "recordings", tmp_path / "archive"
     shutil.copytree(taxis.folder, recordings / taxis.run_id)
     archive_run(run_at(recordings / taxis.run_id), str(archive), remove=True)

@@ -84,7 +84,7 @@ def test_archived_and_removed_a_run_is_listed_and_restored_the_same(run, recordi
     ],
     ids=lambda words: words[1] if words[0] == "export" else words[0],
 )
-def test_what_looks_at_a_run_looks_at_an_archived_one(words, run, command, tmp_path):
+def test_commands_that_read_a_run_read_an_archived_one(words, run, command, tmp_path):
     names = {"RUN": run.run_id, "OTHER": str(run.recording), "DIR": str(tmp_path)}
 
     def filled(word):
@@ -104,7 +104,7 @@ def test_what_looks_at_a_run_looks_at_an_archived_one(words, run, command, tmp_p
     assert re.sub("begun .* ago", "", again.stdout) == re.sub("begun .* ago", "", first.stdout)
 
 
-def test_a_dry_run_tells_the_sizes_and_leaves_everything(run, recordings, command):
+def test_a_dry_run_reports_the_sizes_and_changes_nothing(run, recordings, command):
     result = json.loads(done(command("archive", run.run_id, "--dry-run", "--remove", "--json")))
     assert result["bytes"] > 0
     assert not result["removed"]
@@ -112,7 +112,7 @@ def test_a_dry_run_tells_the_sizes_and_leaves_everything(run, recordings, comman
     assert find_run(run.run_id, recordings).facts == run.facts
 
 
-def test_an_archive_that_is_there_is_looked_at_again_not_written(run, command):
+def test_an_existing_archive_is_checked_and_not_written(run, command):
     done(command("archive", run.run_id))
     result = json.loads(done(command("archive", run.run_id, "--remove", "--json")))
     assert not result["new"]
@@ -158,7 +158,7 @@ def test_recordings_and_archive_may_move_together(run, recordings, command, tmp_
     assert "found no archive at" in lost.output
 
 
-def test_rm_tells_whether_the_archive_is_there(run, recordings, command):
+def test_rm_reports_whether_the_archive_exists(run, recordings, command):
     done(command("archive", run.run_id, "--remove"))
     place = recordings.parent / "archive" / run.run_id
     remove = ("rm", run.run_id, "--dry-run")
@@ -183,7 +183,7 @@ def test_a_running_run_and_an_archived_one_are_refused(run, recordings, command)
     assert "is not archived" in command("restore", run.run_id).output
 
 
-def test_archiving_several_goes_on_behind_those_that_are_archived_already(run, recordings, command):
+def test_archiving_several_runs_skips_those_that_are_archived_already(run, recordings, command):
     other = make_run(recordings, TAXIS, seed=1)
     done(command("archive", run.run_id, "--remove"))
     result = command("archive", run.run_id, other.run_id, "--remove")
@@ -213,9 +213,11 @@ def test_a_killed_run_is_archived_and_restored(run, recordings, command):
         cut = sum(chunks[len(chunks) - 6][:2])
     left = (folder / "recording.mcap").read_bytes()[: cut + 11]
     (folder / "recording.mcap").write_bytes(left)
-    said = json.loads((folder / "run.json").read_text())
+    stored = json.loads((folder / "run.json").read_text())
     owner = {**this_process(), "process_started": -1.0}
-    (folder / "run.json").write_text(json.dumps(said | {"status": "running", "owner": owner, "summary": {}}))
+    (folder / "run.json").write_text(
+        json.dumps(stored | {"status": "running", "owner": owner, "summary": {}})
+    )
     with open_recording(folder / "recording.mcap") as recording:
         came = {"episodes": recording.count(schema.TRAIN_EPISODE)}
         came["train_steps"] = recording.count(schema.TRAIN_STEP)
@@ -239,8 +241,8 @@ def test_another_archive_of_the_same_id_is_left_alone(run, recordings, command):
     done(command("archive", run.run_id))
     facts = json.loads((recordings / run.run_id / "run.json").read_text())
     place = recordings.parent / "archive" / run.run_id
-    said = json.loads((place / layout.MANIFEST).read_text())
-    other = Manifest({**said["run"], "content_digest": "0" * 64}, {"/log": Entry(1, "0" * 64)})
+    stored = json.loads((place / layout.MANIFEST).read_text())
+    other = Manifest({**stored["run"], "content_digest": "0" * 64}, {"/log": Entry(1, "0" * 64)})
     (place / layout.MANIFEST).write_bytes(other.to_json())
     result = command("archive", run.run_id, "--remove")
     assert result.exit_code == 2
@@ -271,7 +273,7 @@ def test_a_disk_that_fills_up_leaves_no_archive(run, recordings, command, monkey
     assert find_run(run.run_id, recordings).status == "finished"
 
 
-def test_what_an_interrupted_archiving_left_is_no_archive_and_gives_way(run, recordings, command):
+def test_the_rest_of_an_interrupted_archiving_is_no_archive_and_is_replaced(run, recordings, command):
     left = recordings.parent / "archive" / ".partial" / run.run_id
     left.mkdir(parents=True)
     (left / layout.STEPS).write_text("half")

@@ -51,7 +51,7 @@ def test_the_steps_recorded_later_are_those_that_were(measured, whole):
     assert rerecord(done).facts == done.facts  # nothing to do
 
 
-def test_another_content_is_refused(measured, monkeypatch):
+def test_other_content_is_refused(measured, monkeypatch):
     before = measured.recording.read_bytes()
     load = again.load_mdp
     monkeypatch.setattr(
@@ -71,7 +71,7 @@ def test_stopped_it_is_as_it_was(measured):
     assert not list(measured.folder.glob("*.rerecording"))
 
 
-def test_what_is_not_finished_is_finished_first(tmp_path):
+def test_an_unfinished_run_is_finished_first(tmp_path):
     config = experiment(TAXIS, recording={"steps": "none"})
     run = run_job(Job(config, 0), create_run(tmp_path, config, 0), stop=lambda: True)
     with pytest.raises(RunnerError, match="`dualtaxi resume"):

@@ -119,7 +119,7 @@ def test_stopped_and_resumed_step_by_step(whole, tmp_path):
     assert_same(run, whole)
 
 
-def test_a_stop_while_it_catches_up_forgets_nothing(whole, tmp_path):
+def test_a_stop_while_it_catches_up_loses_nothing(whole, tmp_path):
     run = copy_of(whole, tmp_path, summary={})
     cut(run, int(0.8 * run.recording.stat().st_size))
     good = survey(run.recording).chunks  # the last chunk may lack its index; it comes again
@@ -169,7 +169,7 @@ def test_a_hole_is_filled_by_a_new_recording(whole, tmp_path, share, repaired):
     assert_same(done, whole)
 
 
-def test_a_digest_that_was_known_is_a_proof(whole, tmp_path):
+def test_a_known_digest_is_a_proof(whole, tmp_path):
     run = copy_of(whole, tmp_path, proof="0" * 64)
     damage(run, 0.5)
     repair(run.recording)
@@ -189,15 +189,15 @@ def test_description_damaged(whole, tmp_path):
     assert_same(resume(run), whole)
 
 
-@pytest.mark.parametrize("behind", [bytes(5000), b"\x06" + b"\xff" * 40, b"hello"])
-def test_something_behind_the_end(whole, tmp_path, behind):
+@pytest.mark.parametrize("more", [bytes(5000), b"\x06" + b"\xff" * 40, b"hello"])
+def test_bytes_after_the_end(whole, tmp_path, more):
     run = copy_of(whole, tmp_path, summary={})
     with run.recording.open("ab") as stream:
-        stream.write(behind)
+        stream.write(more)
     assert_same(resume(run), whole)
     cut(run, int(0.7 * run.recording.stat().st_size))
     with run.recording.open("ab") as stream:
-        stream.write(behind)
+        stream.write(more)
     assert_same(resume(run.update(status="failed")), whole)
 
 
@@ -221,7 +221,7 @@ def test_a_recording_that_stands_alone_is_no_run(whole, tmp_path):
     assert [one.name for one in tmp_path.iterdir()] == ["alone.mcap"]
 
 
-def test_finished_but_not_said_so(whole, tmp_path):
+def test_a_finished_recording_whose_run_file_says_otherwise(whole, tmp_path):
     run = copy_of(whole, tmp_path, "running", owner={"host": "elsewhere"}, summary={})
     os.utime(run.folder / "run.json", (0, 0))
     before = run.recording.stat()
@@ -231,7 +231,7 @@ def test_finished_but_not_said_so(whole, tmp_path):
     assert run.recording.stat().st_mtime_ns == before.st_mtime_ns
 
 
-def test_another_seed_is_not_gone_on_with(whole, tmp_path):
+def test_another_seed_is_not_resumed(whole, tmp_path):
     other = make_run(tmp_path / "other", TAXIS, seed=1)
     run = copy_of(other, tmp_path, summary={})
     cut(run, int(0.7 * run.recording.stat().st_size))
@@ -300,10 +300,10 @@ def test_status(whole, tmp_path):
     assert status(process_started=here["process_started"] - 5) == "interrupted"  # its number used again
     assert status(host="elsewhere") == "running"  # just beaten
     assert status(boot_id="before", process_started=1.0) == "running"
-    for age, said in ((5, "running"), (14, "running"), (16, "interrupted"), (10**6, "interrupted")):
+    for age, expected in ((5, "running"), (14, "running"), (16, "interrupted"), (10**6, "interrupted")):
         elsewhere = run.update(owner=here | {"host": "elsewhere"})
         os.utime(run.folder / "run.json", (time.time() - age,) * 2)
-        assert elsewhere.status == said
+        assert elsewhere.status == expected
     elsewhere.beat()
     assert elsewhere.status == "running"
     for odd in ({}, {"host": None}, {"host": here["host"], "boot_id": here["boot_id"], "pid": "x"}):

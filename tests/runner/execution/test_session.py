@@ -126,12 +126,12 @@ def test_one_table_belongs_to_the_agency_or_to_the_only_agent(made_of, agents, t
 
 def test_run_json_says_what_was_done(tmp_path):
     run = make_run(tmp_path, TAXIS, seed=9)
-    said = json.loads((run.folder / "run.json").read_text())
-    assert said == run.facts
-    assert (said["name"], said["seed"], said["status"]) == ("taxis", 9, "finished")
-    assert said["config"] == experiment(TAXIS).to_mapping()
-    assert said["owner"]["pid"] == os.getpid()
-    summary = said["summary"]
+    stored = json.loads((run.folder / "run.json").read_text())
+    assert stored == run.facts
+    assert (stored["name"], stored["seed"], stored["status"]) == ("taxis", 9, "finished")
+    assert stored["config"] == experiment(TAXIS).to_mapping()
+    assert stored["owner"]["pid"] == os.getpid()
+    summary = stored["summary"]
     with open_recording(run.recording) as recording:
         for topic in schema.TOPICS:
             assert summary["messages"][topic.name] == recording.count(topic)
@@ -196,7 +196,7 @@ def test_recorded_without_threads_a_run_is_the_same_to_the_byte(parts, tmp_path)
     assert set(threading.enumerate()) <= before, "no thread is left"
 
 
-def test_progress_is_told_with_every_evaluation(tmp_path):
+def test_progress_is_reported_after_every_evaluation(tmp_path):
     config = experiment(TAXIS)
     reports = []
     run = run_job(
@@ -212,7 +212,7 @@ def test_progress_is_told_with_every_evaluation(tmp_path):
 
 
 @pytest.mark.parametrize("asked", [1, 2, 3, 5, 9])
-def test_a_run_that_is_told_to_stop_is_interrupted_and_closed_properly(asked, tmp_path):
+def test_a_stopped_run_is_interrupted_and_closed_properly(asked, tmp_path):
     config = experiment(TAXIS, recording={"chunk_steps": 256})
     whole = run_job(Job(config, 0), create_run(tmp_path, config, 0))
     run = run_job(Job(config, 0), create_run(tmp_path, config, 0), stop=stopping_after(asked))
@@ -255,7 +255,7 @@ def test_a_keyboard_interrupt_leaves_an_interrupted_run_with_what_was_done(tmp_p
         assert recording.finished
 
 
-def test_an_error_of_whoever_listens_ends_the_run_as_failed(tmp_path):
+def test_an_error_in_a_callback_ends_the_run_as_failed(tmp_path):
     config = experiment(LAKE)
     run = create_run(tmp_path, config, 0)
 
@@ -269,7 +269,7 @@ def test_an_error_of_whoever_listens_ends_the_run_as_failed(tmp_path):
 
 
 @pytest.mark.parametrize("threads", [True, False])
-def test_an_error_of_whoever_listens_loses_no_step_that_was_taken(threads, tmp_path):
+def test_an_error_in_a_callback_loses_no_step(threads, tmp_path):
     config = experiment(TAXIS, recording={"chunk_steps": 65_536})  # no chunk is full when it ends
     run = create_run(tmp_path, config, 0)
     taken = []
@@ -308,7 +308,7 @@ def test_a_job_that_cannot_be_done_leaves_a_failed_run_that_says_why(broken, err
     assert not failed.recording.exists()
 
 
-def test_learning_goes_on_from_a_recorded_run(tmp_path):
+def test_learning_continues_from_a_recorded_run(tmp_path):
     first = make_run(tmp_path, TAXIS)
     with open_recording(first.recording) as recording:
         tables = {step: [] for step in sorted({table.step for table in recording.snapshots()})}
@@ -323,7 +323,7 @@ def test_learning_goes_on_from_a_recorded_run(tmp_path):
             assert recording.metrics("eval")[0]["step"] == 0, "counting starts again"
 
 
-def test_learning_goes_on_from_any_step_of_a_recorded_run(tmp_path):
+def test_learning_continues_from_any_step_of_a_recorded_run(tmp_path):
     first = make_run(tmp_path, TAXIS)
     run = make_run(tmp_path, TAXIS, name="second", initial_q={"run": "taxis", "step": 777})
     with open_recording(run.recording) as recording, open_recording(first.recording) as origin:
@@ -347,7 +347,7 @@ def test_tables_that_do_not_fit_or_are_not_there_are_refused(start, message, tmp
         make_run(tmp_path, TAXIS, name="second", initial_q=start)
 
 
-def test_the_newest_run_of_a_name_is_never_the_one_that_is_asking(tmp_path):
+def test_the_newest_run_of_a_name_is_never_the_run_itself(tmp_path):
     """A configuration that goes on from its own last run can be run again and again."""
     first = make_run(tmp_path, LAKE)
     second = make_run(tmp_path, LAKE, initial_q={"run": "lake@latest"})
@@ -357,7 +357,7 @@ def test_the_newest_run_of_a_name_is_never_the_one_that_is_asking(tmp_path):
 
 
 @pytest.mark.parametrize("start", [{"run": "lake"}, {"run": "lake@latest", "step": 3}])
-def test_the_run_that_a_table_comes_from_is_settled_when_the_job_is_created(start, tmp_path):
+def test_the_run_that_a_table_comes_from_is_resolved_when_the_job_is_created(start, tmp_path):
     """The name may answer to another run by the time that the job is looked at again."""
     first = make_run(tmp_path, LAKE)
     second = make_run(tmp_path, LAKE, name="second", initial_q=start)

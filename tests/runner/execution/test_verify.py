@@ -61,7 +61,7 @@ def setting_in_message(number: int, **values: object):
     return change_of
 
 
-def test_what_is_right(run):
+def test_a_recording_is_sound(run):
     for rerun in (False, True):
         found = verify(run.recording, rerun=rerun)
         assert found.sound
@@ -74,7 +74,7 @@ def test_what_is_right(run):
         assert not found.provenance
 
 
-def test_written_anew_it_is_still_right(run, tmp_path):
+def test_a_rewritten_recording_is_sound(run, tmp_path):
     assert verify(altered(run.recording, tmp_path / "x.mcap", None, id)).sound
 
 
@@ -178,7 +178,7 @@ def test_another_seed_or_configuration(run, tmp_path):
     assert "metadata run: job" in found.finding
 
 
-def test_what_it_says_at_its_end(run, tmp_path):
+def test_a_changed_result(run, tmp_path):
     for key, value in (("content_digest", "0" * 64), ("train_steps", 1), ("last_evaluation", None)):
 
         def change(entries, key=key, value=value):
@@ -229,7 +229,7 @@ def test_an_interrupted_recording_is_compared_to_its_end(run, tmp_path):
     assert found.difference.field == "mean_length"
 
 
-def test_what_an_interrupted_run_says_at_its_end(run, tmp_path):
+def test_a_changed_result_of_an_interrupted_run(run, tmp_path):
     job = Job(from_mapping(run.facts["config"]), run.seed)
     stopped = run_job(job, create_run(tmp_path, job.config, job.seed), stop=stopping_after(5))
     assert stopped.status == "interrupted"
@@ -274,7 +274,7 @@ def test_damage_is_placed(run, tmp_path):
     assert "resume" in found.finding
 
 
-def test_a_rerun_tells_what_differs(tmp_path, monkeypatch):
+def test_a_rerun_reports_what_differs(tmp_path, monkeypatch):
     whole = make_run(tmp_path, TAXIS)
     here = provenance.provenance()
     other = here | {"package.numpy": "1.0", "command": "x"}
@@ -337,9 +337,9 @@ def described_as(source, target, change):
                 file.add_metadata(name, recording.metadata(name))
         for name, media_type, data in recording.attachments():
             if name == "environment.json":
-                said = json.loads(data)
-                change(said)
-                file.add_attachment(name, media_type, json.dumps(said).encode())
+                stored = json.loads(data)
+                change(stored)
+                file.add_attachment(name, media_type, json.dumps(stored).encode())
                 continue
             file.add_attachment(name, media_type, data)
         for entry in survey(source).chunks:
@@ -351,16 +351,16 @@ def described_as(source, target, change):
     return target
 
 
-def renamed(said):
-    said["scene"]["actions"][0]["name"] = "fly"
+def renamed(stored):
+    stored["scene"]["actions"][0]["name"] = "fly"
 
 
-def reordered(said):
-    said["event_names"].reverse()
+def reordered(stored):
+    stored["event_names"].reverse()
 
 
-def moved(said):
-    said["scene"]["landmarks"][0]["cell"] = [1, 1]
+def moved(stored):
+    stored["scene"]["landmarks"][0]["cell"] = [1, 1]
 
 
 @pytest.mark.parametrize(
@@ -377,8 +377,8 @@ def test_a_rerun_compares_how_the_environment_is_described(run, tmp_path, change
 
 
 def test_names_that_stand_in_a_recording_twice_are_compared(run, tmp_path):
-    def elsewhere(said):
-        said["env_id"] = "another:Game-v1"
+    def elsewhere(stored):
+        stored["env_id"] = "another:Game-v1"
 
     assert "env_id" in verify(described_as(run.recording, tmp_path / "a.mcap", elsewhere)).finding
 

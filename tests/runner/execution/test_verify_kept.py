@@ -23,7 +23,7 @@ def name(request):
     return request.param
 
 
-def test_what_they_hold(name):
+def test_kept_recordings_have_their_contents(name):
     assert expectations(DATA / f"{name}.mcap") == EXPECTED[name]
     assert (DATA / f"{name}.mcap").stat().st_size < 150_000
 
@@ -59,7 +59,7 @@ def test_what_kept_loops_hold(name):
     assert path.stat().st_size < 50_000
 
 
-def test_what_happened_side_by_side_is_told_apart():
+def test_environments_in_parallel_are_distinguished():
     with open_recording(DATA / "vector.mcap") as recording:
         assert recording.environments == 3
         steps = np.concatenate(list(recording.blocks(recording.topic("/train/step"))))

@@ -33,7 +33,7 @@ def forged(source, target, topics=None, result=None):
             counts[topic.name] = len(messages)
             for time, payload in messages:
                 digest.update(topic, message_record(topic, time, payload))
-    said = {
+    stored = {
         "content_digest": digest.content(),
         "topic_digests": digest.topics(),
         "messages": {name: count for name, count in counts.items() if count},
@@ -43,7 +43,7 @@ def forged(source, target, topics=None, result=None):
     } | (result or {})
 
     def change(entries):
-        return {"json": json.dumps(json.loads(entries["json"]) | said)}
+        return {"json": json.dumps(json.loads(entries["json"]) | stored)}
 
     return altered(source, target, None, None, result=change)
 

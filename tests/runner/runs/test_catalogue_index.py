@@ -68,7 +68,7 @@ def aged(folder):
     ids(folder)
 
 
-def test_it_says_what_the_folder_says(folder, recorded):
+def test_the_index_agrees_with_the_folder(folder, recorded):
     shutil.copytree(recorded, folder / recorded.name)
     (row,) = rows(folder)[0]
     (run,) = list_runs(folder)
@@ -121,7 +121,7 @@ def test_a_change_within_the_same_moment_is_not_missed(folder):
     assert rows(folder)[0][0]["status"] == "failed"
 
 
-def test_a_run_whose_process_dies_is_interrupted_without_a_word(folder):
+def test_a_run_whose_process_dies_is_interrupted(folder):
     waiting = "import sys; from pathlib import Path; from runner.runs.run import create_run; \
 from runner.config import from_mapping; create_run(Path(sys.argv[1]), \
 from_mapping({'name': 'some', 'episodes': 5}), 1); print(flush=True); sys.stdin.read()"
@@ -151,7 +151,7 @@ def test_a_run_is_found_in_the_recording_alone_and_keeps_its_labels(folder, reco
 @pytest.mark.parametrize(
     "damage", ["deleted", "text", "truncated", "zeros inside", "foreign", "another version"]
 )
-def test_a_lost_or_damaged_index_is_made_anew(folder, damage):
+def test_a_lost_or_damaged_index_is_rebuilt(folder, damage):
     made = [create_run(folder, CONFIG, seed).run_id for seed in range(40)]
     ids(folder)
     path = index_path()
@@ -280,14 +280,14 @@ def test_odd_values_do_no_harm(folder):
         " " * (2 << 20),
     ],
 )
-def test_hostile_labels_say_nothing(folder, content):
+def test_hostile_labels_are_ignored(folder, content):
     run = create_run(folder, CONFIG, 1)
     (run.folder / LABELS_FILE).write_text(content)
     assert read_labels(run.folder) == Labels()
     assert ids(folder, "name:some NOT tag:*") == [run.run_id]
 
 
-def test_a_pipe_in_place_of_a_file_keeps_nobody_waiting(folder):
+def test_a_pipe_in_place_of_a_file_does_not_block(folder):
     (folder / "pipe").mkdir(parents=True)
     os.mkfifo(folder / "pipe" / RUN_FILE)
     assert ids(folder) == []
@@ -394,7 +394,7 @@ def test_a_name_given_or_taken_away_just_now_is_known(folder):
     assert find_run(newest.run_id[:7], folder).run_id == newest.run_id
 
 
-def test_making_the_index_anew_never_empties_it(folder, monkeypatch):
+def test_rebuilding_the_index_never_empties_it(folder, monkeypatch):
     runs = [create_run(folder, CONFIG, seed) for seed in range(4)]
     ids(folder)
     seen = []

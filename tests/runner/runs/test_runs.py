@@ -31,7 +31,7 @@ def _renamed(run, run_id):
     (run.folder.parent / run_id / RUN_FILE).write_text(json.dumps(facts))
 
 
-def test_a_run_stands_on_disk_with_its_configuration(folder):
+def test_a_run_is_on_disk_with_its_configuration(folder):
     run = create_run(folder, CONFIG, 7)
     (found,) = list_runs(folder)
     assert found == run
@@ -42,7 +42,7 @@ def test_a_run_stands_on_disk_with_its_configuration(folder):
     assert [path.name for path in run.folder.iterdir()] == [RUN_FILE]
 
 
-def test_a_run_may_be_called_otherwise(folder):
+def test_a_run_may_have_another_name(folder):
     assert create_run(folder, CONFIG, 7, "other").name == "other"
 
 
@@ -124,7 +124,7 @@ def test_an_id_goes_before_a_prefix_and_a_name(folder):
         find_run("ab", folder)
 
 
-def test_several_runs_of_a_name_are_told(folder):
+def test_several_runs_of_a_name_are_listed(folder):
     made = [create_run(folder, CONFIG, seed) for seed in (1, 2)]
     with pytest.raises(RunNotFound, match=r"'some' matches 2 runs; .* by some@latest") as caught:
         find_run("some", folder)
@@ -137,7 +137,7 @@ def test_no_runs_at_all(folder, name):
         find_run(name, folder)
 
 
-def test_a_wrong_name_gets_a_hint(folder):
+def test_a_wrong_name_gets_a_suggestion(folder):
     create_run(folder, CONFIG, 1)
     with pytest.raises(RunNotFound, match=r"Did you mean 'some'\?.*lists the 1 there are"):
         find_run("soem", folder)
