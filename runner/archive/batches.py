@@ -65,9 +65,10 @@ class Batches:
             return
         rows: list[dict[str, Any]] = []
         size = 0
-        for row, own in heapq.merge(*map(self._rows, table.topics), key=_position):
+        merged_rows = heapq.merge(*map(self._rows, table.topics), key=lambda pair: pair[0]["position"])
+        for row, message_size in merged_rows:
             rows.append(row)
-            size += own
+            size += message_size
             if len(rows) == _ROWS_AT_ONCE or size > _BYTES_AT_ONCE:
                 yield pa.RecordBatch.from_pylist(rows, table.columns)
                 rows, size = [], 0
@@ -79,7 +80,7 @@ class Batches:
         train, evaluation = table.topics
         for topic, records in merged(self._recording, (train, evaluation)):
             batch = checked_batch(topic, records, self.shape, self._where)
-            self._note(topic, record_bytes(records), len(records))
+            self._count(topic, record_bytes(records), len(records))
             yield topic, records, batch
 
     def messages(self, topic: Topic) -> Iterator[tuple[int, bytes]]:
@@ -87,20 +88,20 @@ class Batches:
         for time, payload in self._recording.messages(topic):
             position, rest = divmod(time, STEP_NANOSECONDS)
             if rest:
-                raise self.foreign(topic, f"at {time} ns")
-            self._note(topic, message_record(topic, time, payload), 1)
+                raise self._unarchivable(topic, f"at {time} ns")
+            self._count(topic, message_record(topic, time, payload), 1)
             yield position, payload
 
-    def same(self, topic: Topic, position: int, made: bytes, payload: bytes) -> None:
+    def compare(self, topic: Topic, position: int, restored: bytes, payload: bytes) -> None:
         """Compare a payload with the one restored from its columns.
 
         Raises:
             RecordingError: they differ.
         """
-        if made != payload:
-            raise self.foreign(topic, f"after {position} steps")
+        if restored != payload:
+            raise self._unarchivable(topic, f"after {position} steps")
 
-    def foreign(self, topic: Topic, place: str, why: str = "") -> RecordingError:
+    def _unarchivable(self, topic: Topic, place: str, why: str = "") -> RecordingError:
         """Return the error for a message that columns cannot represent."""
         return RecordingError(
             f"{self._where}: {topic.name} {place}: found a message that no recorder writes, so that it "
@@ -108,22 +109,16 @@ class Batches:
         )
 
     def _rows(self, topic: Topic) -> Iterator[tuple[dict[str, Any], int]]:
-        """Yield a row a message, and the bytes of the message."""
-        run_id = self.shape.run_id
+        """Yield a row for each message, and the message's size in bytes."""
         for position, payload in self.messages(topic):
             try:
                 row = message_row(topic, payload, self.shape)
-                made = message_payload(topic, position, row, self.shape)
+                restored = message_payload(topic, position, row, self.shape)
             except (RecordingError, ValueError, LookupError) as error:
-                raise self.foreign(topic, f"after {position} steps", f" ({error})") from error
-            self.same(topic, position, made, payload)
-            yield row | {"run_id": run_id, "position": position}, len(payload)
+                raise self._unarchivable(topic, f"after {position} steps", f" ({error})") from error
+            self.compare(topic, position, restored, payload)
+            yield row | {"run_id": self.shape.run_id, "position": position}, len(payload)
 
-    def _note(self, topic: Topic, records: bytes | memoryview, count: int) -> None:
+    def _count(self, topic: Topic, records: bytes | memoryview, count: int) -> None:
         self._hashes[topic.name].update(records)
         self._counts[topic.name] += count
-
-
-def _position(row: tuple[dict[str, Any], int]) -> int:
-    position: int = row[0]["position"]
-    return position

@@ -238,10 +238,8 @@ def shape_of(run: Mapping[str, str], mdp: Mdp | None, where: str) -> Shape:
     spaces = {}
     if kind_of(run) != "job":
         described = spaces_of(run, where)
-        for name, space in (
-            *(("action", "action"), ("next_observation", "observation"), ("observation", "observation")),
-        ):
-            spaces[name] = SpaceColumns(described[space], name, where)
+        for name in ("action", "next_observation", "observation"):
+            spaces[name] = SpaceColumns(described[name.removeprefix("next_")], name, where)
     return Shape(
         run_id=run["run_id"],
         kind=kind_of(run),

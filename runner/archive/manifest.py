@@ -18,7 +18,7 @@ from runner.util.files import hash_of
 from runner.util.values import is_whole
 
 MAX_MANIFEST_BYTES: Final = 1 << 20
-_MOST: Final = 2**53
+_MAX_SIZE: Final = 2**53
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,9 @@ def read_manifest(data: bytes, where: str) -> Manifest:
 def _entries(values: Mapping[str, Any]) -> dict[str, Entry]:
     entries = {name: Entry(entry["size"], entry["blake3"]) for name, entry in values.items()}
     for name, entry in entries.items():
-        sound = is_whole(entry.size, 0, _MOST) and isinstance(entry.blake3, str) and len(entry.blake3) == 64
+        sound = (
+            is_whole(entry.size, 0, _MAX_SIZE) and isinstance(entry.blake3, str) and len(entry.blake3) == 64
+        )
         if not sound or int(entry.blake3, 16) < 0:
             raise ValueError(f"its entry of {name!r} is invalid")
     return entries

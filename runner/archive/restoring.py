@@ -38,7 +38,7 @@ from runner.util.files import storage_errors
 from runner.util.packing import Packing
 
 _ROWS_AT_ONCE: Final = 1024
-_MOST_STEPS: Final = 2**63 // STEP_NANOSECONDS
+_MAX_STEPS: Final = 2**63 // STEP_NANOSECONDS
 _MAX_PENDING: Final = 8
 """Blocks in the pipeline: as many as the recorder has of a topic."""
 
@@ -59,7 +59,7 @@ def restore(folder: Path, path: Path, report: Callable[[int], None] = lambda _: 
     archive.check_files()
     try:
         with storage_errors(path), RecordingFile(path, archive.topics) as file:
-            _Restoring(archive, file, report).restore()
+            _Restorer(archive, file, report).restore()
         with open_recording(path):  # raises if it cannot be read
             pass
     except BaseException:
@@ -72,7 +72,7 @@ def check(folder: Path, report: Callable[[int], None] = lambda _: None) -> Manif
     """Restore an archive in memory only, and return its manifest; errors as for `restore`."""
     archive = Archive(folder)
     archive.check_files()
-    _Restoring(archive, None, report).restore()
+    _Restorer(archive, None, report).restore()
     return archive.manifest
 
 
@@ -84,8 +84,8 @@ class _Row:
     row: dict[str, Any]
 
 
-class _Restoring:
-    """The restoring of one archive into a file, or into hashes only."""
+class _Restorer:
+    """Restores one archive into a file, or into hashes only."""
 
     def __init__(self, archive: Archive, file: RecordingFile | None, report: Callable[[int], None]) -> None:
         self._archive = archive
@@ -101,7 +101,6 @@ class _Restoring:
         topics = archive.topics
         self._undigested = {topic: blake3() for topic in topics if not topic.digested}
         self._counts = {topic.name: 0 for topic in topics}
-        self._steps_done = 0
 
     def restore(self) -> None:
         """Restore everything, and compare its hashes with those of the manifest."""
@@ -150,7 +149,8 @@ class _Restoring:
 
     def _records(self, table: Table) -> Iterator[tuple[Topic, Records]]:
         """Yield the rows of a table as records, at most as many as a chunk has."""
-        archive, rows = self._archive, self._most(table.topics[0])
+        archive, topic = self._archive, table.topics[0]
+        rows = capacity_of(topic, self._shape.sizes[topic], self._chunk_steps)
         for batch in archive.batches(table.name, table.columns, archive.count(*table.topics), rows):
             for topic in table.topics:
                 mine = of_phase(batch, topic.phase, f"{self._where}: {table.name}")
@@ -164,26 +164,22 @@ class _Restoring:
             topic = table.topics[0] if len(phases) == 1 else phases.get(row["phase"])
             if topic is None:
                 raise RecordingError(f"{self._where}: {table.name}: found the phase {row['phase']!r}.")
-            self._send_message(topic, row["position"], self._payload(topic, row))
-
-    def _most(self, topic: Topic) -> int:
-        """Return how many messages of a topic a chunk has at most."""
-        return capacity_of(topic, self._shape.sizes[topic], self._chunk_steps)
+            try:
+                payload = message_payload(topic, row["position"], row, self._shape)
+            except (TypeError, ValueError, OverflowError) as error:
+                raise RecordingError(
+                    f"{self._where}: {topic.name} after {row['position']} steps: is invalid ({error})."
+                ) from error
+            self._send_message(topic, row["position"], payload)
 
     def _send_block(self, topic: Topic, records: Records) -> None:
         """Send records to the file as a chunk."""
         offsets = np.arange(len(records), dtype=np.uint64) * np.uint64(records.itemsize)
         self._send(topic, record_bytes(records), records["log_time"], offsets)
-        self._count_steps(topic, len(records))
-
-    def _count_steps(self, topic: Topic, n: int) -> None:
-        if topic.name in ("/train/step", "/eval/step"):
-            self._steps_done += n
-            self._report(self._steps_done)
 
     def _send_message(self, topic: Topic, position: int, payload: bytes) -> None:
         time = position * STEP_NANOSECONDS
-        if not 0 <= position < _MOST_STEPS or len(payload) > MAX_CHUNK_BYTES - HEADER_BYTES:
+        if not 0 <= position < _MAX_STEPS or len(payload) > MAX_CHUNK_BYTES - HEADER_BYTES:
             raise RecordingError(
                 f"{self._where}: {topic.name}: found {len(payload):,} bytes after {position} steps."
             )
@@ -192,28 +188,21 @@ class _Restoring:
         self._batches.extend(topic, [time], [payload])
         if topic.message is schema.IMAGE or self._archive.is_job:
             self._batches.flush()
-        self._count_steps(topic, 1)
 
     def _send(self, topic: Topic, records: memoryview, times: Any, offsets: Any) -> None:
         self._pipeline.raise_failure()
         self._counts[topic.name] += len(times)
+        if topic.name in ("/train/step", "/eval/step"):
+            self._report(self._counts["/train/step"] + self._counts["/eval/step"])
         self._pending.acquire()
         self._pipeline.send(topic, records, times, offsets, done=self._pending.release)
 
     def _rows(self, table: Table) -> Iterator[dict[str, Any]]:
         """Yield the rows of a table."""
-        most = BLOCK_BYTES // layout.row_bytes(table.columns)
-        n = 1 if "data" in table.columns.names else max(1, min(most, _ROWS_AT_ONCE))
+        limit = BLOCK_BYTES // layout.row_bytes(table.columns)
+        n = 1 if "data" in table.columns.names else max(1, min(limit, _ROWS_AT_ONCE))
         for batch in self._archive.batches(table.name, table.columns, self._archive.count(*table.topics), n):
             yield from batch.to_pylist()
-
-    def _payload(self, topic: Topic, row: dict[str, Any]) -> bytes:
-        try:
-            return message_payload(topic, row["position"], row, self._shape)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise RecordingError(
-                f"{self._where}: {topic.name} after {row['position']} steps: is invalid ({error})."
-            ) from error
 
     def _snapshots(self) -> Iterator[_Row]:
         table = Table(layout.Q_TABLES, (schema.Q_TABLE_TOPIC,), layout.SCHEMAS[layout.Q_TABLES])

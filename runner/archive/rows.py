@@ -13,7 +13,7 @@ from runner.recording import schema
 from runner.recording.messages import QTable, decode, encode, encode_image, encode_log
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 
-_OF_SPACES: Final = (schema.TRANSITION, schema.RESET)
+_WITH_SPACES: Final = (schema.TRANSITION, schema.RESET)
 """The messages with values of spaces, whose columns differ between runs."""
 
 
@@ -39,13 +39,11 @@ def message_row(topic: Topic, payload: bytes, shape: Shape) -> dict[str, Any]:
     """
     values = decode(topic.message, payload)
     if topic.message is schema.LOG:
-        level = values["level"]
-        known = 0 <= level < len(schema.LOG_LEVELS)
-        level = schema.LOG_LEVELS[level if known else 0]
-        return {"name": values["name"], "level": level, "message": values["message"]}
+        number = values["level"] if values["level"] in range(len(schema.LOG_LEVELS)) else 0
+        return {"name": values["name"], "level": schema.LOG_LEVELS[number], "message": values["message"]}
     if topic.message is schema.IMAGE:
         return {"phase": topic.phase, "format": values["format"], "data": values["data"]}
-    if topic.message in _OF_SPACES:
+    if topic.message in _WITH_SPACES:
         for field in values.keys() & shape.spaces.keys():
             values |= shape.spaces[field].row(values.pop(field))
         if topic.message is schema.TRANSITION:
@@ -65,10 +63,10 @@ def message_payload(topic: Topic, position: int, row: Mapping[str, Any], shape: 
         return encode_log(row["message"], position * STEP_NANOSECONDS / 1e9, row["level"], row["name"])
     if topic.message is schema.IMAGE:
         return encode_image(row["data"], row["format"], position, topic.phase)
-    stored = topic.message.fields
-    fields = {field.name: row[field.stored_name] for field in stored if field.stored_name in row}
-    if topic.message in _OF_SPACES:
-        names = {field.name for field in topic.message.fields} & shape.spaces.keys()
+    of_message = topic.message.fields
+    fields = {field.name: row[field.stored_name] for field in of_message if field.stored_name in row}
+    if topic.message in _WITH_SPACES:
+        names = {field.name for field in of_message} & shape.spaces.keys()
         fields |= {name: shape.spaces[name].value(row) for name in names}
         if topic.message is schema.TRANSITION:
             fields["rewards"] = [row[name] for name in shape.per_learner("reward") or ["reward"]]

@@ -50,7 +50,7 @@ def write_archive(
         RecordingError: the recording is damaged, or has what no recorder writes.
         OSError: the folder cannot be written.
     """
-    manifest = _Writing(recording, folder, report).write()
+    manifest = _ArchiveWriter(recording, folder, report).write()
     (folder / layout.MANIFEST).write_bytes(manifest.to_json())
     return manifest
 
@@ -111,8 +111,8 @@ class TableWriter:
             self._writer.close()
 
 
-class _Writing:
-    """The writing of one recording as an archive."""
+class _ArchiveWriter:
+    """Writes one recording as an archive."""
 
     def __init__(self, recording: Recording, folder: Path, report: Callable[[int], None]) -> None:
         self._recording = recording
@@ -197,7 +197,7 @@ class _Writing:
         topic = schema.Q_TABLE_TOPIC
         for position, payload in self._batches.messages(topic):
             table = decode_q_table(payload)
-            self._batches.same(topic, position, encode_q_table(table), payload)
+            self._batches.compare(topic, position, encode_q_table(table), payload)
             yield PlacedTable(position, table)
 
     def _snapshot_row(self, tables: DerivedTables, snapshot: PlacedTable) -> pa.RecordBatch:
