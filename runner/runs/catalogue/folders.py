@@ -108,26 +108,24 @@ class Folders:
         Row.delete().where(Row.root.in_(stale)).execute(self._database)
 
     def _difference(self, root: str) -> Difference:
-        known, tokens = self._known(root), self._tokens_of(root)
+        """Return the difference of one folder; entries without files of a run are left out, or gone."""
+        stored = Row.mark if self._depth is Depth.FOLDERS else Row.fingerprint
+        known = dict(tuples_of(self._database, Row.select(Row.entry, stored).where(Row.root == root)))
+        tokens = self._tokens_of(root)
+        died: list[str] = []
         if self._depth is Depth.NAMES and not self._rebuild:
             changed = [entry for entry in tokens if entry not in known]
-            return self._difference_of(root, known, changed, [])
-        changed = [entry for entry, token in tokens.items() if known.get(entry) != token]
-        running, unstable = self._unstable(root)
-        again = [*tokens] if self._rebuild else unstable
-        if self._depth is Depth.FOLDERS:
-            again = [*again, *running]  # their recordings grow in place
-        changed += [e for e in again if known.get(e) == tokens.get(e) and e not in self._read[root]]
-        alike = set(running) - set(changed)
-        died = [entry for entry in alike if entry in tokens and not _is_running(root, entry)]
-        return self._difference_of(root, known, changed, died)
-
-    def _difference_of(
-        self, root: str, known: dict[str, str], changed: Sequence[str], died: list[str]
-    ) -> Difference:
-        """Return the difference; folders without files of a run are left out, or gone."""
+        else:
+            changed = [entry for entry, token in tokens.items() if known.get(entry) != token]
+            running, unstable = self._unstable(root)
+            again = [*tokens] if self._rebuild else unstable
+            if self._depth is Depth.FOLDERS:
+                again = [*again, *running]  # their recordings grow in place
+            changed += [e for e in again if known.get(e) == tokens.get(e) and e not in self._read[root]]
+            unchanged = set(running) - set(changed)
+            died = [entry for entry in unchanged if entry in tokens and not _is_running(root, entry)]
         there = [entry for entry in dict.fromkeys(changed) if _state_of(root, entry) is not None]
-        missing = {*known} - {*self._tokens[root]} | {*changed} - {*there}
+        missing = {*known} - {*tokens} | {*changed} - {*there}
         gone = [entry for entry in missing if entry in known and _state_of(root, entry) is None]
         return Difference(root, there, died, gone)
 
@@ -146,11 +144,6 @@ class Folders:
                 return _mark(root, entry)[0]
         seen = _state_of(root, entry)
         return "" if seen is None else seen.fingerprint
-
-    def _known(self, root: str) -> dict[str, str]:
-        """Return the token of each run's folder in the index."""
-        token = Row.mark if self._depth is Depth.FOLDERS else Row.fingerprint
-        return dict(tuples_of(self._database, Row.select(Row.entry, token).where(Row.root == root)))
 
     def _unstable(self, root: str) -> tuple[list[str], list[str]]:
         """Return the runs that were running when they were read, and those just changed then."""
