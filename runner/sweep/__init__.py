@@ -1,7 +1,7 @@
 """Sweeps: many runs of one experiment with different values, from a grid, at random or by a search.
 
 model       the contents of a sweep file
-loading     a file to a `Sweep`, with located errors
+loading     reading a sweep file, with located errors
 search      the values to try next, by Optuna
 objective   readings of a metric during a run, and what a run is worth
 task        one run, as a worker does it
@@ -12,7 +12,8 @@ trials      trials, and what is recorded of them
 running     the loop that gives batches of runs to workers
 plan        disk and runs that a sweep will take
 results     ranking, importance, the best configuration
-plots, figure, charts, page   drawings of a sweep, and the page with all of them
+charts      charts of the trials, and one sheet with all of them
+page        the sweep as one self-contained page
 
 This module loads nothing heavy, so that commands can look for sweeps first.
 """

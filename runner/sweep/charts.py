@@ -25,14 +25,14 @@ from runner.export.plots.metrics import Panel, panels_of
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.sweep.model import Range
-from runner.sweep.results import Ranked, Results, spoken
+from runner.sweep.results import Ranked, Results, value_text, values_text
 
 Values = NDArray[np.float64]
 
 _TRIAL: Final = series_colour(0)
 _BEST: Final = series_colour(1)
-_LETTERS: Final = 175
-"""Letters of a note that fit on a line of a sheet."""
+_MAX_NOTE_LENGTH: Final = 175
+"""Characters of a note that fit on a line of a sheet."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def learning(results: Results, recordings: Path) -> tuple[list[Group], list[Pane
         for run_id in trial.runs.values():
             with open_recording(at_hand(find_run(run_id, recordings)).recording) as recording:
                 series.append(read_series(recording))
-        values = ", ".join(f"{path} {spoken(value)}" for path, value in trial.values.items())
+        values = values_text(trial.values)
         groups.append(Group(f"{name}, trial {trial.number}: {values}", tuple(series)))
     return groups, panels_of(groups)
 
@@ -148,7 +148,7 @@ def _axis(path: str, parameter: Range | list[Any], trials: Sequence[Ranked]) -> 
         return Axis(path, (), parameter.log, tuple(float(trial.values[path]) for trial in trials))
     choices = [json.dumps(choice) for choice in parameter]
     numbers = tuple(float(choices.index(json.dumps(trial.values[path]))) for trial in trials)
-    return Axis(path, tuple(map(spoken, parameter)), False, numbers)
+    return Axis(path, tuple(map(value_text, parameter)), False, numbers)
 
 
 def sweep_sheet(title: str, picture: Picture, groups: Sequence[Group], panel: Panel) -> Canvas:
@@ -164,9 +164,9 @@ def sweep_sheet(title: str, picture: Picture, groups: Sequence[Group], panel: Pa
     columns = 2 if len(parameters) in (2, 4) else min(3, len(parameters))
     row_height = max(chart.height for chart in parameters)
     parallel, curves = parallel_chart(picture), panel_chart(panel, len(groups))
-    notes = [(line, palette.INK) for line in textwrap.wrap(picture.footnote, _LETTERS)]
+    notes = [(line, palette.INK) for line in textwrap.wrap(picture.footnote, _MAX_NOTE_LENGTH)]
     for number, group in enumerate(groups):
-        lines = textwrap.wrap(group.label, _LETTERS, subsequent_indent="    ")
+        lines = textwrap.wrap(group.label, _MAX_NOTE_LENGTH, subsequent_indent="    ")
         notes += [(line, series_colour(number)) for line in lines]
     rows = math.ceil(len(parameters) / columns)
     below = 32.0 + row_height * rows + parallel.height

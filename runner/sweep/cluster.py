@@ -15,7 +15,7 @@ from typing import Any, Concatenate, Final, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
 from runner.sweep.local import CLOSE_SECONDS
-from runner.sweep.task import Result, Task, do
+from runner.sweep.task import Result, Task, run_task
 from runner.util.extras import require
 
 _CONNECT_SECONDS: Final = 5.0
@@ -98,15 +98,15 @@ def start_actor(ray: Any) -> Any:
     return ray.remote(RayActor).options(num_cpus=1, max_concurrency=3, max_restarts=0).remote()
 
 
-def _do(actor: RayActor, task: Task) -> Result:
-    return do(task, actor.stop)
+def _run(actor: RayActor, task: Task) -> Result:
+    return run_task(task, actor.stop)
 
 
 class RayWorkers:
     """Actors of Ray, started when they are needed; each keeps what it has loaded.
 
     Args:
-        count: the most workers; None for one per processor of the cluster.
+        count: the maximum number of workers; None for one per processor of the cluster.
         address: the cluster, or `auto`; None starts Ray on this machine.
         limit: never start more workers than this.
 
@@ -119,7 +119,7 @@ class RayWorkers:
         self._ray = connect(address, count)
         processors = int(self._ray.cluster_resources().get("CPU", 1))
         self._count = max(1, min(count or processors, limit))
-        self._elsewhere = address is not None
+        self._on_own_disk = address is not None
         self._idle: list[Any] = []
         self._busy: dict[Any, tuple[Any, Task]] = {}
 
@@ -128,14 +128,14 @@ class RayWorkers:
         """The number of tasks that can be started now."""
         return self._count - len(self._busy)
 
-    def give(self, task: Task) -> None:
-        """Have an idle worker do a task."""
+    def submit(self, task: Task) -> None:
+        """Start a task on an idle worker."""
         actor = self._idle.pop() if self._idle else start_actor(self._ray)
-        there = replace(task, elsewhere=self._elsewhere, threads=False)
-        self._busy[actor.run.remote(_do, there)] = actor, task
+        remote = replace(task, on_own_disk=self._on_own_disk, threads=False)
+        self._busy[actor.run.remote(_run, remote)] = actor, task
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
-        """Wait up to this time for tasks to end; return them with their results, None if the worker died."""
+        """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
         done: list[tuple[Task, Result | None]] = []
         ready = self._ray.wait(list(self._busy), timeout=seconds)[0] if self._busy else []
         for reference in ready:

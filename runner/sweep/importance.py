@@ -64,13 +64,13 @@ def effects_of(
     levels = {name: _levels(parameter, len(names)) for name, parameter in parameters.items()}
     grid = list(itertools.product(*levels.values()))
     coded = _coded(parameters, [dict(zip(names, point, strict=True)) for point in grid])
-    known, objective = _coded(parameters, trials), np.asarray(values, np.float64)
+    tried, objective = _coded(parameters, trials), np.asarray(values, np.float64)
     shape = tuple(len(own) for own in levels.values())
     rng = np.random.default_rng(0)
     all_shares: list[dict[tuple[int, ...], float]] = []
     for forest in range(FORESTS):
         drawn = rng.integers(0, len(trials), len(trials))
-        predicted = forest_prediction(known[drawn], objective[drawn], coded, forest)
+        predicted = forest_prediction(tried[drawn], objective[drawn], coded, forest)
         shares = shares_of_variance(predicted.reshape(shape))
         if shares:
             all_shares.append(shares)
@@ -170,14 +170,14 @@ def _effects(names: Sequence[str], all_shares: Sequence[Mapping[tuple[int, ...],
 
 def _levels(parameter: Range | list[Any], parameters: int) -> list[Any]:
     """Return the values of a parameter in the grid, evenly spaced; all of them if they are few."""
-    most = max(2, min(MAX_LEVELS, int(MAX_POINTS ** (1 / parameters) + 1e-9)))
+    limit = max(2, min(MAX_LEVELS, int(MAX_POINTS ** (1 / parameters) + 1e-9)))
     if not isinstance(parameter, Range):
-        chosen = np.unique(np.linspace(0, len(parameter) - 1, min(most, len(parameter))).round().astype(int))
+        chosen = np.unique(np.linspace(0, len(parameter) - 1, min(limit, len(parameter))).round().astype(int))
         return [parameter[i] for i in chosen]
     low, high = float(parameter.low), float(parameter.last)
     if parameter.log:
-        return list(np.geomspace(low, high, most).tolist())
-    count = min(most, parameter.steps + 1) if parameter.step is not None or parameter.whole else most
+        return list(np.geomspace(low, high, limit).tolist())
+    count = min(limit, parameter.steps + 1) if parameter.step is not None or parameter.is_integer else limit
     return list(np.linspace(low, high, count).tolist())
 
 

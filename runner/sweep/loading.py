@@ -1,4 +1,4 @@
-"""A sweep file to a `Sweep`; all problems are reported at once, with line and key."""
+"""Reading a sweep file; all problems are reported at once, with line and key."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MAX_NAME: Final = 50
 """The longest name of a sweep, which is part of a tag of its runs."""
 _LEARNERS: Final = {"mode", "tables", "rewards"}
 _MAX_COMBINATIONS: Final = 64
-"""The most combinations that are tried to find values that are valid together."""
+"""Maximum number of combinations tried to find values that are valid together."""
 
 
 def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
@@ -101,18 +101,18 @@ def _sweep(document: Document, name: str | None, stem: str, folder: Path | None)
         errors = [refuse(problems, document)]
         if isinstance(document.value.get("base"), Mapping):
             try:
-                experiment_in(_below(document, "base"), (), stem, named_by=repr(stem))
+                experiment_in(_part(document, "base"), (), stem, named_by=repr(stem))
             except ConfigError as error:
                 errors.append(error)
         raise _combined(errors)
-    called = name or file.name or stem
-    if len(called) > MAX_NAME:
+    sweep_name = name or file.name or stem
+    if len(sweep_name) > MAX_NAME:
         raise ConfigError(
-            f"name: found {len(called)} characters, expected at most {MAX_NAME}: runs carry it."
+            f"name: found {len(sweep_name)} characters, expected at most {MAX_NAME}: runs carry it."
         )
-    base, values = _base(file, document, called, folder)
-    spelled = file.model_copy(update={"name": called, "base": values})
-    sweep = Sweep(called, spelled, base)
+    base, values = _base(file, document, sweep_name, folder)
+    resolved = file.model_copy(update={"name": sweep_name, "base": values})
+    sweep = Sweep(sweep_name, resolved, base)
     _check_parameters(sweep, document)
     return sweep
 
@@ -136,8 +136,8 @@ def _base(
         load(path)  # reports every problem at its place in that file
         within = read_yaml(read_text(path), str(path))
     else:
-        within = _below(document, "base")
-    at = {key: _below(document, key).places for key in ("seeds", "recording")}
+        within = _part(document, "base")
+    at = {key: _part(document, key).places for key in ("seeds", "recording")}
     seeds = file.model_dump(mode="json")["seeds"]
     values: list[tuple[tuple[str, ...], Document]] = [
         (("name",), Document(name)),
@@ -167,7 +167,7 @@ def _start_of_trials(
     return values
 
 
-def _below(document: Document, key: str) -> Document:
+def _part(document: Document, key: str) -> Document:
     """Return the part of a document under a key, with its places."""
     places = {where[1:]: place for where, place in document.places.items() if where[:1] == (key,)}
     return Document(document.value.get(key), places)
@@ -179,7 +179,7 @@ def _check_parameters(sweep: Sweep, document: Document) -> None:
     for path, parameter in sweep.file.parameters.items():
         for number, sample in enumerate(_samples(parameter)):
             try:
-                experiment = _fitting(sweep, path, sample, document)
+                experiment = _valid_experiment(sweep, path, sample, document)
                 if number == 0 or path.startswith("env."):
                     _check_environment(experiment, path, document)
             except ConfigError as error:
@@ -188,7 +188,7 @@ def _check_parameters(sweep: Sweep, document: Document) -> None:
         raise _combined(errors)
 
 
-def _fitting(sweep: Sweep, path: str, sample: object, document: Document) -> ExperimentConfig:
+def _valid_experiment(sweep: Sweep, path: str, sample: object, document: Document) -> ExperimentConfig:
     """Return an experiment with a value of a parameter, and the first values of the others valid with it.
 
     Raises:
@@ -200,7 +200,7 @@ def _fitting(sweep: Sweep, path: str, sample: object, document: Document) -> Exp
     problem = None
     for values in itertools.islice(itertools.product(*samples.values()), _MAX_COMBINATIONS):
         try:
-            return _placed(sweep, dict(zip(samples, values, strict=True)), document)
+            return _experiment(sweep, dict(zip(samples, values, strict=True)), document)
         except ConfigError as error:
             problem = problem or error
     assert problem is not None
@@ -214,7 +214,7 @@ def _samples(parameter: Range | list[Any]) -> Iterator[Any]:
         yield from parameter
 
 
-def _placed(sweep: Sweep, values: Mapping[str, Any], document: Document) -> ExperimentConfig:
+def _experiment(sweep: Sweep, values: Mapping[str, Any], document: Document) -> ExperimentConfig:
     """Return the base with values; errors name the places of the parameters."""
     within = Document(sweep.start_of_trials)
     places = {path: document.place(("parameters", path)) for path in values}

@@ -1,4 +1,4 @@
-"""Worker processes on this machine: each does one task after the other, and keeps what it has loaded."""
+"""Worker processes on this machine: each runs one task after another, and keeps what it has loaded."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from dataclasses import replace
 from multiprocessing import connection
 from typing import Any, Final, Protocol, Self
 
-from runner.sweep.task import Result, Task, do
+from runner.sweep.task import Result, Task, run_task
 
 CLOSE_SECONDS: Final = 30.0
 """The time that a worker has to close its recording before it is killed."""
 
 
 class Workers(Protocol):
-    """Workers that do tasks, on this machine or on others."""
+    """Workers that run tasks, on this machine or on others."""
 
     @property
     def idle(self) -> int:
         """The number of tasks that can be started now."""
 
-    def give(self, task: Task) -> None:
-        """Have an idle worker do a task."""
+    def submit(self, task: Task) -> None:
+        """Start a task on an idle worker."""
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
-        """Wait up to this time for tasks to end; return them with their results, None if the worker died."""
+        """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
 
     def stop(self) -> None:
         """Make every worker close its recording and return its task as interrupted."""
@@ -37,7 +37,7 @@ class LocalWorkers:
     """Processes, started when they are needed.
 
     Args:
-        count: the most processes.
+        count: the maximum number of processes.
     """
 
     def __init__(self, count: int) -> None:
@@ -53,25 +53,25 @@ class LocalWorkers:
         """The number of tasks that can be started now."""
         return self._count - len(self._busy)
 
-    def give(self, task: Task) -> None:
-        """Have an idle worker do a task."""
-        here = replace(task, threads=self._count < (os.cpu_count() or 1))
+    def submit(self, task: Task) -> None:
+        """Start a task on an idle worker."""
+        local = replace(task, threads=self._count < (os.cpu_count() or 1))
         while self._idle:
             worker = self._idle.pop()
-            if worker.ask(here):
+            if worker.send(local):
                 break
             worker.end()
         else:
             worker = _Worker(self._context, self._stopping)
-            worker.ask(here)  # `collect` notices if it is dead already
+            worker.send(local)  # `collect` notices if it is dead already
         self._busy[worker.pipe] = worker, task
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
-        """Wait up to this time for tasks to end; return them with their results, None if the worker died."""
+        """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
         done: list[tuple[Task, Result | None]] = []
         for pipe in connection.wait(list(self._busy), seconds) if self._busy else ():
             worker, task = self._busy.pop(pipe)
-            result = worker.answer()
+            result = worker.receive()
             done.append((task, result))
             if result is not None:
                 self._idle.append(worker)
@@ -101,7 +101,7 @@ class _Worker:
         self._process.start()
         theirs.close()
 
-    def ask(self, task: Task) -> bool:
+    def send(self, task: Task) -> bool:
         """Send a task; return False if the process is dead."""
         try:
             self.pipe.send(task)
@@ -109,7 +109,7 @@ class _Worker:
             return False
         return True
 
-    def answer(self) -> Result | None:
+    def receive(self) -> Result | None:
         """Return the result of the task; None if the process died."""
         try:
             result: Result = self.pipe.recv()
@@ -128,9 +128,9 @@ class _Worker:
 
 
 def serve(pipe: Any, stopping: Any) -> None:
-    """Do the tasks that come through a pipe until it is closed; the main function of a worker."""
+    """Run the tasks that come through a pipe until it is closed; the main function of a worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of a terminal
     parent = os.getppid()
     with contextlib.suppress(EOFError, OSError):
         while True:
-            pipe.send(do(pipe.recv(), lambda: stopping.is_set() or os.getppid() != parent))
+            pipe.send(run_task(pipe.recv(), lambda: stopping.is_set() or os.getppid() != parent))

@@ -55,7 +55,7 @@ class Range(Section):
         return self
 
     @property
-    def whole(self) -> bool:
+    def is_integer(self) -> bool:
         """Whether its values are whole numbers."""
         return all(isinstance(bound, int) for bound in (self.low, self.high, self.step or 1))
 
@@ -68,7 +68,7 @@ class Range(Section):
     def at(self, number: int) -> int | float:
         """Return the value after this number of steps, in decimal arithmetic: 0.3, not 0.1 + 0.2."""
         value = Decimal(str(self.low)) + number * Decimal(str(self.step or 1))
-        return int(value) if self.whole else float(value)
+        return int(value) if self.is_integer else float(value)
 
     @property
     def last(self) -> int | float:
@@ -202,7 +202,7 @@ class SweepFile(Section):
             if self.trials is not None:
                 raise refusal(("trials",), f"found {self.trials}, but a grid tries all of its points")
             for name, parameter in self.parameters.items():
-                if isinstance(parameter, Range) and parameter.step is None and not parameter.whole:
+                if isinstance(parameter, Range) and parameter.step is None and not parameter.is_integer:
                     raise refusal(("parameters", name), "found a range without step: a grid needs one")
                 if isinstance(parameter, Range) and parameter.log:
                     raise refusal(("parameters", name, "log"), "found true, but a grid has steps")
@@ -270,5 +270,5 @@ class Sweep:
         return {path: value for path, value in values.items() if path.partition(".")[0] not in others}
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return plain values, fit for JSON and YAML, which `from_values` takes back to an equal sweep."""
+        """Return plain values, fit for JSON and YAML, from which `from_values` builds an equal sweep."""
         return self.file.model_dump(mode="json") | {"name": self.name}

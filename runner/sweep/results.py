@@ -19,12 +19,12 @@ from runner.analysis.compare.statistics import Estimate, bounded
 from runner.analysis.sections import Grid, Section
 from runner.sweep.importance import Effect, effects_of, effects_of_grid
 from runner.sweep.model import Sweep
-from runner.sweep.trials import State, Trial, Trials, best_of, recorded
+from runner.sweep.trials import State, Trial, Trials, best_of, recorded_trials
 
-SHOWN: Final = 20
+DEFAULT_SHOWN: Final = 20
 MIN_SHARE: Final = 0.01
 """Interactions of a smaller share are not listed."""
-CONFIRMING: Final = 10
+FRESH_SEEDS: Final = 10
 """Seeds in the file of the best configuration."""
 
 
@@ -106,7 +106,7 @@ def results_of(sweep: Sweep, recordings: Path) -> Results:
     """
     statistics.require_scipy()
     trials = Trials(sweep)
-    suggested = list(recorded(trials, recordings))
+    suggested = list(recorded_trials(trials, recordings))
     best = best_of(suggested, sweep)
     return Results(sweep, trials.search.trials, ranking(sweep, suggested), suggested, best)
 
@@ -124,8 +124,8 @@ def ranking(sweep: Sweep, trials: Sequence[Trial]) -> list[Ranked]:
 
     def key(trials: list[Trial]) -> tuple[int, float, int]:
         first = trials[0]
-        worth = math.inf if first.value is None else -sweep.objective.sign * first.value
-        return order.index(first.state), worth, first.number
+        rank = math.inf if first.value is None else -sweep.objective.sign * first.value
+        return order.index(first.state), rank, first.number
 
     return [_ranked(*same) for same in sorted(by_values.values(), key=key)]
 
@@ -155,28 +155,28 @@ def yaml_of(sweep: Sweep, trial: Trial) -> str:
     """
     name, seeds = f"{sweep.name}_best", fresh_seeds(sweep.seeds)
     config = sweep.config(trial.values | {"name": name, "recording.steps": "all", "seeds": seeds})
-    worth = f"{reading(trial.value)}, the median over {len(trial.results)} seeds"
+    result = f"{objective_text(trial.value)}, the median over {len(trial.results)} seeds"
     return (
-        f"# Trial {trial.number} of the sweep {sweep.name}: {words(trial.values)}.\n"
-        f"# {sweep.objective.description}: {worth}.\n"
+        f"# Trial {trial.number} of the sweep {sweep.name}: {values_text(trial.values)}.\n"
+        f"# {sweep.objective.description}: {result}.\n"
         "# The best of many trials is also the luckiest on the seeds by which it was chosen. The seeds\n"
         "# below are new: expect the results that they give.\n"
     ) + config.to_yaml()
 
 
 def fresh_seeds(searched: Sequence[int]) -> list[int]:
-    """Return `CONFIRMING` seeds that are not among those searched: the next larger ones, if possible."""
+    """Return `FRESH_SEEDS` seeds that are not among those searched: the next larger ones, if possible."""
     first = max(searched) + 1
-    if first + CONFIRMING <= 2**64:
-        return list(range(first, first + CONFIRMING))
+    if first + FRESH_SEEDS <= 2**64:
+        return list(range(first, first + FRESH_SEEDS))
     used = set(searched)
-    return list(itertools.islice((seed for seed in itertools.count() if seed not in used), CONFIRMING))
+    return list(itertools.islice((seed for seed in itertools.count() if seed not in used), FRESH_SEEDS))
 
 
 # --- as text ------------------------------------------------------------------------------------------
 
 
-def sections(results: Results, shown: int | None = SHOWN) -> list[Section]:
+def sections(results: Results, shown: int | None = DEFAULT_SHOWN) -> list[Section]:
     """Return the results as sections of text.
 
     Args:
@@ -189,7 +189,7 @@ def sections(results: Results, shown: int | None = SHOWN) -> list[Section]:
     return [*ranking_sections(results, shown), *effects_sections(results)]
 
 
-def ranking_sections(results: Results, shown: int | None = SHOWN) -> list[Section]:
+def ranking_sections(results: Results, shown: int | None = DEFAULT_SHOWN) -> list[Section]:
     """Return the ranking and the trials without a value as sections; arguments as for `sections`."""
     ranked = results.ranking[:shown]
     grid = _ranking_grid(results.sweep, ranked)
@@ -269,22 +269,22 @@ def _ranking_grid(sweep: Sweep, ranked: Sequence[Ranked]) -> Grid:
         rows.append(
             (
                 str(entry.number),
-                reading(entry.median),
+                objective_text(entry.median),
                 _between(entry.low, entry.high),
-                *((reading(iqm.value), _between(iqm.low, iqm.high)) if has_means else ()),
-                *(spoken(value) for value in entry.values.values()),
+                *((objective_text(iqm.value), _between(iqm.low, iqm.high)) if has_means else ()),
+                *(value_text(value) for value in entry.values.values()),
                 entry.state,
             )
         )
     return Grid((*headings, *sweep.file.parameters, "state"), rows)
 
 
-def words(values: Mapping[str, Any]) -> str:
+def values_text(values: Mapping[str, Any]) -> str:
     """Return values as text: `step_size 0.25, discount 0.9`."""
-    return ", ".join(f"{path} {spoken(value)}" for path, value in values.items())
+    return ", ".join(f"{path} {value_text(value)}" for path, value in values.items())
 
 
-def spoken(value: Any) -> str:
+def value_text(value: Any) -> str:
     """Return a value in a few characters, as in a configuration."""
     if isinstance(value, float):
         return f"{value:.4g}"
@@ -292,10 +292,10 @@ def spoken(value: Any) -> str:
 
 
 def _between(low: float | None, high: float | None) -> str:
-    return f"{reading(low)} to {reading(high)}" if reading(low) else ""
+    return f"{objective_text(low)} to {objective_text(high)}" if objective_text(low) else ""
 
 
-def reading(value: float | None) -> str:
+def objective_text(value: float | None) -> str:
     """Return the value of a trial as text: `never` for a level that was not reached, empty without one."""
     if value is None or math.isnan(value):
         return ""

@@ -58,12 +58,12 @@ def run_sweep(
     limit: Limit = lambda *_: "",
     accept_changes: bool = False,
 ) -> tuple[Trials, SweepStatus]:
-    """Run what is left of a sweep; return its trials and its status.
+    """Run the rest of a sweep; return its trials and its status.
 
     Args:
         sweep: written to disk by `state.begin`.
         recordings: the folder of its runs.
-        workers: the workers that do the runs.
+        workers: the workers that execute the runs.
         stop: called several times a second; returns whether to stop.
         report: called with the status several times a second.
         limit: returns why a task may not be started; empty if it may.
@@ -134,7 +134,7 @@ class _Runner:
         self._waiting = deque(sorted(tasks.values(), key=lambda task: not task.run_id))
 
     def run(self, batch: list[Trial]) -> None:
-        """Have every queued run done; or set `status.stopped`, and wait for the runs in progress."""
+        """Finish every queued run, or, when stopped, only those in progress."""
         began, before, status = time.monotonic(), self.status.seconds, self.status
         while status.running or (self._waiting and not status.stopped):
             if not status.stopped and self._stop():
@@ -143,14 +143,14 @@ class _Runner:
             self._start_tasks()
             status.seconds = before + time.monotonic() - began
             self._report(status)
-            for task, answer in self._workers.collect(_WAIT_SECONDS):
+            for task, received in self._workers.collect(_WAIT_SECONDS):
                 status.running -= 1
-                if answer is None and task.identity not in self._retried:  # its worker died
+                if received is None and task.identity not in self._retried:  # its worker died
                     self._retried.add(task.identity)
                     run = state.runs_of(self._sweep.name, self._recordings).get(task.identity)
                     self._waiting.appendleft(replace(task, run_id=run.run_id if run else ""))
                     continue
-                result = answer or Result("failed", task.run_id, error="its worker died twice")
+                result = received or Result("failed", task.run_id, error="its worker died twice")
                 if result.status == "interrupted":
                     status.stopped = status.stopped or INTERRUPTED
                 self._results.add(task.identity, result)
@@ -165,7 +165,7 @@ class _Runner:
             task = self._waiting[0]
             status.stopped = self._limit(status, task)
             if not status.stopped:
-                self._workers.give(self._waiting.popleft())
+                self._workers.submit(self._waiting.popleft())
                 status.running += 1
                 if task.identity not in self._retried:
                     status.begun += 1

@@ -1,4 +1,4 @@
-"""The values to try next: Optuna's samplers, asked in batches, with results in the order of the trials.
+"""The values to try next: Optuna's samplers, queried in batches; results are reported in trial order.
 
 The same results give the same suggestions. An interrupted search is therefore replayed from its runs and
 continues as if undisturbed; nothing of it is stored.
@@ -32,7 +32,7 @@ class Search:
     """Suggests values for trials.
 
     Args:
-        file: the sweep's.
+        file: the sweep file.
 
     Raises:
         MissingExtra: Optuna is not installed.
@@ -43,7 +43,7 @@ class Search:
         self._file = file
         self._space = {path: self._distribution(parameter) for path, parameter in file.parameters.items()}
         self._study = self._optuna.create_study(sampler=self._sampler(), direction=file.objective.direction)
-        self._asked: list[Any] = []
+        self._asked_trials: list[Any] = []
         self._suggested: set[str] = set()
         self.trials = file.trials or file.grid_points
         """The number of trials of the whole search."""
@@ -51,7 +51,7 @@ class Search:
     def ask(self, count: int) -> list[dict[str, Any]]:
         """Return the values of the next trials, by path; fewer at the end of the search."""
         suggested = []
-        for number in range(len(self._asked), min(len(self._asked) + count, self.trials)):
+        for number in range(len(self._asked_trials), min(len(self._asked_trials) + count, self.trials)):
             if self._file.strategy == "grid":
                 self._study.enqueue_trial(self._grid_point(number))
             trial, values = self._draw()
@@ -62,14 +62,14 @@ class Search:
                         break
                     self._study.tell(trial, state=self._optuna.trial.TrialState.FAIL)
                     trial, values = self._draw()
-            self._asked.append(trial)
+            self._asked_trials.append(trial)
             self._suggested.add(json.dumps(values, sort_keys=True))
             suggested.append(values)
         return suggested
 
     def tell(self, number: int, value: float | None, pruned: bool, curve: Mapping[int, float]) -> None:
         """Report the result of a trial: its value and whether it was pruned; None if it failed."""
-        trial, states = self._asked[number], self._optuna.trial.TrialState
+        trial, states = self._asked_trials[number], self._optuna.trial.TrialState
         if value is None:
             self._study.tell(trial, state=states.FAIL)
             return
@@ -104,7 +104,7 @@ class Search:
         kinds = self._optuna.distributions
         if not isinstance(parameter, Range):
             return kinds.CategoricalDistribution([json.dumps(choice) for choice in parameter])
-        if parameter.whole:
+        if parameter.is_integer:
             step = int(parameter.step or 1)
             return kinds.IntDistribution(
                 int(parameter.low), int(parameter.last), log=parameter.log, step=step

@@ -1,4 +1,4 @@
-"""One run of a sweep, as a worker does it: started, resumed, or only read if it is over."""
+"""One run of a sweep, as a worker runs it: started, resumed, or only read if it is over."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from runner.util.files import storage_errors
 
 @dataclass(frozen=True)
 class Task:
-    """A run to do: a trial's configuration with a seed."""
+    """A run of a sweep: a trial's configuration with a seed."""
 
     identity: str
     """The identity of its job."""
@@ -43,12 +43,12 @@ class Task:
     recordings: str
     objective: Objective
     bounds: Mapping[int, float] = field(default_factory=dict)
-    """By episode, the bound that a run must reach or be pruned."""
+    """By episode, the bound below which the run is pruned."""
     run_id: str = ""
     """The existing run to resume; empty to start a new one."""
     accept_changes: bool = False
     """Whether to resume a run that other code started."""
-    elsewhere: bool = False
+    on_own_disk: bool = False
     """Whether to record on the worker's own disk, and to move the run when it is complete."""
     threads: bool = True
     """Whether the worker has more than one processor, so that recording can run in parallel to learning."""
@@ -68,30 +68,30 @@ class Result:
     error: str = ""
 
 
-def do(task: Task, stop: Callable[[], bool]) -> Result:
-    """Do a task; errors that a user can fix become a failed result.
+def run_task(task: Task, stop: Callable[[], bool]) -> Result:
+    """Run a task; errors that a user can fix become a failed result.
 
     Args:
-        task: the run to do.
+        task: the run.
         stop: called every few milliseconds; once it returns True, the run is interrupted.
     """
     try:
-        if task.elsewhere:
-            return _do_elsewhere(task, stop)
+        if task.on_own_disk:
+            return _run_on_own_disk(task, stop)
         run = _run(task, stop)
         return result_of(run, task.objective) if is_over(run) else Result("interrupted", run.run_id)
     except RunnerError as error:
         return Result("failed", task.run_id, error=str(error))
 
 
-def _do_elsewhere(task: Task, stop: Callable[[], bool]) -> Result:
-    """Do a task in a temporary folder of this machine; then move its run into the recordings."""
+def _run_on_own_disk(task: Task, stop: Callable[[], bool]) -> Result:
+    """Run a task in a temporary folder of this machine; then move its run into the recordings."""
     recordings = Path(task.recordings)
     with storage_errors(recordings), tempfile.TemporaryDirectory(prefix="dualtaxi-sweep-") as folder:
         own = Path(folder)
         if task.run_id:
             shutil.copytree(recordings / task.run_id, own / task.run_id)
-        result = do(replace(task, recordings=folder, elsewhere=False), stop)
+        result = run_task(replace(task, recordings=folder, on_own_disk=False), stop)
         for run in list_runs(own):
             move_whole(run.folder, recordings)
     return result
@@ -103,17 +103,17 @@ def move_whole(run: Path, recordings: Path) -> None:
     Raises:
         OSError: it cannot be copied; the older copy stays.
     """
-    place, mark = recordings / run.name, secrets.token_hex(4)
-    fresh, old = (recordings / f".{run.name}.{mark}.{kind}" for kind in ("fresh", "old"))
+    target, suffix = recordings / run.name, secrets.token_hex(4)
+    fresh, old = (recordings / f".{run.name}.{suffix}.{kind}" for kind in ("fresh", "old"))
     try:
         shutil.copytree(run, fresh)
-        if place.exists():
-            place.rename(old)
+        if target.exists():
+            target.rename(old)
         try:
-            fresh.rename(place)
+            fresh.rename(target)
         except OSError:
             if old.exists():
-                old.rename(place)
+                old.rename(target)
             raise
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
@@ -128,15 +128,15 @@ def result_of(run: Run, objective: Objective) -> Result:
     """
     path = at_hand(run).recording
     try:
-        facts = path.stat()
+        stat = path.stat()
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
     return Result(
         "pruned" if PRUNED in run.tags else "finished",
         run.run_id,
-        dict(_curve_of(path, facts.st_size, facts.st_mtime_ns, objective.metric)),
+        dict(_curve_of(path, stat.st_size, stat.st_mtime_ns, objective.metric)),
         run.summary.content_digest or "",
-        facts.st_size,
+        stat.st_size,
         run.summary.seconds or 0.0,
     )
 
@@ -185,19 +185,19 @@ class _Pruner:
         self._agents = ("agency",) if joint else mdp.agents
         self._events = mdp.event_names
         self._curve: Curve = {}
-        self._seen = 0
+        self._evaluations_read = 0
         self.is_pruned = False
 
     def report(self, progress: Progress) -> None:
-        """Look at the new evaluations."""
+        """Compare the new evaluations with the bounds; an observer for `run_job`."""
         if not self._task.bounds:
             return
         objective = self._task.objective
-        for metrics in progress.evaluations[self._seen :]:
+        for metrics in progress.evaluations[self._evaluations_read :]:
             read = readings(metrics, metrics.get("optimality"), self._agents, self._events)
             if objective.metric in read:
                 self._curve[metrics["episode"]] = read[objective.metric]
-        self._seen = len(progress.evaluations)
+        self._evaluations_read = len(progress.evaluations)
         is_done = progress.episode >= progress.episodes
         self.is_pruned = not is_done and should_prune(objective, self._curve, self._task.bounds)
 

@@ -1,4 +1,4 @@
-"""The trials of a sweep, batch by batch, and what is recorded of them."""
+"""The trials of a sweep, batch by batch, and their recorded results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Trial:
     config: dict[str, Any]
     """The configuration as plain values; empty if the values contradict each other."""
     identities: dict[int, str]
-    """Seed to the identity of its job; empty as well."""
+    """By seed, the identity of its job; empty if the values contradict each other."""
     error: str = ""
     results: dict[int, Result] = field(default_factory=dict)
     """By seed; seeds whose runs are not over are missing."""
@@ -89,12 +89,12 @@ class Trials:
         self.done: list[Trial] = []
         """The trials of the batches that are over."""
         adaptive = sweep.file.strategy in ("tpe", "genetic") or sweep.file.pruning is not None
-        self._size = sweep.file.batch if adaptive else self.search.trials
+        self._batch_size = sweep.file.batch if adaptive else self.search.trials
 
     def ask(self) -> list[Trial]:
         """Return the next batch; empty at the end."""
         batch = []
-        for number, values in enumerate(self.search.ask(self._size), start=len(self.done)):
+        for number, values in enumerate(self.search.ask(self._batch_size), start=len(self.done)):
             try:
                 config = self.sweep.config(values).to_mapping()
             except ConfigError as error:
@@ -170,7 +170,7 @@ class JobResults:
             state.write_failures(self._sweep.name, self._recordings, self._failures)
 
 
-def recorded(trials: Trials, recordings: Path) -> Iterator[Trial]:
+def recorded_trials(trials: Trials, recordings: Path) -> Iterator[Trial]:
     """Yield the trials of a sweep that have been suggested so far, with the results that are recorded.
 
     Raises:

@@ -71,7 +71,7 @@ def loop_expectations(path: Path) -> dict[str, Any]:
 
 
 def make(name: str) -> None:
-    """Make one of them, with nothing in it that tells of the machine but its kind."""
+    """Make one of them, with nothing about the machine but its kind."""
     session.provenance = made_by
     config = load(HERE / f"{name}.yaml")
     facts = {
@@ -118,7 +118,7 @@ def make_together(name: str) -> None:
 
 
 def made_by() -> dict[str, str]:
-    """Return a provenance that tells nothing of the machine but its kind."""
+    """Return a provenance with nothing about the machine but its kind."""
     packages = {f"package.{package}": version(package) for package in ("numpy", "numba", "llvmlite")}
     own = {"dualtaxi": runner.__version__, "python": platform.python_version()}
     return own | packages | {"machine": platform.machine()}

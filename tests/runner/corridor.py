@@ -1,4 +1,4 @@
-"""`tests.runner.corridor:Corridor-v0`: an environment with a table that says nothing of what it means."""
+"""`tests.runner.corridor:Corridor-v0`: a bare transition table, without events, agents or scene."""
 
 from __future__ import annotations
 

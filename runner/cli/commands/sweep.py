@@ -172,7 +172,7 @@ def show(
       dualtaxi sweep show hyperparameters
       dualtaxi sweep show hyperparameters --best best.yaml
     """
-    from runner.sweep.results import SHOWN, results_of, sections
+    from runner.sweep.results import DEFAULT_SHOWN, results_of, sections
     from runner.sweep.state import read_sweep
 
     require_one_form(as_json, as_markdown)
@@ -194,7 +194,7 @@ def show(
             }
         )
     else:
-        print_sections(sections(results, None if everything else SHOWN), as_markdown)
+        print_sections(sections(results, None if everything else DEFAULT_SHOWN), as_markdown)
         if best is None and results.best is not None:
             number = results.best.number
             say(f"--best FILE writes the configuration of trial {number}, with fresh seeds to confirm it.")
@@ -253,7 +253,7 @@ def _live_status(sweep: Sweep) -> Iterator[Callable[[SweepStatus], None]]:
 
 
 def _status_rows(sweep: Sweep, status: SweepStatus) -> dict[str, str]:
-    from runner.sweep.results import reading, words
+    from runner.sweep.results import objective_text, values_text
 
     left = status.runs - status.done - status.failed
     ended = status.begun - status.running
@@ -272,7 +272,7 @@ def _status_rows(sweep: Sweep, status: SweepStatus) -> dict[str, str]:
         "rate": f"{speed}, {duration(status.seconds)} so far, {size(status.bytes)} of disk",
     }
     if status.best is not None:
-        rows["best"] = f"{reading(status.best.value)} with {words(status.best.values)}"
+        rows["best"] = f"{objective_text(status.best.value)} with {values_text(status.best.values)}"
     return rows
 
 
@@ -306,7 +306,7 @@ def _range_text(parameter: Any) -> str:
 
 def _print_results(sweep: Sweep, trials: Trials, status: SweepStatus, as_json: bool) -> None:
     from runner.analysis.compare.statistics import bounded
-    from runner.sweep.results import reading, words
+    from runner.sweep.results import objective_text, values_text
 
     best = trials.best()
     if as_json:
@@ -325,7 +325,7 @@ def _print_results(sweep: Sweep, trials: Trials, status: SweepStatus, as_json: b
     else:
         rows = _status_rows(sweep, status)
         if best is not None:
-            rows["best"] = f"{reading(best.value)} in trial {best.number}: {words(best.values)}"
+            rows["best"] = f"{objective_text(best.value)} in trial {best.number}: {values_text(best.values)}"
         draw(facts(rows | {"next": f"dualtaxi sweep show {sweep.name}"}))
     for trial in trials.done:
         for error in trial.errors if trial.state == "failed" else ():

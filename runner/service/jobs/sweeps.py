@@ -112,11 +112,11 @@ class SlottedWorkers:
         self._report(slots)
         return max(0, min(self._workers.idle, slots - self._busy))
 
-    def give(self, task: Task) -> None:
-        """Have an idle worker do a task."""
+    def submit(self, task: Task) -> None:
+        """Start a task on an idle worker."""
         self._busy += 1
         self._report(self._channel.slots)
-        self._workers.give(task)
+        self._workers.submit(task)
 
     def collect(self, seconds: float) -> list[tuple[Task, Result | None]]:
         """Return what is done, waiting that long for it; None for a worker that died and was replaced."""

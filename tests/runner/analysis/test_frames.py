@@ -30,7 +30,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def corridor_run(tmp_path_factory):
-    """A run of an environment that has neither events nor agents, nor says what success is."""
+    """A run of an environment that declares no events, agents or success."""
     config = CONFIG | {"env": {"id": "tests.runner.corridor:Corridor-v0"}, "mode": "cooperative"}
     return runner.run(config, recordings=tmp_path_factory.mktemp("corridor"))
 

@@ -40,7 +40,7 @@ def test_a_file_has_priority_over_a_shipped_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "expected"),
     [
         ("quik", "Did you mean 'quick'?"),
         ("configs/quick.yaml", "`dualtaxi run quick`"),
@@ -48,10 +48,10 @@ def test_a_file_has_priority_over_a_shipped_name(tmp_path):
         ("nothing", "`dualtaxi config ls`"),
     ],
 )
-def test_an_unknown_name_is_refused_with_the_nearest(name, said):
+def test_an_unknown_name_is_refused_with_the_nearest(name, expected):
     with pytest.raises(ConfigError, match=r"no such file") as raised:
         load(name)
-    assert said in str(raised.value)
+    assert expected in str(raised.value)
 
 
 def test_every_shipped_experiment_is_listed_with_its_description():
@@ -93,6 +93,6 @@ def test_errors_of_a_sweep_and_of_its_base_are_reported_together():
     Path("bad.yaml").write_text(
         "base: {episodes: -1, epsilon: 7}\nstrategy: gird\nparameters: {discount: []}\nsides: 3\n"
     )
-    said = type_in("sweep", "run", "bad.yaml", code=2).stderr
+    errors = type_in("sweep", "run", "bad.yaml", code=2).stderr
     for key in ("episodes", "epsilon", "strategy", "parameters", "sides"):
-        assert f": {key}" in said or f".{key}" in said
+        assert f": {key}" in errors or f".{key}" in errors

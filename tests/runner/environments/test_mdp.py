@@ -1,4 +1,4 @@
-"""Environments as arrays: equal to what Gymnasium says of them, or refused with the reason."""
+"""Environments as arrays: equal to Gymnasium's tables, or refused with the reason."""
 
 from __future__ import annotations
 

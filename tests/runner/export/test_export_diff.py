@@ -1,4 +1,4 @@
-"""The pages about a difference and a comparison: whole, and with what the text says in them."""
+"""The pages about a difference and a comparison: self-contained, with the same content as the text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a report says of the content digest of a run that has none."""
+"""The line of a report about a run without a content digest."""
 
 from __future__ import annotations
 

@@ -100,8 +100,8 @@ def test_a_run_without_steps_is_shown_without_replay_and_with_a_note(pictured, t
     assert result.exit_code == 0
     assert "dualtaxi rerecord" in result.stderr
     assert "dualtaxi rerecord" in path.read_text()
-    asked = report(run.recording, "-o", path, "--force", "--episode", 0)
-    assert "rerecord" in asked.stderr
+    result = report(run.recording, "-o", path, "--force", "--episode", 0)
+    assert "rerecord" in result.stderr
 
 
 def test_a_run_without_any_metric_is_shown_without_curves(pictured):

@@ -484,11 +484,11 @@ def test_values_that_are_not_finite_are_left_out_of_curves_and_counted(value, tm
         value = 0.0
         list(play(recorded, 200, 1))
         recorded.log("loss", 0.25)
-    said = "“Return of training episodes”, 1 value of “Logged: loss”."
+    message = "“Return of training episodes”, 1 value of “Logged: loss”."
     for command, file in (("plot", "plot.svg"), ("report", "report.html")):
         done = dualtaxi(tmp_path, command, "bad", "-o", str(tmp_path / file))
         assert done.exit_code == 0
-        assert said in done.stderr
+        assert message in done.stderr
         assert "Return of training episodes" in (tmp_path / file).read_text()
     with open_recording(runner.find_run("bad", tmp_path).recording) as recording:
         series = read_series(recording)

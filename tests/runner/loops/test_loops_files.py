@@ -98,19 +98,19 @@ def pole(tmp_path_factory):
     return rec.run.recording
 
 
-def altered(path: Path, tmp_path: Path, **said: str) -> Path:
+def altered(path: Path, tmp_path: Path, **metadata: str) -> Path:
     """Return a copy with other metadata of the run."""
     made = tmp_path / "made-up.mcap"
 
     def change(name: str, entries: dict[str, str]) -> dict[str, str]:
-        return entries | said if name == "run" else entries
+        return entries | metadata if name == "run" else entries
 
     rewrite(path, made, change)
     return made
 
 
 @pytest.mark.parametrize(
-    ("said", "message"),
+    ("metadata", "message"),
     [
         ({"kind": "other"}, "kind"),
         ({"kind": "job"}, "not written by dualtaxi"),
@@ -144,10 +144,10 @@ def altered(path: Path, tmp_path: Path, **said: str) -> Path:
     ],
     ids=lambda value: value if isinstance(value, str) else "-",
 )
-def test_false_metadata_is_refused(pole, tmp_path, said, message):
+def test_false_metadata_is_refused(pole, tmp_path, metadata, message):
     with (
         pytest.raises(RecordingError, match=message),
-        open_recording(altered(pole, tmp_path, **said)) as recording,
+        open_recording(altered(pole, tmp_path, **metadata)) as recording,
     ):
         for _ in recording.transitions("train"):
             pass

@@ -98,7 +98,7 @@ def expected(mdp, policy, state, t=0, succeeded=False):
     return total
 
 
-def said(outcome):
+def as_array(outcome):
     return np.array(
         [
             outcome.success_percent / 100,
@@ -111,10 +111,10 @@ def said(outcome):
 def values_of(mdp, policy):
     """Return the discounted values [S, 2] of a policy by solving its linear equations."""
     rows = np.arange(mdp.states)
-    goes_on = DISCOUNT * mdp.probability[rows, policy] * ~mdp.terminated[rows, policy]
+    continuation = DISCOUNT * mdp.probability[rows, policy] * ~mdp.terminated[rows, policy]
     matrix = np.eye(mdp.states)
-    for k in range(goes_on.shape[1]):
-        np.subtract.at(matrix, (rows, mdp.next_state[rows, policy, k]), goes_on[:, k])
+    for k in range(continuation.shape[1]):
+        np.subtract.at(matrix, (rows, mdp.next_state[rows, policy, k]), continuation[:, k])
     rewards = (mdp.probability[rows, policy][..., None] * mdp.rewards[rows, policy]).sum(axis=1)
     return np.linalg.solve(matrix, rewards)
 
@@ -127,7 +127,7 @@ def test_exact_evaluation_is_the_mean_of_an_episode_from_every_start(mdp, data):
     starts = np.flatnonzero(mdp.start)
     episodes = np.array([played(mdp, policy, state) for state in starts])
     assert outcome.starts == len(starts)
-    np.testing.assert_allclose(said(outcome), mdp.start[starts] @ episodes, atol=1e-12)
+    np.testing.assert_allclose(as_array(outcome), mdp.start[starts] @ episodes, atol=1e-12)
     np.testing.assert_allclose(outcome.values, mdp.start @ values_of(mdp, policy), atol=1e-9)
 
 
@@ -153,7 +153,7 @@ def test_chances_are_followed_exactly(mdp, data):
     outcome = evaluate_policy(mdp, policy, 2, DISCOUNT)
     starts = np.flatnonzero(mdp.start)
     episodes = np.array([[float(x) for x in expected(mdp, policy, state)] for state in starts])
-    np.testing.assert_allclose(said(outcome), mdp.start[starts] @ episodes, atol=1e-9)
+    np.testing.assert_allclose(as_array(outcome), mdp.start[starts] @ episodes, atol=1e-9)
     np.testing.assert_allclose(outcome.values, mdp.start @ values_of(mdp, policy), atol=1e-8)
 
 
@@ -189,7 +189,7 @@ def test_policies_that_draw_are_evaluated_exactly(mdp, data):
     drawing, only = folded(mdp, policies), np.zeros(mdp.states, np.int32)
     starts = np.flatnonzero(mdp.start)
     episodes = np.array([[float(x) for x in expected(drawing, only, state)] for state in starts])
-    np.testing.assert_allclose(said(outcome), mdp.start[starts] @ episodes, atol=1e-9)
+    np.testing.assert_allclose(as_array(outcome), mdp.start[starts] @ episodes, atol=1e-9)
     np.testing.assert_allclose(outcome.values, mdp.start @ values_of(drawing, only), atol=1e-8)
 
 
@@ -214,10 +214,10 @@ def test_a_best_response_to_policies_that_draw_solves_its_optimality_equation(md
     shape = mdp.states, 2, 2, -1
     for learner in (0, 1):
         found = best_response_to_stochastic(mdp, policies, learner, DISCOUNT)
-        going_on = DISCOUNT * ~mdp.terminated * found[mdp.next_state]
-        worth = (mdp.probability * (mdp.rewards[..., learner] + going_on)).reshape(shape).sum(axis=-1)
+        future = DISCOUNT * ~mdp.terminated * found[mdp.next_state]
+        value = (mdp.probability * (mdp.rewards[..., learner] + future)).reshape(shape).sum(axis=-1)
         other = policies[1 - learner]
-        own = np.einsum("sab,sb->sa" if learner == 0 else "sab,sa->sb", worth, other)
+        own = np.einsum("sab,sb->sa" if learner == 0 else "sab,sa->sb", value, other)
         np.testing.assert_allclose(own.max(axis=1), found, atol=1e-9)
 
 
@@ -274,9 +274,9 @@ def test_the_optimum_is_the_best_of_all_policies(mdp):
     np.testing.assert_allclose(
         values_of(mdp, greedy_policy(mdp, DISCOUNT, values)).sum(axis=1), values, atol=1e-6
     )
-    going_on = DISCOUNT * ~mdp.terminated * values[mdp.next_state]
-    worth = (mdp.probability * (mdp.rewards.sum(axis=-1) + going_on)).sum(axis=-1)
-    np.testing.assert_allclose(worth.max(axis=1), values, atol=1e-9)
+    future = DISCOUNT * ~mdp.terminated * values[mdp.next_state]
+    value = (mdp.probability * (mdp.rewards.sum(axis=-1) + future)).sum(axis=-1)
+    np.testing.assert_allclose(value.max(axis=1), values, atol=1e-9)
 
 
 @settings(deadline=None, max_examples=40)
@@ -292,9 +292,9 @@ def test_a_best_response_is_the_best_of_all_answers(mdp, data):
             assert (found >= values_of(mdp, rest + own * stride)[:, learner] - 1e-8).all()
         joint = rest[:, None] + np.arange(2) * stride
         rows = np.arange(mdp.states)[:, None]
-        going_on = DISCOUNT * ~mdp.terminated[rows, joint, 0] * found[mdp.next_state[rows, joint, 0]]
+        future = DISCOUNT * ~mdp.terminated[rows, joint, 0] * found[mdp.next_state[rows, joint, 0]]
         np.testing.assert_allclose(
-            (mdp.rewards[rows, joint, 0, learner] + going_on).max(axis=1), found, atol=1e-9
+            (mdp.rewards[rows, joint, 0, learner] + future).max(axis=1), found, atol=1e-9
         )
 
 

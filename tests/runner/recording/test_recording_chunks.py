@@ -1,4 +1,4 @@
-"""Which chunks hold which messages, where no message index says so."""
+"""Which chunks hold which messages, where there is no message index."""
 
 from __future__ import annotations
 

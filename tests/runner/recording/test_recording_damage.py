@@ -328,7 +328,9 @@ def test_a_description_that_makes_no_sense_is_refused(entries, lake, tmp_path):
 )
 def test_learners_without_names_are_refused(agents, lake, tmp_path):
     path = tmp_path / "nameless.mcap"
-    rewrite(lake.recording, path, lambda name, said: said | ({"agents": agents} if name == "run" else {}))
+    rewrite(
+        lake.recording, path, lambda name, entries: entries | ({"agents": agents} if name == "run" else {})
+    )
     with pytest.raises(RecordingError, match="its run has agents"):
         everything(path)
 
@@ -336,9 +338,9 @@ def test_learners_without_names_are_refused(agents, lake, tmp_path):
 @pytest.mark.parametrize("key", ["arrays", "event_names", "success_events"])
 @pytest.mark.parametrize("names", [None, "wall", [1]])
 def test_an_environment_that_names_nothing_is_refused(key, names):
-    said = {"arrays": [], "event_names": [], "success_events": []} | {key: names}
+    entries = {"arrays": [], "event_names": [], "success_events": []} | {key: names}
     with pytest.raises(RecordingError, match=f"here: environment.json does not name the environment's {key}"):
-        environment_description(json.dumps(said).encode(), "here")
+        environment_description(json.dumps(entries).encode(), "here")
 
 
 def _text(text: str) -> bytes:

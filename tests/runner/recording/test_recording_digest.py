@@ -54,7 +54,7 @@ def digest_of(path: Path) -> tuple[str, dict[str, str]]:
     return whole.hexdigest(), topics
 
 
-def said(run) -> tuple[str, dict[str, str]]:
+def recorded_digests(run) -> tuple[str, dict[str, str]]:
     """Return the digests that a run's summary states."""
     return run.summary["content_digest"], run.summary["topic_digests"]
 
@@ -62,19 +62,21 @@ def said(run) -> tuple[str, dict[str, str]]:
 @pytest.mark.parametrize("made_of", [TAXIS, LAKE, LAKE | {"evaluation": None, "log": None}])
 def test_the_digest_follows_its_definition(made_of, tmp_path):
     run = make_run(tmp_path, made_of)
-    assert said(run) == digest_of(run.recording)
+    assert recorded_digests(run) == digest_of(run.recording)
     with open_recording(run.recording) as recording:
-        assert (recording.result["content_digest"], recording.result["topic_digests"]) == said(run)
+        assert (recording.result["content_digest"], recording.result["topic_digests"]) == recorded_digests(
+            run
+        )
 
 
 def test_topics_have_no_order(taxis):
-    content, topics = said(taxis)
+    content, topics = recorded_digests(taxis)
     assert combine(dict(reversed(topics.items()))) == combine(topics) == content
 
 
 @pytest.mark.parametrize("packing", PACKINGS, ids=lambda packing: "-".join(map(str, packing.values())))
 def test_how_it_is_packed_does_not_matter(packing, taxis, tmp_path):
-    assert said(make_run(tmp_path, TAXIS, recording=packing)) == said(taxis)
+    assert recorded_digests(make_run(tmp_path, TAXIS, recording=packing)) == recorded_digests(taxis)
 
 
 def test_when_chunks_are_flushed_does_not_matter(taxis, tmp_path, monkeypatch):
@@ -82,29 +84,33 @@ def test_when_chunks_are_flushed_does_not_matter(taxis, tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "SYNC_SECONDS", 0)
     monkeypatch.setattr(recorder, "EPISODES_A_BLOCK", 2)
     run = make_run(tmp_path, TAXIS, recording={"chunk_steps": 256})
-    assert said(run) == said(taxis) == digest_of(run.recording)
+    assert recorded_digests(run) == recorded_digests(taxis) == digest_of(run.recording)
     assert run.summary["bytes"] > taxis.summary["bytes"], "there are more chunks than with the clock's"
 
 
 def test_what_it_is_called_and_how_often_it_is_done_does_not_matter(taxis, tmp_path):
-    assert said(make_run(tmp_path, TAXIS, name="another")) == said(taxis)
-    assert said(make_run(tmp_path, TAXIS, seeds=[5, 0])) == said(taxis)
+    assert recorded_digests(make_run(tmp_path, TAXIS, name="another")) == recorded_digests(taxis)
+    assert recorded_digests(make_run(tmp_path, TAXIS, seeds=[5, 0])) == recorded_digests(taxis)
 
 
 @pytest.mark.parametrize(
     "other", [{"episodes": 61}, {"epsilon": 0.41}, {"evaluation": {"every": 20, "trials": 4}}, {"log": None}]
 )
 def test_other_content_has_another_digest(other, taxis, tmp_path):
-    assert said(make_run(tmp_path, TAXIS, other))[0] != said(taxis)[0]
+    assert recorded_digests(make_run(tmp_path, TAXIS, other))[0] != recorded_digests(taxis)[0]
 
 
 def test_each_seed_has_its_own(tmp_path):
-    assert len({said(make_run(tmp_path, LAKE, seed=seed))[0] for seed in range(5)}) == 5
+    assert len({recorded_digests(make_run(tmp_path, LAKE, seed=seed))[0] for seed in range(5)}) == 5
 
 
 def test_what_differs_shows_in_the_hash_of_its_topic_and_in_no_other(tmp_path):
     first, second = (make_run(tmp_path, LAKE, snapshots={"every": every}) for every in (6, 4))
-    differing = {topic for topic, found in said(first)[1].items() if said(second)[1][topic] != found}
+    differing = {
+        topic
+        for topic, found in recorded_digests(first)[1].items()
+        if recorded_digests(second)[1][topic] != found
+    }
     assert differing == {"/q_table"}
 
 
@@ -116,7 +122,9 @@ def test_leaving_the_steps_out_leaves_only_them_out(taxis, tmp_path):
         for topic in set(schema.TOPICS) - {schema.TRAIN_STEP, schema.EVAL_STEP}:
             assert list(bare.messages(topic)) == list(full.messages(topic))
     _, topics = digest_of(run.recording)
-    assert topics == {topic: found for topic, found in said(taxis)[1].items() if not topic.endswith("/step")}
+    assert topics == {
+        topic: found for topic, found in recorded_digests(taxis)[1].items() if not topic.endswith("/step")
+    }
 
 
 @pytest.mark.parametrize("made_of", [TAXIS, LAKE, TAXIS | SAMPLED | {"algorithm": "random"}])
@@ -128,7 +136,7 @@ def test_recording_changes_nothing(made_of, tmp_path):
     learner = Learner(config, mdp, 4)
     unrecorded = Session(Job(config, 4), learner, recorder_for(Job(config, 4), learner, None))
     assert unrecorded.run()
-    assert unrecorded.recorder.drain() == said(run)[1]
+    assert unrecorded.recorder.drain() == recorded_digests(run)[1]
     twin = Twin(config, mdp, 4)
     twin.train(config.episodes, 10**9)
     with open_recording(run.recording) as recording:

@@ -71,10 +71,10 @@ def page(browser, served):
     yield open_page
     wrong = [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
     assert [message for message in wrong if " 422 " not in message] == []
-    asked = re.findall(
+    requested = re.findall(
         r'"url":"(\w+://[^"/]+)', " ".join(e["message"] for e in browser.get_log("performance"))
     )
-    assert {address for address in asked if address.startswith(("http", "ws"))} <= {served}
+    assert {address for address in requested if address.startswith(("http", "ws"))} <= {served}
 
 
 def wait(browser, done, seconds=60):

@@ -17,8 +17,8 @@ from runner.service.jobs.store import JobStore
 from runner.sweep import state
 from runner.sweep.loading import from_values
 from runner.sweep.running import run_sweep
-from runner.sweep.task import do
-from runner.sweep.trials import Trials, recorded
+from runner.sweep.task import run_task
+from runner.sweep.trials import Trials, recorded_trials
 
 CONFIG = {
     "name": "quick",
@@ -151,8 +151,8 @@ class Here:
         self.answers = []
         self.idle = 1
 
-    def give(self, task):
-        self.answers.append((task, do(task, lambda: False)))
+    def submit(self, task):
+        self.answers.append((task, run_task(task, lambda: False)))
 
     def collect(self, seconds):
         answers, self.answers = self.answers, []
@@ -164,7 +164,7 @@ class Here:
 
 def tried(folder):
     """Return the trials of the sweep with their results."""
-    trials = recorded(Trials(state.read_sweep("small", folder)), folder)
+    trials = recorded_trials(Trials(state.read_sweep("small", folder)), folder)
     return [(trial.values, trial.value, trial.results[0].digest) for trial in trials]
 
 

@@ -71,9 +71,9 @@ def test_steps_and_episodes_are_those_recorded(client, recording, phase):
 
 def test_arrow_has_the_same_columns(client):
     for table in ("steps", "episodes"):
-        asked = {"start": 5, "stop": 30}
-        listed = client.get(f"{RUN}/{table}/train", params=asked).json()["columns"]
-        body = client.get(f"{RUN}/{table}/train.arrow", params=asked).content
+        params = {"start": 5, "stop": 30}
+        listed = client.get(f"{RUN}/{table}/train", params=params).json()["columns"]
+        body = client.get(f"{RUN}/{table}/train.arrow", params=params).content
         assert pa.ipc.open_stream(body).read_all().to_pydict() == listed
 
 
@@ -82,8 +82,8 @@ def test_the_q_table_at_a_step_is_the_exact_one(client, recording, recordings):
     np.testing.assert_array_equal(
         np.load(io.BytesIO(body), allow_pickle=False), one_array(tables_at(recording, 777))
     )
-    asked = {"step": 777, "state": 17}
-    shown_here = client.get(f"{RUN}/qtable", params=asked).json()
+    params = {"step": 777, "state": 17}
+    shown_here = client.get(f"{RUN}/qtable", params=params).json()
     words = ("--step", "777", "--state", "17", "--json", "--recordings", str(recordings))
     assert shown_here == _printed("qtable", "first", *words)
 
@@ -111,13 +111,13 @@ def test_metrics_are_complete_or_marked_as_thinned(client, recording):
     recorded = [record["success_percent"] for record in recording.metrics("eval")]
     assert finish["values"] == recorded
     assert not finish["thinned"]
-    asked = {"points": 2, "metric": "success_percent"}
-    (thin,) = client.get(f"{RUN}/metrics", params=asked).json()["curves"]
+    params = {"points": 2, "metric": "success_percent"}
+    (thin,) = client.get(f"{RUN}/metrics", params=params).json()["curves"]
     assert thin["thinned"]
     assert thin["of"] == len(recorded)
     assert {min(recorded), max(recorded)} <= set(thin["values"])
     (part,) = client.get(
-        f"{RUN}/metrics", params=asked | {"points": 0, "start": finish["episodes"][1]}
+        f"{RUN}/metrics", params=params | {"points": 0, "start": finish["episodes"][1]}
     ).json()["curves"]
     assert part["values"] == recorded[1:]
 
@@ -132,8 +132,8 @@ def test_diff_and_compare_equal_the_commands(client, recordings):
     place = ("--json", "--recordings", str(recordings))
     diff = client.get("/api/v1/diff", params={"a": "first", "b": "second", "target": "success_percent=1"})
     assert diff.json() == _printed("diff", "first", "second", "--target", "success_percent=1", *place, code=1)
-    asked = {"run": ["first", "second"], "by": "name"}
-    compared = client.get("/api/v1/compare", params=asked).json()
+    params = {"run": ["first", "second"], "by": "name"}
+    compared = client.get("/api/v1/compare", params=params).json()
     assert compared == _printed("compare", "first", "second", "--by", "name", *place)
     alone = client.get("/api/v1/compare", params={"run": "first"})
     assert alone.status_code == 400

@@ -151,9 +151,9 @@ def test_a_token_writes_from_anywhere_on_loopback_too(connect, settings, tokens)
 def test_a_login_sets_a_cookie_that_cannot_write_from_other_sites(connect, open_to_others, tokens):
     _, secret = tokens.create("writer", (READ, WRITE))
     client = connect(open_to_others, accept="text/html")
-    asked = client.get("/runs?filter=x", follow_redirects=False)
-    assert asked.status_code == 303
-    assert asked.headers["location"] == "/login?next=%2Fruns%3Ffilter%3Dx"
+    response = client.get("/runs?filter=x", follow_redirects=False)
+    assert response.status_code == 303
+    assert response.headers["location"] == "/login?next=%2Fruns%3Ffilter%3Dx"
     form = {"token": secret, "next": "/runs"}
     assert client.post("/login", data=form).status_code == 403
     assert client.post("/login", data=form | {"token": "wrong"}, headers=OWN).status_code == 401
@@ -256,9 +256,9 @@ def test_no_path_names_a_run(client, name):
 def test_a_note_and_tags_are_checked_as_by_the_commands(client):
     for wrong in ({"name": "<script>"}, {"tag": ["a b"]}, {"note": "x" * 10_001}, {"name": "../x"}):
         assert client.patch(RUN, json=wrong).status_code in (400, 422)
-    said = {"name": "renamed", "tag": ["keep", "a"], "note": "<script>alert(1)</script>"}
-    labels = client.patch(RUN, json=said).json()
-    assert (labels["name"], labels["tags"], labels["note"]) == ("renamed", ["a", "keep"], said["note"])
+    changes = {"name": "renamed", "tag": ["keep", "a"], "note": "<script>alert(1)</script>"}
+    labels = client.patch(RUN, json=changes).json()
+    assert (labels["name"], labels["tags"], labels["note"]) == ("renamed", ["a", "keep"], changes["note"])
     (row,) = client.get(RUNS, params={"filter": "tag:keep"}).json()["runs"]
     assert row["name"] == "renamed"
     back = client.patch(f"{RUNS}/renamed", json={"name": "", "untag": ["a"], "note": ""}).json()
@@ -297,9 +297,9 @@ def test_an_unread_log_blocks_nothing_and_counts_dropped_lines(client):
         stream.close()
         lines = [json.loads(line) for line in read.result(20).splitlines()]
     left_out = [line["lines"] for line in lines if line["event"] == "lines left out"]
-    said = sum(line["event"] == "said" for line in lines)
+    logged = sum(line["event"] == "said" for line in lines)
     assert left_out, "the queue was full"
-    assert sum(left_out) + said == logs.MAX_WAITING + 3_000
+    assert sum(left_out) + logged == logs.MAX_WAITING + 3_000
     assert lines[-1]["event"] == "last"
 
 
@@ -308,8 +308,8 @@ def test_a_service_with_an_unread_log_responds_and_stops(recordings, tmp_path):
     unread = os.open(tmp_path / "log", os.O_RDWR)
     with os.fdopen(unread), Served(recordings, "--log", str(tmp_path / "log")) as served:
         for number in range(100):  # 2 kB of log each, more than a pipe holds
-            asked = {"filter": f"name:n{number}{'x' * 2_000}"}
-            assert served.client.get("/runs", params=asked).status_code == 200
+            params = {"filter": f"name:n{number}{'x' * 2_000}"}
+            assert served.client.get("/runs", params=params).status_code == 200
         assert served.stop() == 0
 
 
@@ -335,19 +335,19 @@ def test_readiness_names_the_failed_check(client, recordings):
 def test_the_command_creates_lists_and_revokes_tokens(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
 
-    def said(*words):
+    def token_command(*words):
         return CliRunner().invoke(cli, ["token", *words])
 
-    secret = said("create", "laptop").stdout.strip()
-    writes = json.loads(said("create", "pusher", "--scope", "write", "--json").stdout)
+    secret = token_command("create", "laptop").stdout.strip()
+    writes = json.loads(token_command("create", "pusher", "--scope", "write", "--json").stdout)
     kept = Tokens(tokens_file())
     assert kept.find(secret).scopes == (READ,)
     assert kept.find(writes["token"]).scopes == (READ, WRITE)
-    listed = json.loads(said("ls", "--json").stdout)["tokens"]
+    listed = json.loads(token_command("ls", "--json").stdout)["tokens"]
     assert [token["name"] for token in listed] == ["laptop", "pusher"]
-    assert secret not in said("ls").stdout
-    assert said("revoke", "nobody").exit_code == 2
-    assert said("revoke", "laptop").exit_code == 0
+    assert secret not in token_command("ls").stdout
+    assert token_command("revoke", "nobody").exit_code == 2
+    assert token_command("revoke", "laptop").exit_code == 0
     assert kept.find(secret) is None
 
 
@@ -356,11 +356,11 @@ def test_headers_of_a_trusted_proxy_are_used(recordings, tmp_path, monkeypatch):
     tokens = Tokens(tmp_path / "dualtaxi" / "tokens.json")
     _, secret = tokens.create("laptop", (READ,))
     words = ("--require-token", "--allow-host", "Runs.example.org", "--proxy", "127.0.0.1")
-    said = {"Host": "runs.example.org", "Origin": "https://runs.example.org"}
-    said |= {"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.7"}
+    headers = {"Host": "runs.example.org", "Origin": "https://runs.example.org"}
+    headers |= {"X-Forwarded-Proto": "https", "X-Forwarded-For": "203.0.113.7"}
     with Served(recordings, *words) as served:
         assert httpx2.get(f"{served.url}/api/v1/runs").status_code == 401
-        entered = httpx2.post(f"{served.url}/login", data={"token": secret}, headers=said)
+        entered = httpx2.post(f"{served.url}/login", data={"token": secret}, headers=headers)
         assert httpx2.get(f"{served.url}/api/v1/runs", headers=_bearer(secret)).status_code == 200
     assert entered.status_code == 303
     assert "Secure" in entered.headers["set-cookie"]

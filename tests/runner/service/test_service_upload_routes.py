@@ -37,8 +37,8 @@ def digest(data):
 
 
 def patch(client, upload, data, offset, **headers):
-    said = PIECE | {"Upload-Offset": str(offset)} | headers
-    return client.patch(f"{UPLOADS}/{upload}", content=data, headers=said)
+    all_headers = PIECE | {"Upload-Offset": str(offset)} | headers
+    return client.patch(f"{UPLOADS}/{upload}", content=data, headers=all_headers)
 
 
 def complete(client, upload, data, **more):

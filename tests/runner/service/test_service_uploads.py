@@ -262,7 +262,7 @@ def test_an_interrupted_replacement_is_completed_by_a_second_upload(uploads, sto
     early, whole = stopped
     assert send(uploads, early.recording.read_bytes(), status="interrupted").state == "stored"
     there = find_run(early.run_id, tmp_path / "runs")
-    shutil.copy(whole.recording, there.recording)  # and killed before run.json said so
+    shutil.copy(whole.recording, there.recording)  # and killed before run.json was updated
     assert send(uploads, whole.recording.read_bytes(), status="finished").already
     assert find_run(early.run_id, tmp_path / "runs").status == "finished"
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from runner.sweep import state
 from runner.sweep.running import run_sweep
-from runner.sweep.task import do
+from runner.sweep.task import run_task
 
 BASE = {
     "env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": False}},
@@ -41,11 +41,11 @@ class Here:
     def idle(self):
         return 1 - len(self.answers)
 
-    def give(self, task):
+    def submit(self, task):
         self.given.append(task)
         self.done += 1
         died = self.done in self.dying
-        self.answers.append((task, None if died else do(task, lambda: self.done > self.most)))
+        self.answers.append((task, None if died else run_task(task, lambda: self.done > self.most)))
 
     def collect(self, seconds):
         answers, self.answers = self.answers, []

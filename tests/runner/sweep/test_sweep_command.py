@@ -25,9 +25,9 @@ def type_in(tmp_path):
 
 
 def test_a_dry_run_prints_the_plan_and_runs_nothing(type_in, file, tmp_path):
-    said = json.loads(type_in("run", str(file()), "--dry-run", "--json").stdout)
-    assert (said["trials"], said["runs"]) == (6, 12)
-    assert said["bytes"] == 12 * said["bytes_a_run"] > 0
+    planned = json.loads(type_in("run", str(file()), "--dry-run", "--json").stdout)
+    assert (planned["trials"], planned["runs"]) == (6, 12)
+    assert planned["bytes"] == 12 * planned["bytes_a_run"] > 0
     assert not (tmp_path / "runs").exists()
     assert "0.1 to 1" in type_in("run", str(file()), "--dry-run").stdout
 
@@ -70,9 +70,9 @@ def test_existing_runs_are_finished_despite_a_limit(type_in, file, tmp_path):
 def test_a_full_disk_is_reported_before_anything_runs(type_in, file, monkeypatch, tmp_path):
     with monkeypatch.context() as small:
         small.setattr(plan, "free_bytes", lambda _: 1000)
-        said = type_in("run", str(file()), code=1).output
-    assert "12 runs need about" in said
-    assert "and 1.0 kB are free" in said
+        output = type_in("run", str(file()), code=1).output
+    assert "12 runs need about" in output
+    assert "and 1.0 kB are free" in output
     assert list_runs(tmp_path / "runs") == []
     type_in("run", str(file()), "--workers", "1")  # it has not begun, so nothing is to be resumed
 

@@ -38,7 +38,7 @@ def test_ray_gives_the_results_of_local_workers_also_when_one_is_killed(tmp_path
     with RayWorkers(2, None, 6) as workers:
         trials, status = swept(tmp_path / "ray", sweep, workers, report=kill_one)
         impossible = Task("", 0, {}, "small", (), None, sweep.objective, run_id="none")  # a TypeError
-        workers.give(impossible)
+        workers.submit(impossible)
         assert workers.collect(60) == [(impossible, None)]
     assert killed
     assert (status.done, status.failed) == (6, 0)

@@ -27,8 +27,8 @@ def test_a_grid_has_all_points_in_order():
     parameters = {"episodes": {"low": 1, "high": 6, "step": 2}, "discount": [0.5, 0.9]}
     search = searched(strategy="grid", trials=None, parameters=parameters)
     assert search.trials == 6
-    asked = search.ask(4) + search.ask(4)
-    assert [tuple(values.values()) for values in asked] == [
+    suggested = search.ask(4) + search.ask(4)
+    assert [tuple(values.values()) for values in suggested] == [
         (episodes, discount) for episodes in (1, 3, 5) for discount in (0.5, 0.9)
     ]
 
@@ -54,13 +54,13 @@ def test_choices_may_be_of_any_kind():
 @pytest.mark.parametrize("strategy", ["random", "tpe", "genetic"])
 def test_equal_results_give_equal_suggestions(strategy):
     def suggestions():
-        search, asked = searched(strategy=strategy, trials=40, batch=5), []
+        search, suggested = searched(strategy=strategy, trials=40, batch=5), []
         for _ in range(8):
             batch = search.ask(5)
             for values in batch:
-                search.tell(len(asked), values["step_size"] * values["discount"], False, {})
-                asked.append(values)
-        return asked
+                search.tell(len(suggested), values["step_size"] * values["discount"], False, {})
+                suggested.append(values)
+        return suggested
 
     first = suggestions()
     assert first == suggestions()

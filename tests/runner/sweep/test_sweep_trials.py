@@ -89,8 +89,8 @@ def test_resuming_a_run_of_other_code_is_refused(done, sweep, tmp_path, monkeypa
 
 def test_runs_recorded_elsewhere_are_moved_and_resumed(done, sweep, tmp_path):
     class Elsewhere(Here):
-        def give(self, task):
-            super().give(replace(task, elsewhere=True))
+        def submit(self, task):
+            super().submit(replace(task, on_own_disk=True))
 
     first = Elsewhere(most=3)
     _, status = swept(tmp_path, sweep, first, stop=lambda: first.done > 3)
@@ -165,14 +165,14 @@ def test_a_process_that_dies_before_its_task_is_replaced(done, monkeypatch):
 
     monkeypatch.setattr(local._Worker, "ask", ask)
     folder, trials, _ = done
-    said = trials.done[0].results[0]
-    task = Task("", 0, {}, "small", (), str(folder), Objective(metric="mean_length"), run_id=said.run_id)
+    result = trials.done[0].results[0]
+    task = Task("", 0, {}, "small", (), str(folder), Objective(metric="mean_length"), run_id=result.run_id)
     with LocalWorkers(1) as workers:
-        workers.give(task)
+        workers.submit(task)
         assert workers.collect(30) == [(task, None)]
-        workers.give(task)
+        workers.submit(task)
         ((_, result),) = workers.collect(30)
-    assert (result.status, result.digest) == ("finished", said.digest)
+    assert (result.status, result.digest) == ("finished", result.digest)
 
 
 @pytest.mark.parametrize("failing", [(".fresh",), (".fresh", ".old")])
