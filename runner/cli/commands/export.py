@@ -69,8 +69,9 @@ def rerun(
     from runner.recording.reader import open_recording
 
     require_rerun("export rerun")
+    from runner.export.rerun.runs import Source
     from runner.export.rerun.selection import Request
-    from runner.export.rerun.writing import Source, export
+    from runner.export.rerun.writing import export
 
     started = time.monotonic()
     run = find_recorded(run_name, recordings)

@@ -1,4 +1,4 @@
-"""Arrays as Rerun columns, without an object a row."""
+"""Arrays as Rerun columns, without one object per row."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from runner.drawing import palette
 
 APPLICATION: Final = "dualtaxi"
+MAX_ROWS: Final = 8_192
+"""Maximum number of rows sent at once: the web viewer drops larger columns."""
 _POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
 _STRIP: Final = pa.list_(pa.field("item", _POINT, nullable=False))
 _BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
@@ -91,14 +93,14 @@ def new_stream(recording_id: str) -> rr.RecordingStream:
 
 
 class Sender:
-    """Sends what is below one entity path."""
+    """Sends data of the entities below one path."""
 
     def __init__(self, stream: rr.RecordingStream, path: str) -> None:
         self._stream = stream
         self.path = path
 
     def send(self, part: str, times: list[rr.TimeColumn], columns: Iterable[Any]) -> None:
-        """Send columns of rows."""
+        """Send columns, a row for each time."""
         self._stream.send_columns(f"{self.path}/{part}", times, columns)
 
     def send_static(self, part: str, *archetypes: Any) -> None:
@@ -131,8 +133,8 @@ def instances(archetype: Any, **parts: NDArray[Any]) -> list[Any]:
     """Return the columns of n rows with equally many instances each.
 
     Args:
-        archetype: of Rerun.
-        parts: text or numbers [n, instances], or points [n, instances, 2], by component.
+        archetype: a class of Rerun, such as `rerun.Points2D`.
+        parts: by component, text or numbers [n, instances], or points [n, instances, 2].
     """
     return [
         _column(archetype, name, _offsets(*part.shape[:2]), part.reshape(-1, *part.shape[2:]))
@@ -140,8 +142,8 @@ def instances(archetype: Any, **parts: NDArray[Any]) -> list[Any]:
     ]
 
 
-def lists(archetype: Any, lengths: NDArray[np.int64], **parts: NDArray[Any]) -> list[Any]:
-    """Return the columns of rows with different numbers of instances; a part is [all instances, ...]."""
+def ragged(archetype: Any, lengths: NDArray[np.int64], **parts: NDArray[Any]) -> list[Any]:
+    """Return the columns of rows with different numbers of instances; each part is [all instances, ...]."""
     offsets = pa.array(np.concatenate(([0], np.cumsum(lengths))).astype(np.int32))
     return [_column(archetype, name, offsets, part) for name, part in parts.items()]
 
@@ -192,13 +194,13 @@ def pixel_centres(height: int, width: int) -> NDArray[np.float32]:
     return np.stack((pixel % width + 0.5, pixel // width + 0.5), axis=1).astype(np.float32)
 
 
-def place(n: int, x: float, y: float) -> NDArray[np.float32]:
-    """Return the same point for n rows, [n, 1, 2]."""
+def repeated_point(n: int, x: float, y: float) -> NDArray[np.float32]:
+    """Return the same point in each of n rows, [n, 1, 2]."""
     return np.broadcast_to(np.array([[x, y]], np.float32), (n, 1, 2))
 
 
 def texts(rows: Sequence[str]) -> NDArray[Any]:
-    """Return a text a row, [n, 1]."""
+    """Return one text per row, [n, 1]."""
     return np.array(rows, dtype=object)[:, None]
 
 

@@ -34,7 +34,7 @@ class Labels:
     Args:
         mdp: the environment.
         scene: its scene; None if it has none.
-        learners: their names.
+        learners: the names of the learners.
         value_range: the lowest and the highest value of the tables.
     """
 
@@ -53,7 +53,7 @@ class Labels:
         self.waiting = self._add(passengers, palette.PASSENGER)
         """The first passenger's label."""
         self.riding = self._add([""], palette.PASSENGER)
-        """A passenger that is carried: the label of its carrier says so."""
+        """The empty label of a passenger that is carried: the label of its carrier shows it."""
         self._longest = min(mdp.step_limit or MAX_T, MAX_T)
         self._t = self._add([*(f"t = {k}" for k in range(self._longest)), f"t ≥ {self._longest}"])
         self._add_rewards(mdp.rewards_of(len(learners)), learners)

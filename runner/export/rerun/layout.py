@@ -58,7 +58,7 @@ _AGENT_GAP: Final = 2.0
 
 @dataclass(frozen=True, eq=False)
 class RunView:
-    """A run as the blueprint sees it."""
+    """The properties of a run that decide which views it has."""
 
     root: str
     """Entity path of everything of the run; empty for the root."""
@@ -76,9 +76,7 @@ class RunView:
         if self.has_values:
             _draw_table(stream, f"{self.root}/table/words", self.mdp)
         if self.scene is not None:
-            _draw_grid(stream, f"{self.root}/scene", self.scene)
-            if self.scene.placements is not None:
-                _draw_blocks(stream, f"{self.root}/frame", self.scene.placements)
+            draw_scene(stream, self.root, self.scene)
 
     def grid_view(self) -> Any:
         """Return the view of the grid; without a scene that of state and action as lines."""
@@ -87,10 +85,7 @@ class RunView:
             return self._view(
                 rrb.TimeSeriesView, f"{self.title}: state and action", entities, axis_x=whole_axis(self.last)
             )
-        bounds = rrb.VisualBounds2D(
-            x_range=(-GRID_MARGIN, self.scene.columns + GRID_MARGIN),
-            y_range=(-GRID_MARGIN - 0.1, self.scene.rows + GRID_MARGIN + 0.1),
-        )
+        bounds = grid_bounds(self.scene)
         entities = ["scene/**", "train/grid/**", "eval/grid/**", "notice/**"]
         return self._view(rrb.Spatial2DView, self.title, entities, visual_bounds=bounds)
 
@@ -124,11 +119,11 @@ class RunView:
 
 
 def blueprint(runs: Sequence[RunView], entities: set[str] | None) -> rrb.Blueprint:
-    """Return the arrangement of one run, or of several side by side; it opens at the last step.
+    """Return the blueprint of one run, or of several side by side; it opens at the last step.
 
     Args:
         runs: the runs.
-        entities: the metrics that there are; None if not known yet.
+        entities: the entities of recorded metrics; None if not known yet.
     """
     plots = _plots(runs, entities)
     body: Any
@@ -161,7 +156,7 @@ def blueprint(runs: Sequence[RunView], entities: set[str] | None) -> rrb.Bluepri
 
 
 def loop_blueprint(views: Sequence[Any]) -> rrb.Blueprint:
-    """Return the arrangement of loops, whose views are given."""
+    """Return the blueprint of loops, given the view of each."""
     return _with_panels(views[0] if len(views) == 1 else rrb.Vertical(*views), "paused")
 
 
@@ -204,21 +199,35 @@ def bar_rows(mdp: Mdp) -> list[NDArray[np.float64]]:
     return rows
 
 
+def grid_bounds(scene: Scene) -> rrb.VisualBounds2D:
+    """Return the part of the plane that a view of the grid shows."""
+    return rrb.VisualBounds2D(
+        x_range=(-GRID_MARGIN, scene.columns + GRID_MARGIN),
+        y_range=(-GRID_MARGIN - 0.1, scene.rows + GRID_MARGIN + 0.1),
+    )
+
+
+def draw_scene(stream: rr.RecordingStream, root: str, scene: Scene) -> None:
+    """Log what never changes in the scene of a run: cells, walls and landmarks, and the frames of maps."""
+    _draw_grid(stream, f"{root}/scene", scene)
+    if scene.placements is not None:
+        _draw_blocks(stream, f"{root}/frame", scene.placements)
+
+
 def _draw_table(stream: rr.RecordingStream, path: str, mdp: Mdp) -> None:
-    """Log the words around the table of values."""
-    words: list[tuple[float, float, str, str]] = []
-    """x, y, text and colour."""
+    """Log the headings and names around the table of values."""
+    labels: list[tuple[float, float, str, str]] = []  # x, y, text and colour
     agents = zip(mdp.agents, bar_rows(mdp), numbered_actions(mdp), strict=True)
     for i, (agent, rows, names) in enumerate(agents):
-        words.append((NAME_X, float(rows[0]) - 1.15, spoken(agent).upper(), palette.agent(i)))
-        words += [(NAME_X, float(y), name, palette.MIDTONE) for y, name in zip(rows, names, strict=True)]
+        labels.append((NAME_X, float(rows[0]) - 1.15, spoken(agent).upper(), palette.agent(i)))
+        labels += [(NAME_X, float(y), name, palette.MIDTONE) for y, name in zip(rows, names, strict=True)]
     middle = BAR_LEFT + BAR_LENGTH / 2
     headings = {middle: "worst to best", NUMBER_X: "Q", GREEDY_X: "greedy", CHOSEN_X: "chosen"}
-    words += [(x, -0.15, heading, palette.MIDTONE) for x, heading in headings.items()]
+    labels += [(x, -0.15, heading, palette.MIDTONE) for x, heading in headings.items()]
     points = rr.Points2D(
-        [(x, y - LABEL_RISE) for x, y, _, _ in words],
-        labels=[text for _, _, text, _ in words],
-        colors=[rgba(colour) for _, _, _, colour in words],
+        [(x, y - LABEL_RISE) for x, y, _, _ in labels],
+        labels=[text for _, _, text, _ in labels],
+        colors=[rgba(colour) for _, _, _, colour in labels],
         radii=0.0,
         show_labels=True,
     )

@@ -35,11 +35,11 @@ END_SECONDS: Final = 10.0
 
 
 class Piece(NamedTuple):
-    """What is shown at once."""
+    """Steps or metrics to show, of one phase."""
 
     phase: str
     time: int
-    """Steps of both phases executed, the first of these included; for metrics, all until then."""
+    """Steps of both phases executed by the first of these steps; for metrics, all until then."""
     episode: int
     """The training episode at that time."""
     content: NDArray[np.void] | dict[str, Any]
@@ -50,10 +50,10 @@ class LiveView:
     """Shows a run in a viewer while it trains: an observer for `run_job`, and a context manager.
 
     Args:
-        title: title of the run.
-        run_id: its id.
-        every: one training episode, and one trial, in this number is shown.
-        url: of the viewer, such as `rerun+http://127.0.0.1:9876/proxy`.
+        title: the title of the run.
+        run_id: the id of the run.
+        every: N, to show every Nth training episode and trial.
+        url: the address of the viewer, such as `rerun+http://127.0.0.1:9876/proxy`.
     """
 
     def __init__(self, title: str, run_id: str, every: int, url: str) -> None:

@@ -1,4 +1,4 @@
-"""What a live view sends to a viewer: no Q-values, since the tables would have to be replayed."""
+"""Sending a run to a viewer while it trains: no Q-values, since the tables would have to be replayed."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class LiveStream:
     """Sends a run to a viewer while it trains.
 
     Args:
-        title: title of the run.
-        run_id: its id.
-        mdp: its environment.
-        learners: the names of its learners.
-        url: of the viewer.
+        title: the title of the run.
+        run_id: the id of the run.
+        mdp: the environment.
+        learners: the names of the learners.
+        url: the address of the viewer.
     """
 
     def __init__(self, title: str, run_id: str, mdp: Mdp, learners: tuple[str, ...], url: str) -> None:
@@ -63,7 +63,7 @@ class LiveStream:
         self._steps[phase].write(Batch(steps, episode, time))
 
     def show_phase(self, phase: str, time: int) -> None:
-        """Clear the grid of the other phase at a time if it is shown."""
+        """Show the grid of a phase from a time on, and clear that of the other one."""
         if phase != self._phase:
             self._steps[self._phase].clear("grid", [time])
             self._phase = phase

@@ -13,9 +13,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from runner.export.rerun.columns import Batch, Sender, scalars
+from runner.export.rerun.columns import MAX_ROWS, Batch, Sender, scalars
 from runner.export.rerun.labels import Labels
-from runner.export.rerun.layout import RunView, whole_axis
+from runner.export.rerun.layout import draw_scene, grid_bounds, whole_axis
 from runner.export.rerun.metrics import phase_colours, series_lines
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import Selection, Span
@@ -25,13 +25,11 @@ from runner.recording.reader import Recording
 from runner.recording.spaces import leaves_of
 from runner.replay.steps import check_steps
 
-BATCH: Final = 8_192
-"""Rows sent at a time: larger columns are dropped by the web viewer."""
 MAX_LINES: Final = 16
-"""Numbers of an observation or action that are drawn as lines."""
+"""Observations or actions of more numbers are not drawn as lines."""
 MAX_ARRAYS: Final = 2
 MAX_LOGGED: Final = 6
-PHASES: Final = ("train", "eval")
+"""Views of logged arrays and of logged scalars in the blueprint; all are sent."""
 _FRAMES: Final = {"train": schema.TRAIN_FRAME, "eval": schema.EVAL_FRAME}
 Leaf = tuple[str, tuple[str, ...]]
 """A name, and the path of fields in the record of a step."""
@@ -48,24 +46,21 @@ class LoopExporter:
         self._learners = recording.agents
         self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._drawn: dict[str, None] = {}
-        """The parts of both phases that are drawn as lines."""
+        """The parts of both phases that are drawn as lines; a dictionary keeps them in order."""
         self._logged: dict[str, None] = {}
         self._frames: list[str] = []
         self._arrays: dict[str, None] = {}
         self._has_log = False
         self._last = 0
-        """The last step of the timeline with anything sent."""
+        """The last step for which anything was sent."""
 
     def blueprint(self, title: str) -> Any:
         """Return the arrangement of what `export` has sent."""
         root = self._root
-        left: list[tuple[Any, int]] = []
-        """Views and their shares of the height."""
+        left: list[tuple[Any, int]] = []  # views and their shares of the height
         if self._scene is not None:
-            contents = [f"{root}/scene/**", *(f"{root}/{phase}/grid/**" for phase in PHASES)]
-            bounds = rrb.VisualBounds2D(
-                x_range=(-0.8, self._scene.columns + 0.8), y_range=(-0.9, self._scene.rows + 0.9)
-            )
+            contents = [f"{root}/scene/**", *(f"{root}/{phase}/grid/**" for phase in schema.PHASES)]
+            bounds = grid_bounds(self._scene)
             grid = rrb.Spatial2DView(origin=f"{root}/", contents=contents, visual_bounds=bounds, name=title)
             left.append((grid, 4))
         left += [
@@ -78,7 +73,7 @@ class LoopExporter:
         ]
         if self._has_log:
             left.append((rrb.TextLogView(origin=f"{root}/log", name="Log"), 1))
-        plots = [self._plot(name, [f"{phase}/{name}" for phase in PHASES]) for name in self._drawn]
+        plots = [self._plot(name, [f"{phase}/{name}" for phase in schema.PHASES]) for name in self._drawn]
         plots += [self._plot(name, [f"logged/{name}"]) for name in islice(self._logged, MAX_LOGGED)]
         if not left:
             return rrb.Grid(*plots, grid_columns=2, name=title)
@@ -93,7 +88,7 @@ class LoopExporter:
     def export(self) -> None:
         """Send everything that is selected."""
         recording = self._recording
-        for phase in PHASES:
+        for phase in schema.PHASES:
             self._send_episodes(phase)
             self._send_frames(phase)
         self._send_logged()
@@ -102,11 +97,11 @@ class LoopExporter:
         if self._scene is not None:
             labels = Labels(recording.mdp, self._scene, self._learners)
             labels.log(self._stream, self._root)
-            RunView(self._root, "", recording.mdp, self._scene, self._learners).draw_background(self._stream)
+            draw_scene(self._stream, self._root, self._scene)
         else:
             labels = None
         spans = {"train": self._selection.train, "eval": [span for _, span in self._selection.evaluations]}
-        for phase in PHASES:
+        for phase in schema.PHASES:
             if recording.kind == "variable":
                 self._send_rewards(phase, spans[phase])
             else:
@@ -146,7 +141,7 @@ class LoopExporter:
                 sender.send_static(name, series_lines([name]))
             rows = waiting.setdefault(name, [])
             rows.append((scalar["log_time"], scalar["episode"], scalar["value"]))
-            if len(rows) == BATCH:
+            if len(rows) == MAX_ROWS:
                 send(name)
         for name in list(waiting):
             send(name)
@@ -205,7 +200,7 @@ class LoopExporter:
             self._draw_lines(sender, "reward", self._reward_lines(phase))
         for span in spans:
             steps = islice(self._recording.transitions(phase), span.start, span.stop)
-            while batch := list(islice(steps, BATCH)):
+            while batch := list(islice(steps, MAX_ROWS)):
                 times, episodes = (np.array([step[key] for step in batch]) for key in ("log_time", "episode"))
                 rewards = np.array([step["rewards"] for step in batch])
                 sender.send("reward", self._times(times, episodes), scalars(rewards))
@@ -215,8 +210,8 @@ class LoopExporter:
         recording = self._recording
         for span in spans:
             for block in recording.blocks(topic, span.start, span.stop):
-                for start in range(0, len(block), BATCH):
-                    steps = block[start : start + BATCH]
+                for start in range(0, len(block), MAX_ROWS):
+                    steps = block[start : start + MAX_ROWS]
                     is_shown = (steps["step"] % recording.environments == 0) & (steps["t"] != schema.NEVER)
                     steps = steps[is_shown]
                     if not len(steps):

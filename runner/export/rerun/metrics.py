@@ -30,12 +30,12 @@ class MetricWriter:
     """Sends the metrics of a run.
 
     Args:
-        stream: the stream.
+        stream: the stream to send to.
         root: entity path of the run; empty for the root.
-        learners: their names.
-        event_names: of the environment.
-        tint: the base colour of its lines, where runs are compared.
-        label: name of the run, where runs are compared.
+        learners: the names of the learners.
+        event_names: the events of the environment.
+        tint: the base colour of the run's lines, where runs are compared.
+        label: the name of the run, where runs are compared.
     """
 
     def __init__(
@@ -64,19 +64,20 @@ class MetricWriter:
         self.send_reward_shares(reports, sorted({reward for row in reports for reward in row["rewards"]}))
         self.send_evaluations(evaluations)
         ends = np.array([row["step"] for row in reports], np.int64)
+        # The last row is for episodes that ended after the last report.
         sums = np.zeros((len(reports) + 1, 2 + len(self._learners) + len(self._events)))
         for phase, (_, topic) in schema.PHASES.items():
             for block in recording.blocks(topic):
                 self._send_episodes(phase, block)
                 if phase == "train":
-                    ended = np.searchsorted(ends, block["last_step"].astype(np.int64) + 1)
+                    report = np.searchsorted(ends, block["last_step"].astype(np.int64) + 1)
                     ones = np.ones((len(block), 1))
                     parts = (block["penalties"][:, None], ones, block["returns"], block["events"])
-                    np.add.at(sums, ended, np.concatenate(parts, axis=1))
+                    np.add.at(sums, report, np.concatenate(parts, axis=1))
         self._send_training_means(reports, sums[:-1])
 
     def send_training(self, rows: Rows) -> None:
-        """Send what training measured of itself, from both kinds of metrics messages."""
+        """Send the metrics of training, which both kinds of metrics messages have."""
         if rows:
             self._series("train/metrics/mean_length", rows, [[r["mean_length"]] for r in rows], ["training"])
             filled = self._learners if len(self._learners) > 1 else ["filled"]

@@ -23,9 +23,9 @@ from runner.export.rerun.columns import (
     StepValues,
     images,
     instances,
-    lists,
     pixel_centres,
-    place,
+    ragged,
+    repeated_point,
     rgba,
     scalars,
     strips,
@@ -74,7 +74,7 @@ class StepValueReader:
         self._states = np.empty((1, 0), np.int32)
         if placements is not None:
             self._context, self._states = placements.context, placements.states
-        self._known = known_steps(recording)
+        self._known_ranges = known_steps(recording)
         self._replay: TableReplay | None = None
         self._last = (0, -1)
         """Time and context of the step before."""
@@ -82,7 +82,7 @@ class StepValueReader:
     def split(self, block: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
         """Yield a block of training steps in parts whose values are either all known or all unknown."""
         first = int(block["step"][0])
-        edges = [edge for start, last in self._known for edge in (start, last + 1)]
+        edges = [edge for start, last in self._known_ranges for edge in (start, last + 1)]
         yield from np.split(block, [edge - first for edge in edges if 0 < edge - first < len(block)])
 
     def training(self, block: NDArray[np.void]) -> StepValues | None:
@@ -109,7 +109,7 @@ class StepValueReader:
 
     def _replay_at(self, step: int) -> TableReplay | None:
         """Return the replay at a training step; None if the tables there are unknown."""
-        if not any(first <= step <= last for first, last in self._known):
+        if not any(first <= step <= last for first, last in self._known_ranges):
             return None
         if self._replay is None:
             self._replay = TableReplay(self._recording, step)
@@ -163,7 +163,7 @@ class TableWriter(Sender):
             np.stack((np.full_like(height, x), height), axis=1) for x in (NUMBER_X, GREEDY_X, CHOSEN_X)
         ]
         self._points = np.concatenate(columns).astype(np.float32)
-        """Of the number of each action, of its mark as the greedy one, and as the chosen one."""
+        """The points of each action's number, then of its mark as greedy, then of its mark as chosen."""
         colours = [rgba(palette.agent(i)) for i, count in enumerate(counts) for _ in range(count)]
         names = zip(mdp.agents, numbered_actions(mdp), strict=True)
         series = [f"{spoken(agent)} {name}" for agent, actions in names for name in actions]
@@ -210,7 +210,7 @@ class MapWriter(Sender):
         super().__init__(stream, f"{path}/map")
         mdp = scene.mdp
         self._learner = learner
-        self._part = learners[learner]
+        self._name = learners[learner]
         self._placements = placements
         is_joint = len(learners) != len(mdp.agents)
         agents = list(range(len(mdp.agents))) if is_joint else [learner]
@@ -226,7 +226,7 @@ class MapWriter(Sender):
         offsets = np.stack((x, np.zeros(len(agents))), axis=1).astype(np.float32)
         origins = self._centres[None] + offsets[:, None]
         self._letter_points = origins - np.array([0.0, _LETTER_RISE], np.float32)
-        self._set_moves(scene, labels, agents, movers, is_joint)
+        self._arrows, self._letters = _arrows_and_letters(scene, labels, agents, movers, is_joint)
         colours = [rgba(palette.agent(agent)) for agent in agents for _ in self._centres]
         text = rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[rgba(palette.MIDTONE)])
         pixels = rr.components.ImageFormat(
@@ -241,32 +241,18 @@ class MapWriter(Sender):
         here = rr.Boxes2D.from_fields(colors=[rgba(palette.BAD)], radii=0.1, draw_order=50.0)
         letters = rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0)
         self.send_static(
-            self._part,
+            self._name,
             rr.DepthImage.from_fields(format=pixels, colormap=rr.components.Colormap.Viridis),
         )
-        self.send_static(f"{self._part}/moves", arrows)
-        self.send_static(f"{self._part}/here", here)
-        self.send_static(f"{self._part}/stops", letters)
-        self.send_static(f"{self._part}/label", text)
-
-    def _set_moves(
-        self, scene: Scene, labels: Labels, agents: list[int], movers: list[int], is_joint: bool
-    ) -> None:
-        """Set the arrow, [agents, actions, 2], and the letter, [agents, actions], of each action."""
-        own = own_actions(scene.mdp)
-        arrows, letters = [], []
-        for agent, mover in zip(agents, movers, strict=True):
-            count = scene.mdp.action_counts[agent]
-            first = [int(np.argmax(own[:, agent] == action)) for action in range(count)]
-            actions = own[:, agent] if is_joint else np.arange(count)
-            arrows.append((scene.moves[first, mover] * np.float32(_ARROW_SCALE))[actions])
-            letters.append(labels.stops[agent][actions])
-        self._arrows, self._letters = np.stack(arrows), np.stack(letters)
+        self.send_static(f"{self._name}/moves", arrows)
+        self.send_static(f"{self._name}/here", here)
+        self.send_static(f"{self._name}/stops", letters)
+        self.send_static(f"{self._name}/label", text)
 
     def write(self, batch: Batch, values: StepValues) -> None:
         """Send where each step of a batch is in the map, and the maps that there are."""
         here = self._centres.take(self._pixel.take(batch.records["state"]), axis=0)[:, None]
-        self.send(f"{self._part}/here", batch.times, instances(rr.Boxes2D, centers=here))
+        self.send(f"{self._name}/here", batch.times, instances(rr.Boxes2D, centers=here))
         rows = values.map_rows
         if not len(rows):
             return
@@ -279,21 +265,36 @@ class MapWriter(Sender):
         total = _fill_moves(
             greedy, self._arrows, self._letters, self._letter_points, vectors, counts, points, classes
         )
-        letters = lists(rr.Points2D, counts, positions=points[:total], class_ids=classes[:total])
+        letters = ragged(rr.Points2D, counts, positions=points[:total], class_ids=classes[:total])
         contexts = self._placements.context[batch.records["state"][rows]].tolist()
         labels = [
             f"as of step {time:,}\n{self._placements.names[context]}"
             for time, context in zip(batch.time[rows].tolist(), contexts, strict=True)
         ]
-        points = place(n, self._placements.width / 2, MAP_LABEL_Y)
+        label_points = repeated_point(n, self._placements.width / 2, MAP_LABEL_Y)
         sizes = np.full((n, 1, 2), 0.5, np.float32)
-        self.send(self._part, times, images(values.value_maps[:, self._learner][:, self._order]))
-        self.send(f"{self._part}/here", times, instances(rr.Boxes2D, half_sizes=sizes))
-        self.send(f"{self._part}/moves", times, instances(rr.Arrows2D, vectors=vectors.reshape(n, -1, 2)))
-        self.send(f"{self._part}/stops", times, letters)
+        self.send(self._name, times, images(values.value_maps[:, self._learner][:, self._order]))
+        self.send(f"{self._name}/here", times, instances(rr.Boxes2D, half_sizes=sizes))
+        self.send(f"{self._name}/moves", times, instances(rr.Arrows2D, vectors=vectors.reshape(n, -1, 2)))
+        self.send(f"{self._name}/stops", times, letters)
         self.send(
-            f"{self._part}/label", times, instances(rr.Points2D, positions=points, labels=texts(labels))
+            f"{self._name}/label", times, instances(rr.Points2D, positions=label_points, labels=texts(labels))
         )
+
+
+def _arrows_and_letters(
+    scene: Scene, labels: Labels, agents: list[int], movers: list[int], is_joint: bool
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return the arrow, [agents, actions, 2], and the letter, [agents, actions], of each action."""
+    own = own_actions(scene.mdp)
+    arrows, letters = [], []
+    for agent, mover in zip(agents, movers, strict=True):
+        count = scene.mdp.action_counts[agent]
+        first = [int(np.argmax(own[:, agent] == action)) for action in range(count)]
+        actions = own[:, agent] if is_joint else np.arange(count)
+        arrows.append((scene.moves[first, mover] * np.float32(_ARROW_SCALE))[actions])
+        letters.append(labels.stops[agent][actions])
+    return np.stack(arrows), np.stack(letters)
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
@@ -308,16 +309,16 @@ def _split_joint(rows: Any, own: Any, first: Any, best: Any, greedy: Any) -> Non
         greedy: [n, agents], filled; ties go to the lowest joint action.
     """
     for k in range(len(rows)):
-        for at in range(best.shape[1]):
-            best[k, at] = -np.inf
+        for i in range(best.shape[1]):
+            best[k, i] = -np.inf
         highest = 0
         for joint in range(rows.shape[1]):
             value = rows[k, joint]
             if value > rows[k, highest]:
                 highest = joint
             for agent in range(own.shape[1]):
-                at = first[agent] + own[joint, agent]
-                best[k, at] = max(best[k, at], value)
+                i = first[agent] + own[joint, agent]
+                best[k, i] = max(best[k, i], value)
         for agent in range(own.shape[1]):
             greedy[k, agent] = own[highest, agent]
 
@@ -342,8 +343,8 @@ def _fill_table(
         own: [n, agents], its chosen action.
         explored: [n, agents], whether that was explored.
         bounds: [agents + 1], the first value of each agent, and the number of values.
-        unit: of the labels of values.
-        marks: of `Labels`.
+        unit: `Labels.unit`, the rounding of the labels of values.
+        marks: `Labels.value_marks`.
         classes: [n, 3 * values], filled with the labels of values, greedy and chosen actions.
         ends: [n, values], filled: a bar reaches from the agent's lowest value in a step to its highest.
     """
@@ -372,7 +373,7 @@ def _fill_table(
 def _fill_moves(
     greedy: Any, arrows: Any, letters: Any, points: Any, vectors: Any, counts: Any, places: Any, classes: Any
 ) -> int:
-    """Fill in the arrows of greedy actions, and the letters of those that are no moves.
+    """Fill in the arrows of greedy actions, and the letters of those that do not move.
 
     Args:
         greedy: [k, pixels], greedy actions; -1 for no state.

@@ -37,8 +37,9 @@ class Request:
     every: int = 0
     """Every Nth training episode; 0 for none."""
     everything: bool = False
+    """Whether all steps are exported."""
     with_default: bool = False
-    """Whether the default selection is added to the rest."""
+    """Whether the default selection is exported as well."""
 
     @property
     def is_default(self) -> bool:
@@ -145,8 +146,8 @@ def locate(run: Run, request: Request, step: tuple[int, ...] | None) -> Location
     Args:
         run: the run.
         request: what is exported anyway.
-        step: (episode, t) of training, (training episodes, trial, t) of an evaluation, or None for the first
-            step of the last evaluation exported, or else of the last training episode.
+        step: a parsed step reference, `runner.analysis.step_reference`; None for the first
+            step of the last evaluation exported, or of the last training episode if there is none.
 
     Raises:
         RecordingError: there is no such step, or none at all.
@@ -208,11 +209,10 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[tuple[int, ...] | None, str]
             divergence = next(evaluation_divergences(a, b), None)
             if divergence is None:
                 return None, f"They never diverge: every step is the same{suffix}."
-    step = (divergence.episode, divergence.t)
-    return step if divergence.after is None else (
-        divergence.after,
-        *step,
-    ), f"They diverge {where_in_words(divergence)}."
+    step: tuple[int, ...] = (divergence.episode, divergence.t)
+    if divergence.after is not None:
+        step = (divergence.after, *step)
+    return step, f"They diverge {where_in_words(divergence)}."
 
 
 def episodes_of(recording: Recording, phase: str) -> Episodes:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from runner.drawing import palette
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import events_in_words, spoken, states_in_words
-from runner.export.rerun.columns import Batch, Sender, instances, place, rgba, scalars, strips, texts
+from runner.export.rerun.columns import Batch, Sender, instances, repeated_point, rgba, scalars, strips, texts
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.metrics import phase_colours, series_lines
 from runner.export.rerun.scene import Scene
@@ -35,12 +35,12 @@ class StepWriter(Sender):
     """Sends the steps of one phase of a tabular run.
 
     Args:
-        stream: the stream.
-        root: entity path of the run.
+        stream: the stream to send to.
+        root: the entity path of the run.
         phase: `train` or `eval`.
         mdp: the environment.
-        scene: its scene; None to send states and actions as series instead of a grid.
-        labels: those of the run.
+        scene: the scene of the environment; None to send states and actions as series instead of a grid.
+        labels: the labels of the run.
         learners: the names of the learners whose rewards are sent; empty for none.
     """
 
@@ -177,16 +177,16 @@ class _Grid(Sender):
         return np.concatenate((points, np.broadcast_to(status, (len(points), *status.shape))), axis=1)
 
     def _trails(self, state: NDArray[np.int64], t: NDArray[Any]) -> NDArray[np.float32]:
-        """Return the way of each mover in the last steps of the episode, [n, movers, TRAIL_STEPS + 1, 2]."""
+        """Return each mover's path over the last steps of the episode, [n, movers, TRAIL_STEPS + 1, 2]."""
         before = np.repeat(state[:1], TRAIL_STEPS) if self._before is None else self._before
         states = np.concatenate((before, state))
         self._before = states[-TRAIL_STEPS:]
         # A point as one number of eight bytes: fewer and larger values to copy.
         points = self._scene.mover_points.take(states, axis=0).view(np.int64)[..., 0]
         lines = np.ascontiguousarray(sliding_window_view(points, TRAIL_STEPS + 1, axis=0))
-        young = np.flatnonzero(t < TRAIL_STEPS)
-        back = np.minimum(np.arange(TRAIL_STEPS, -1, -1), t[young, None])
-        lines[young] = points[young[:, None] + TRAIL_STEPS - back].swapaxes(1, 2)
+        early = np.flatnonzero(t < TRAIL_STEPS)
+        back = np.minimum(np.arange(TRAIL_STEPS, -1, -1), t[early, None])
+        lines[early] = points[early[:, None] + TRAIL_STEPS - back].swapaxes(1, 2)
         return lines[..., None].view(np.float32)
 
     def _send_sizes(self, batch: Batch) -> None:
@@ -209,7 +209,7 @@ class _Grid(Sender):
             else f"EVALUATION after {trained:,} episodes, trial {trial:,}"
             for trained, trial in numbers
         ]
-        points = place(n, scene.columns / 2, TITLE_Y)
+        points = repeated_point(n, scene.columns / 2, TITLE_Y)
         self.send("grid/title", times, instances(rr.Points2D, positions=points, labels=texts(titles)))
         if not scene.goals:
             return
@@ -233,11 +233,11 @@ class _EventLog:
         self._mask = np.uint32(
             sum(1 << bit for bit, name in enumerate(mdp.event_names) if ".illegal" not in name)
         )
-        self._known: dict[tuple[int, int], tuple[str, str]] = {}
+        self._entries: dict[tuple[int, int], tuple[str, str]] = {}
         """Text and level by events and ending."""
 
     def columns(self, batch: Batch, events: NDArray[np.uint32]) -> tuple[NDArray[np.int64], list[Any]]:
-        """Return the rows of a batch that something happens in, ascending, and their texts."""
+        """Return the rows of a batch with an entry in the log, ascending, and the entries as columns."""
         records = batch.records
         masks = events & self._mask
         endings = np.where(records["terminated"], 1, np.where(records["truncated"], 2, 0))
@@ -257,10 +257,10 @@ class _EventLog:
 
     def _entry(self, mask: int, ending: int, length: int) -> tuple[str, str]:
         """Return text and level for a mask of events and an ending (0: none, 1: terminal, 2: time-out)."""
-        if (mask, ending) not in self._known:
+        if (mask, ending) not in self._entries:
             text = events_in_words(self._mdp, mask)
             is_bad = "collision" in text and not mask & self._mdp.success_mask
             end = ("", "episode over", "time-out")[ending]
-            self._known[mask, ending] = ", ".join(filter(None, (text, end))), "WARN" if is_bad else "INFO"
-        text, level = self._known[mask, ending]
+            self._entries[mask, ending] = ", ".join(filter(None, (text, end))), "WARN" if is_bad else "INFO"
+        text, level = self._entries[mask, ending]
         return (f"{text} after {length} steps" if ending else text), level

@@ -119,9 +119,9 @@ class Viewer:
     """A viewer that listens on loopback.
 
     Args:
-        log: file for its output.
-        port: that it listens on.
-        options: of the viewer's command line.
+        log: the file for its output.
+        port: the port it listens on.
+        options: more arguments of its command line.
         detached: whether it survives the end of this program.
 
     Raises:
@@ -178,7 +178,7 @@ class Viewer:
         return client
 
     def error(self, what: str) -> ViewerError:
-        """Return the error that the viewer did something, with the reason as far as its output shows it."""
+        """Return an error of the viewer, with the reason as far as its output shows it."""
         text = self._log.read_text(errors="replace")
         if any(word in text for word in ("graphics adapter", "libEGL", "Vulkan", "libxkbcommon")):
             reason = f": it finds no graphics. On Debian: apt-get install {MESA_PACKAGES}"

@@ -13,10 +13,11 @@ from runner.drawing.palette import COMPARED
 from runner.environments.mdp import events_of
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.layout import PLOTS
+from runner.export.rerun.runs import Source
 from runner.export.rerun.scene import own_actions, scene_of
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import viewer_program
-from runner.export.rerun.writing import Source, export
+from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, tables_at
