@@ -21,14 +21,14 @@ Change = Callable[[Any], Any]
 
 
 def altered(source: Path, target: Path, topic: Topic | None, change: Change, **metadata: Change) -> Path:
-    """Write a recording anew with the messages of a topic changed, and metadata by name; return where it is.
+    """Write a copy of a recording in which messages of a topic or metadata differ; return its path.
 
     Args:
         source: a finished recording.
         target: the new file.
-        topic: whose messages are changed; None for none.
-        change: takes all of them, as one array, or as a list of (log time, payload), and gives them back.
-        metadata: what changes the entries of a metadata record.
+        topic: the topic whose messages are changed; None for none.
+        change: maps all of its messages, one array or a list of (log time, payload), to the new ones.
+        metadata: by the name of a metadata record, a function from its entries to the new ones.
     """
     with open_recording(source) as recording, RecordingFile(target, recording.topics) as file:
         contents = survey(source, keep_result=True)

@@ -163,35 +163,33 @@ class LoopExporter:
         """Send steps of the first environment, in all their views."""
         recording, sender, leaves = self._recording, self._sender(phase), self._leaves()
         grid: StepWriter | None = None
-        is_first = True
-        if labels is not None and phase == "eval":
-            ends = [block["log_time"] for block in recording.blocks(schema.TRAIN_EPISODE)]
-            episode_ends = np.concatenate([np.empty(0, np.uint64), *ends])
-        for steps in self._batches(recording.topic(f"/{phase}/step"), spans):
-            columns = {
-                part: np.concatenate([_numbers(steps, path) for _, path in paths], axis=1)
-                for part, paths in leaves.items()
-            }
-            if is_first:
+        training_ends = self._training_ends() if labels is not None and phase == "eval" else None
+        for number, steps in enumerate(self._batches(recording.topic(f"/{phase}/step"), spans)):
+            if number == 0:
                 self._draw_lines(sender, "reward", self._reward_lines(phase))
                 for part, paths in leaves.items():
                     self._draw_lines(sender, part, list(_line_names(steps, paths)))
-            is_first = False
+                if labels is not None:
+                    grid = StepWriter(self._stream, self._root, phase, recording.mdp, self._scene, labels)
             times = self._times(steps["log_time"], steps["episode"])
             times.append(rr.TimeColumn("t", sequence=steps["t"].astype(np.int64)))
             sender.send("reward", times, scalars(steps["rewards"]))
-            for part, values in columns.items():
-                sender.send(part, times, scalars(values))
-            if labels is not None:
-                if grid is None:
-                    grid = StepWriter(self._stream, self._root, phase, recording.mdp, self._scene, labels)
+            for part, paths in leaves.items():
+                numbers = np.concatenate([_numbers(steps, path) for _, path in paths], axis=1)
+                sender.send(part, times, scalars(numbers))
+            if grid is not None:
                 episode = steps["episode"].astype(np.int64)
-                if phase == "eval":
-                    episode = np.searchsorted(episode_ends, steps["log_time"])
+                if training_ends is not None:  # evaluation is shown by the training episodes before it
+                    episode = np.searchsorted(training_ends, steps["log_time"])
                 time = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS
                 grid.write(Batch(steps, episode, time))
         if grid is not None:
             grid.clear_gaps(["grid"], grid.covered[-1][1])
+
+    def _training_ends(self) -> NDArray[np.uint64]:
+        """Return the times at which training episodes ended."""
+        ends = [block["log_time"] for block in self._recording.blocks(schema.TRAIN_EPISODE)]
+        return np.concatenate([np.empty(0, np.uint64), *ends])
 
     def _send_rewards(self, phase: str, spans: Sequence[Span]) -> None:
         """Send the rewards of a loop whose steps vary in size."""
