@@ -154,25 +154,26 @@ def test_a_killed_process_is_replaced_and_its_run_resumed(tmp_path):
 
 
 def test_a_process_that_dies_before_its_task_is_replaced(done, monkeypatch):
-    real, gone = local._Worker.ask, []
+    real, gone = local._Worker.send, []
 
-    def ask(worker, task):
+    def send(worker, task):
         if not gone:
             gone.append(worker)
             worker._process.kill()
             worker._process.join()
         return real(worker, task)
 
-    monkeypatch.setattr(local._Worker, "ask", ask)
+    monkeypatch.setattr(local._Worker, "send", send)
     folder, trials, _ = done
-    result = trials.done[0].results[0]
-    task = Task("", 0, {}, "small", (), str(folder), Objective(metric="mean_length"), run_id=result.run_id)
+    expected = trials.done[0].results[0]
+    objective = Objective(metric="mean_length")
+    task = Task("", 0, {}, "small", (), str(folder), objective, run_id=expected.run_id)
     with LocalWorkers(1) as workers:
         workers.submit(task)
         assert workers.collect(30) == [(task, None)]
         workers.submit(task)
         ((_, result),) = workers.collect(30)
-    assert (result.status, result.digest) == ("finished", result.digest)
+    assert (result.status, result.digest) == ("finished", expected.digest)
 
 
 @pytest.mark.parametrize("failing", [(".fresh",), (".fresh", ".old")])
