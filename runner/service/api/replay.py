@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel
@@ -27,10 +27,10 @@ router = APIRouter(
     ),
 )
 
-STEPS = 500
+STEPS: Final = 500
 """Steps in a response by default."""
-MAX_STEPS = 2000
-LONG = 3600.0
+MAX_STEPS: Final = 2000
+LONG: Final = 3600.0
 """Seconds that a part is cached, unless the recording changes."""
 
 Number = Annotated[int, Path(ge=0, lt=2**62, description="Counted from 0.")]
