@@ -23,10 +23,12 @@ serve: $(VENV)/.installed-service  ## open the runs in the browser
 test: $(VENV)/.installed-dev  ## run all tests
 	$(BIN)/python -m pytest -n 2
 
-lint: $(VENV)/.installed-dev  ## formatting, style and strict types
+lint: $(VENV)/.installed-dev  ## formatting, style, strict types and wording
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	@! git grep -nwiE -f .ci/forbidden-words -- '*.py' '*.md' '*.html' '*.js' '*.css' '*.yaml' \
+		|| { echo 'Reword these lines: .ci/forbidden-words lists what this project does not write.'; exit 1; }
 
 bench: $(VENV)/.installed-dev  ## measure what docs/performance.md states
 	$(BIN)/python -m benchmarks

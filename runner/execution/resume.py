@@ -5,7 +5,7 @@ everything after its end is recorded. Learning is much faster than recording: th
 what it saves, and it proves what it continues.
 
 A recording with a hole, or with damage before undamaged chunks, is left alone: the run is recorded again in
-`recording.anew`, which replaces it when it is complete. That is resumed as well.
+`recording.resuming`, which replaces it when it is complete. That is resumed as well.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ DECISIVE: Final = (
     *("package.numpy", "package.numba", "package.llvmlite"),
 )
 """Provenance that must be the same at the beginning of a run and when it is resumed."""
-_REPLACEMENT: Final = ".anew"
+_REPLACEMENT: Final = ".resuming"
 """The suffix of a recording that replaces a damaged one."""
 
 

@@ -30,7 +30,7 @@ KINDS: Final = ("recording", "exports", "restored", "other")
 
 _OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, LOCK_FILE, RUN_LOCK))
 _LEFT_OVER: Final = re.compile(
-    r"recording\.(anew|repairing|rerecording|restoring)|recording\.damaged-\d+\.mcap"
+    r"recording\.(resuming|repairing|rerecording|restoring)|recording\.damaged-\d+\.mcap"
     r"|\.[0-9a-f]{8}\.(run|labels)\.json|(run|labels)\.[0-9a-f]{8}\.tmp"
 )
 _KEY: Final = re.compile(r"-[0-9a-f]+(\.\w+)+$")

@@ -160,9 +160,9 @@ def test_a_hole_is_filled_by_a_new_recording(whole, tmp_path, share, repaired):
     stopped = resume(run, stop=stopping_after(6))
     assert stopped.status == "interrupted"
     assert run.recording.read_bytes() == before
-    first = run.recording.with_suffix(".anew").stat().st_size
+    first = run.recording.with_suffix(".resuming").stat().st_size
     stopped = resume(run, stop=stopping_after(12))
-    assert run.recording.with_suffix(".anew").stat().st_size > first
+    assert run.recording.with_suffix(".resuming").stat().st_size > first
     done = resume(stopped)
     for path in done.folder.glob("*.damaged-*"):
         path.unlink()
