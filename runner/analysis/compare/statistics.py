@@ -134,7 +134,7 @@ def share_at_least(values: Values, thresholds: Values) -> tuple[Values, Values, 
     """Return the share of values that are at least each threshold, and its interval: (share, low, high)."""
     above = (values >= thresholds[:, np.newaxis]).astype(np.float64)
     share = above.mean(axis=1)
-    if len(values) < 2:
+    if len(values) < 2 or not len(thresholds):
         return share, np.full_like(share, np.nan), np.full_like(share, np.nan)
     return share, *_interval(above, np.mean)
 
