@@ -20,6 +20,7 @@ from runner.analysis.compare.moments import Moment, higher_is_better, value_of
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.groups import Group
 from runner.analysis.series import RunSeries, points_of, title_of
+from runner.errors import RunnerError
 from runner.util.humanize import listed
 
 THRESHOLDS: Final = 101
@@ -124,9 +125,12 @@ def compare(
 
     Raises:
         MissingExtra: SciPy is not installed.
+        RunnerError: no run has a value of any of the metrics.
     """
     statistics.require_scipy()
     results = [_metric(groups, metric, line, moment) for metric, line in metrics]
+    if results and not any(metric.groups for metric in results):
+        raise RunnerError(_no_values(groups, metrics, moment, results))
     pairs = [pair for metric in results for pair in metric.pairs]
     if len(pairs) > 1:  # their intervals are widened to hold together
         widened = iter(statistics.simultaneous([pair.differences for pair in pairs]))
@@ -140,6 +144,24 @@ def compare(
         metrics=results,
         notes=[*notes, *_notes(groups, metrics)],
     )
+
+
+def _no_values(
+    groups: Sequence[Group],
+    metrics: Sequence[tuple[str, str]],
+    moment: Moment,
+    results: Sequence[MetricResult],
+) -> str:
+    """Return why there is nothing to compare."""
+    if moment.kind != "episode":
+        return f"found nothing to compare: {results[0].notes[0]}."
+    runs = [run for group in groups for run in group.runs]
+    episodes = {n for run in runs for name in metrics for n in points_of(run, *name, aligned=True)}
+    before = sorted(n for n in episodes if n < moment.number)[-1:]
+    after = sorted(n for n in episodes if n > moment.number)[:1]
+    nearest = " and ".join(f"{episode:,}" for episode in before + after)
+    hint = f"; the nearest are those after {nearest}" if nearest else ""
+    return f"at: found no values after {moment.number:,} training episodes{hint}."
 
 
 def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]]) -> Iterator[str]:

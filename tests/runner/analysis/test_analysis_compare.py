@@ -261,6 +261,13 @@ def test_a_level_reached_by_some_is_ranked_after_all_numbers():
     assert "never" in text_of(result(series, Moment("crossing", level=30.0)))
 
 
+def test_a_level_that_no_run_reaches_is_never_reached():
+    (metric,) = result(two_groups([1, 2], [3, 4]), Moment("crossing", level=99.0)).metrics
+    assert [group.median for group in metric.groups] == [math.inf, math.inf]
+    assert metric.thresholds == metric.groups[0].profile == []
+    assert metric.pairs[0].ties == 2
+
+
 def test_interrupted_runs_are_left_out_and_taken_at_an_episode_that_they_have():
     series = [*two_groups([1, 2, 3, 4], [1, 2, 3, 4]), run(9, [0, 77], finished=False, discount=0.8)]
     metric = result(series).metrics[0]
@@ -339,6 +346,7 @@ def test_the_command_prints_text_json_and_markdown(command):
         (["near", "far", "--at", "middle"], "expected last, best, area"),
         (["near", "far", "--target", "success_percent"], "expected METRIC=LEVEL"),
         (["near", "far", "--target", "finish=80"], "expected one of"),
+        (["near", "far", "--at", "14"], "the nearest are those after 10 and 20"),
         (["near", "far", "--by", "tables"], "expected two values"),
         (["near", "nobody"], "nobody"),
     ],
