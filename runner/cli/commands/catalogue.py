@@ -103,9 +103,11 @@ _FREED_BY: Final = {
 @click.command("du", cls=Command)
 @filter_argument
 @folders_option
-@limit_option(20)
+@limit_option("20, with --json all")
 @json_option
-def du_command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int, as_json: bool) -> None:
+def du_command(
+    words: tuple[str, ...], recordings: tuple[Path, ...], limit: int | None, as_json: bool
+) -> None:
     """Show the disk usage of the runs that match FILTER (as in `dualtaxi ls`), or of all, largest first.
 
     It counts recordings; exports made by `view` and recordings restored from archives, both kept in the
@@ -121,9 +123,9 @@ def du_command(words: tuple[str, ...], recordings: tuple[Path, ...], limit: int,
     from runner.runs.catalogue.usage import sizes, usage_of
 
     chosen = parse(" ".join(words))
-    largest, sums = usage_of(
-        lambda work: look(recordings, work, say), chosen, None if as_json or not limit else limit
-    )
+    if limit is None and not as_json:
+        limit = 20
+    largest, sums = usage_of(lambda work: look(recordings, work, say), chosen, limit or None)
     freeable = sums.freeable(recordings)
     if as_json:
         runs = [
