@@ -109,8 +109,8 @@ def compare_command(
         for note in comparison.notes:
             say(f"Note: {note}.")
         count = sum(len(group.runs) for group in groups)
-        metrics = "1 metric" if len(comparison.metrics) == 1 else f"{len(comparison.metrics)} metrics"
-        page = f"{html}: {metrics} of {count} runs in {len(groups)} groups"
+        named = "1 metric" if len(comparison.metrics) == 1 else f"{len(comparison.metrics)} metrics"
+        page = f"{html}: {named} of {count} runs in {len(groups)} groups"
         (say if as_json else click.echo)(page)
     if as_json:
         print_json(dataclasses.asdict(comparison))
