@@ -246,7 +246,7 @@ def test_another_archive_of_the_same_id_is_left_alone(run, recordings, command):
     (place / layout.MANIFEST).write_bytes(other.to_json())
     result = command("archive", run.run_id, "--remove")
     assert result.exit_code == 2
-    assert "an archive of another content" in result.output
+    assert "an archive of this run with other content" in result.output
     assert json.loads((recordings / run.run_id / "run.json").read_text()) == facts
 
 
