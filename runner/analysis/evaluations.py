@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -14,6 +13,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_usable
 from runner.recording.reader import Recording
+from runner.util.values import finite
 
 RECENT_EPISODES: Final = 100
 """Training episodes that the summary of a loop averages, the last ones."""
@@ -115,7 +115,7 @@ def evaluation_record(metrics: Mapping[str, Any], agents: Sequence[str], events:
     """Return the recorded metrics of a job's evaluation under the names of `evaluation_records`."""
 
     def known(value: Any) -> Any:  # NaN stands for unknown
-        return dict(zip(agents, value, strict=True)) if isinstance(value, list) else _finite(value)
+        return dict(zip(agents, value, strict=True)) if isinstance(value, list) else finite(value)
 
     return {
         "evaluation": metrics["evaluation"],
@@ -177,7 +177,7 @@ def _training_values(metrics: Mapping[str, Any], agents: Sequence[str]) -> Recor
     """Return the progress of training in a report, or at an evaluation."""
     rewards = zip(metrics["rewards"], metrics["reward_counts"], strict=True)
     return {
-        "mean_length": _finite(metrics["mean_length"]),  # unknown before the first episode ends
+        "mean_length": finite(metrics["mean_length"]),  # unknown before the first episode ends
         "reward_counts": [{"reward": reward, "steps": steps} for reward, steps in rewards],
         "zero_cells": dict(zip(agents, metrics["zero_cells"], strict=True)),
         "percent_filled": dict(zip(agents, metrics["percent_filled"], strict=True)),
@@ -198,7 +198,7 @@ def loop_summary(recording: Recording) -> Record:
     logged = (
         dict(recording.result.logged)
         if "logged" in recording.result
-        else {one["name"]: _finite(one["value"]) for one in recording.decoded(schema.SCALAR_TOPIC)}
+        else {one["name"]: finite(one["value"]) for one in recording.decoded(schema.SCALAR_TOPIC)}
     )
     return {
         "last_evaluation": evaluation_summary(evaluations[-1]) if evaluations else None,
@@ -209,7 +209,3 @@ def loop_summary(recording: Recording) -> Record:
         },
         "logged": logged,
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None

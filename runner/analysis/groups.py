@@ -1,4 +1,4 @@
-"""Runs in groups: together are those whose configurations differ in nothing but the seed."""
+"""Groups of runs whose configurations differ in nothing but the seed."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def groups_of(series: Sequence[RunSeries]) -> list[Group]:
 def grouped(series: Sequence[RunSeries], by: str | None = None) -> tuple[list[Group], list[str]]:
     """Return runs in groups for a comparison, and notes on them, a sentence each.
 
-    Together are runs whose configurations differ in nothing but the seed, whatever their names and however
+    A group has the runs whose configurations differ in nothing but the seed, whatever their names and however
     they were recorded; or, with `by`, those that have the same value there. Of a job that was run twice one
     run counts, as in `groups_of`. Several loops of one configuration and seed, such as the workers of one
     training, all count: the value of their seed is the mean over them.
@@ -155,6 +155,11 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
     return list(dict.fromkeys(pair for name in names for pair in known[name]))
 
 
+def flat_config(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a configuration by dotted key, but for its name and seeds."""
+    return {key: value for key, value in flatten(config).items() if key not in ("seeds", "name")}
+
+
 # --- inside -------------------------------------------------------------------------------------------
 
 
@@ -190,11 +195,6 @@ def _labelled(runs_of: Sequence[Sequence[RunSeries]], names: Sequence[str]) -> l
         values = ", ".join(f"{key}={own.get(key)}" for key in differing)
         groups.append(_group(f"{name}, {values}" if values else name, runs))
     return groups
-
-
-def flat_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a configuration by dotted key, but for its name and seeds."""
-    return {key: value for key, value in flatten(config).items() if key not in ("seeds", "name")}
 
 
 def _value_at(path: str, series: Sequence[RunSeries]) -> Callable[[RunSeries], str]:

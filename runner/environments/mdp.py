@@ -210,7 +210,7 @@ def check_mdp(mdp: Mdp) -> None:
     Each expectation relies on those before it.
     """
     with np.errstate(all="ignore"):
-        for expectations in (_descriptions_right(mdp), _arrays_right(mdp)):
+        for expectations in (_description_checks(mdp), _array_checks(mdp)):
             for expectation, holds, found in expectations:
                 if not holds:
                     raise EnvironmentNotUsable(
@@ -221,7 +221,7 @@ def check_mdp(mdp: Mdp) -> None:
         raise EnvironmentNotUsable(f"environment {mdp.env_id!r}: {mistake}.")
 
 
-def _descriptions_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
+def _description_checks(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
     """Yield expectations of all fields but the arrays: their text, whether they hold, and the value found."""
     agents, counts, events = mdp.agents, mdp.action_counts, mdp.event_names
     yield "an id must be text", is_text(mdp.env_id), mdp.env_id
@@ -241,7 +241,7 @@ def _descriptions_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
     yield "the step limit must be a number from 0", is_whole(limit, 0, 2**31 - 1), limit
 
 
-def _arrays_right(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
+def _array_checks(mdp: Mdp) -> Iterator[tuple[str, bool, Any]]:
     """Yield expectations of the arrays: their text, whether they hold, and the value found."""
     for name, kind in _DTYPES.items():
         array = getattr(mdp, name)

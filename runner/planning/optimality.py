@@ -53,8 +53,8 @@ class ExactEvaluator:
             outcome = evaluate_policy(self._mdp, policy, self._learners, discount)
         else:
             outcome = evaluate_stochastic_policy(self._mdp, policy, self._learners, discount)
-        none = discount >= 1
-        optimal_value, optimum = (np.nan, None) if none else self._optimum(discount)
+        undiscounted = discount >= 1
+        optimal_value, optimum = (np.nan, None) if undiscounted else self._optimum(discount)
         return {
             "starts": outcome.starts,
             "success_percent": outcome.success_percent,
@@ -64,7 +64,7 @@ class ExactEvaluator:
             "mean_returns": list(outcome.mean_returns),
             "values": list(outcome.values),
             "best_responses": [
-                np.nan if none else self._best_response(policy, learner, discount)
+                np.nan if undiscounted else self._best_response(policy, learner, discount)
                 for learner in range(self._learners)
             ],
             "optimal_value": optimal_value,

@@ -75,7 +75,7 @@ class Identity(TypedDict):
 
 @dataclass(frozen=True)
 class RunDiff:
-    """Everything in which two runs, `a` and `b`, differ."""
+    """All differences of two runs, `a` and `b`."""
 
     a: Identity
     b: Identity
@@ -108,7 +108,7 @@ class RunDiff:
 def diff(
     a: Recording, b: Recording, targets: Mapping[str, float] | None = None, first: bool = False
 ) -> RunDiff:
-    """Return in what two runs differ.
+    """Return how two runs differ.
 
     Args:
         a: one run, finished or not.

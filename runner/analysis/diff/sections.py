@@ -87,7 +87,7 @@ def summary(difference: RunDiff) -> str:
 
 
 def _text(value: Any) -> str:
-    return "–" if value is None else str(value)
+    return UNKNOWN if value is None else str(value)
 
 
 def _amount(value: Any) -> str:
@@ -243,7 +243,7 @@ def _tables(difference: RunDiff) -> Section:
             f"{table.largest:.4g}",
             f"{table.mean:.4g}",
             f"{table.greedy_share:.1%}",
-            "–" if math.isnan(table.greedy_share_visited) else f"{table.greedy_share_visited:.1%}",
+            UNKNOWN if math.isnan(table.greedy_share_visited) else f"{table.greedy_share_visited:.1%}",
         )
         for table in differing
     ]
@@ -261,7 +261,7 @@ def _metrics(difference: RunDiff, everything: bool) -> Section:
             f"{metric.end_a:,.2f}",
             f"{metric.end_b:,.2f}",
             f"{metric.end_b - metric.end_a:+,.2f}",
-            "–" if math.isnan(metric.area) else f"{metric.area:+,.2f}",
+            UNKNOWN if math.isnan(metric.area) else f"{metric.area:+,.2f}",
         )
         for metric in difference.metrics
         if everything or not metric.same
