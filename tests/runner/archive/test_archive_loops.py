@@ -290,3 +290,27 @@ def test_a_value_that_unpacks_to_more_than_the_memory_limit_is_refused(tmp_path,
     unharmed = archived(recording, tmp_path / "unharmed")
     places.restore_to(unharmed, tmp_path / "back.mcap", manifest.digest, steps.append)
     assert steps[-1] == 120
+
+
+class Speaker(gymnasium.Env):
+    """An environment whose actions are text."""
+
+    observation_space = spaces.Discrete(2)
+    action_space = spaces.Text(8)
+    metadata = {"render_modes": []}  # noqa: RUF012 - as in Gymnasium
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        return len(action) % 2, 1.0, len(action) > 2, False, {}
+
+
+def test_actions_that_are_text_are_archived_and_restored(tmp_path):
+    with runner.record(Speaker(), tmp_path / "recordings") as env:
+        env.reset(seed=0)
+        for word in ("a", "bc", "def"):
+            env.step(word)
+    restore(archived(env.run.recording, tmp_path / "archive"), tmp_path / "back.mcap")
+    assert contents(tmp_path / "back.mcap") == contents(env.run.recording)

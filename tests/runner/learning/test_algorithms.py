@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+from typing import get_args
 
 import numpy as np
 import pytest
 
+from runner.config.sections import Algorithm
 from runner.environments.loading import load_mdp
 from runner.execution.rerecord import evaluate
 from runner.execution.resume import resume
 from runner.execution.verify import verify
+from runner.learning.algorithms import NUMBERS
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.blocks import blank_records, topic_sizes
@@ -18,6 +21,7 @@ from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, held_at, tables_at
 from runner.runs.run import list_runs
 from tests.runner.killing import LONG, kill_when, posix, start
+from tests.runner.learning import harness
 from tests.runner.recording.making import SAMPLED, TAXIS, experiment, make_run
 
 TEAM = {"mode": "cooperative"}
@@ -170,3 +174,10 @@ def test_a_policy_that_draws_is_measured_exactly(algorithm, tmp_path):
     gains = [best - own for own, best in zip(exact["values"], exact["best_responses"], strict=True)]
     assert min(gains) > -1e-9
     assert verify(done.recording).sound
+
+
+def test_every_algorithm_has_a_number_and_is_compared_with_plain_python():
+    names = set(get_args(Algorithm))
+    assert names == set(NUMBERS)
+    compared = {values["algorithm"] for values in harness.ALGORITHMS.values()}
+    assert names - compared == {"q_learning", "random"}  # `harness.RULES` are of Q-learning
