@@ -13,7 +13,7 @@ from blake3 import blake3
 from runner.archive.layout import FORMAT, MANIFEST, VERSION
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.digest import combine
+from runner.recording.digest import combined_digest
 from runner.util.files import hash_of
 from runner.util.values import is_whole
 
@@ -51,7 +51,7 @@ class Manifest:
     def digest(self) -> str:
         """The content digest of the messages in the archive; without steps, it is not that of the run."""
         digested = self.topics.keys() & schema.DIGESTED
-        return combine({name: self.topics[name].blake3 for name in digested})
+        return combined_digest({name: self.topics[name].blake3 for name in digested})
 
     @property
     def size(self) -> int:

@@ -38,10 +38,10 @@ class ContentHash:
 
     def content(self) -> str:
         """Return the content digest, in hexadecimal."""
-        return combine(self.topics())
+        return combined_digest(self.topics())
 
 
-def combine(topics: Mapping[str, str]) -> str:
+def combined_digest(topics: Mapping[str, str]) -> str:
     """Return the content digest for the hashes of the topics."""
     whole = blake3(_PREFIX)
     for name in sorted(topics):

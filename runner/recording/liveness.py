@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from runner.util.files import read_object
 
-_MAX_BYTES: Final = 8 << 20
+_MAX_RUN_FILE_BYTES: Final = 8 << 20
 HEARTBEAT_SECONDS: Final = 15.0
 """On another host, a run without a heartbeat for this long counts as interrupted."""
 
@@ -46,7 +46,7 @@ def is_alive(owner: Mapping[str, Any], heartbeat: Path) -> bool:
 def is_owned(folder: Path) -> bool:
     """Return whether a living process owns the run in a folder, according to its `run.json`."""
     try:
-        facts = read_object(folder / "run.json", _MAX_BYTES)
+        facts = read_object(folder / "run.json", _MAX_RUN_FILE_BYTES)
     except (OSError, ValueError):
         return False
     process = facts.get("owner")

@@ -19,11 +19,10 @@ from runner.recording.arrays import pack_array, unpack_array
 from runner.recording.blocks import Sizes, topic_sizes
 from runner.recording.index import Index
 from runner.recording.records import MAX_METADATA_BYTES
-from runner.recording.run_file import MAX_DEPTH, is_too_deep
 from runner.recording.schema import Topic
 from runner.recording.spaces import dtype_of, leaves_of
 from runner.recording.writer import RecordingFile, storage_error
-from runner.util.values import is_whole, without_surrogates
+from runner.util.values import MAX_JSON_DEPTH, is_too_deep, is_whole, without_surrogates
 
 REQUIRED_RECORDS: Final = frozenset({"run", "config", "provenance"})
 """The metadata records without which a recording's messages cannot be interpreted."""
@@ -174,7 +173,7 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, Any]:
             raise ValueError("it is missing, or too long")
         value = dict(without_surrogates(json.loads(text), text))
         if is_too_deep(value):
-            raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
+            raise ValueError(f"it is nested more than {MAX_JSON_DEPTH} deep")
         return value
     except (TypeError, ValueError, RecursionError) as error:
         raise RecordingError(f"{what} holds no JSON object ({error}).") from error

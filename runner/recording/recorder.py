@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from runner.recording import schema
 from runner.recording.blocks import Sizes, blank_records, message_record, record_dtype, topic_sizes
-from runner.recording.digest import combine
+from runner.recording.digest import combined_digest
 from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reference import Reference
 from runner.recording.schema import STEP_NANOSECONDS, Topic
@@ -244,7 +244,7 @@ class Recorder:
     def totals(self, topic_digests: Mapping[str, str]) -> dict[str, Any]:
         """Return the totals in a result; `topic_digests` is what `drain` returned."""
         return {
-            "content_digest": combine(topic_digests),
+            "content_digest": combined_digest(topic_digests),
             "topic_digests": topic_digests,
             "train_steps": self.steps["train"],
             "eval_steps": self.steps["eval"],

@@ -109,6 +109,7 @@ def _salvage(path: Path, fresh: Path, report: Report) -> Repair:
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
     with stream:
+        # The kind decides what the new file begins with, so it is looked for in a reading of its own.
         topics = schema.KINDS[_kind(DamagedFile(stream, path), path)]
         return _Salvage(path, DamagedFile(stream, path), topics).write(fresh, report)
 

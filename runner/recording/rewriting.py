@@ -9,7 +9,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 
 from runner.errors import RecordingError
-from runner.recording.digest import ContentHash, combine
+from runner.recording.digest import ContentHash, combined_digest
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from runner.recording.records import (
@@ -122,7 +122,7 @@ def _is_stated(result: Summary, seen: dict[str, str]) -> bool:
     if not result.steps_recorded:
         steps = {topic.name for topic in TOPICS if topic.message is STEP}
         seen = seen | {name: digest for name, digest in result.topic_digests.items() if name in steps}
-    return dict(result.topic_digests) == seen and combine(seen) == result.content_digest
+    return dict(result.topic_digests) == seen and combined_digest(seen) == result.content_digest
 
 
 def _chunks(path: Path) -> Iterator[tuple[Topic, ReadChunk]]:

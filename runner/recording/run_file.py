@@ -15,11 +15,10 @@ from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 
 from runner.recording.metrics import METRICS
+from runner.util.values import MAX_JSON_DEPTH, is_too_deep
 
 STATED_STATUSES: Final = ("running", "finished", "interrupted", "failed")
 """The statuses that a run's owner writes."""
-MAX_DEPTH: Final = 100
-"""How deep the values of either file may be nested."""
 RUN_ID: Final = re.compile(r"[\w.-]{1,100}")
 
 _LARGEST: Final = 2**62
@@ -151,7 +150,7 @@ def parse_run_file(record: Mapping[str, Any]) -> RunFile:
         name=values.get("name", record["run_id"]),
         seed=values.get("seed"),
         status=values.get("status", "interrupted"),
-        created=_moment(values["created"]) if "created" in values else None,
+        created=_in_utc(values["created"]) if "created" in values else None,
         owner=values.get("owner", {}),
         config=values.get("config", {}),
         summary=_parse_summary(values.get("summary", {}), "summary.", problems),
@@ -185,29 +184,13 @@ def _parse_summary(record: Mapping[str, Any], prefix: str, problems: list[str]) 
 def _without_deep_values(record: Mapping[str, Any], problems: list[str]) -> Mapping[str, Any]:
     if not is_too_deep(record):
         return record
-    problems.append(f"found values nested more than {MAX_DEPTH} deep")
+    problems.append(f"found values nested more than {MAX_JSON_DEPTH} deep")
     return {key: value for key, value in record.items() if not is_too_deep(value, 1)}
 
 
 def run_title(name: str, seed: int | None) -> str:
     """Return a run's name, and its seed if it has one: `patient, seed 3`."""
     return name if seed is None else f"{name}, seed {seed}"
-
-
-def is_too_deep(value: Any, depth: int = 0) -> bool:
-    """Return whether a JSON value is nested more than `MAX_DEPTH` deep, counted from `depth`."""
-    level = [value]
-    while level:
-        if depth > MAX_DEPTH:
-            return True
-        inner: list[Any] = []
-        for item in level:
-            if isinstance(item, Mapping):
-                inner += item.values()
-            elif isinstance(item, list):
-                inner += item
-        level, depth = [item for item in inner if isinstance(item, Mapping | list)], depth + 1
-    return False
 
 
 def _valid(
@@ -241,14 +224,14 @@ def _quoted(value: Any) -> str:
     return "a number of many digits"
 
 
-def _moment(text: str) -> datetime:
+def _in_utc(text: str) -> datetime:
     return datetime.fromisoformat(text).astimezone(UTC)
 
 
 def _is_moment(value: Any) -> bool:
     if isinstance(value, str):
         with contextlib.suppress(ValueError, OverflowError):  # the latter of a date at the end of time
-            return bool(_moment(value))
+            return bool(_in_utc(value))
     return False
 
 

@@ -11,6 +11,8 @@ from runner.errors import ConfigError
 
 MAX_TEXT: Final = 200
 """The most characters of a short text."""
+MAX_JSON_DEPTH: Final = 100
+"""How deep the values of a JSON file may be nested."""
 NAME_PATTERN: Final = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}$"
 NAME_EXPECTED: Final = "1 to 100 letters, digits, '_', '.' or '-', not starting with '.' or '-'"
 RUN_NAME_PATTERN: Final = r"^[A-Za-z0-9_][A-Za-z0-9_.+/-]{0,99}$"
@@ -81,6 +83,22 @@ def flatten(values: Mapping[str, Any], keep_empty: bool = False, prefix: str = "
         else:
             flat[f"{prefix}{key}"] = value
     return flat
+
+
+def is_too_deep(value: Any, depth: int = 0) -> bool:
+    """Return whether a JSON value is nested more than `MAX_JSON_DEPTH` deep, counted from `depth`."""
+    level = [value]
+    while level:
+        if depth > MAX_JSON_DEPTH:
+            return True
+        inner: list[Any] = []
+        for item in level:
+            if isinstance(item, Mapping):
+                inner += item.values()
+            elif isinstance(item, list):
+                inner += item
+        level, depth = [item for item in inner if isinstance(item, Mapping | list)], depth + 1
+    return False
 
 
 def finite(value: Any) -> Any:

@@ -15,7 +15,7 @@ from runner.environments.loading import load_mdp
 from runner.execution.session import Session, recorder_for
 from runner.learning.learner import Learner
 from runner.recording import pipeline, recorder, schema
-from runner.recording.digest import combine
+from runner.recording.digest import combined_digest
 from runner.recording.reader import open_recording
 from tests.runner.learning.twin import Twin
 from tests.runner.recording.making import LAKE, SAMPLED, TAXIS, experiment, make_run
@@ -71,7 +71,7 @@ def test_the_digest_follows_its_definition(made_of, tmp_path):
 
 def test_topics_have_no_order(taxis):
     content, topics = recorded_digests(taxis)
-    assert combine(dict(reversed(topics.items()))) == combine(topics) == content
+    assert combined_digest(dict(reversed(topics.items()))) == combined_digest(topics) == content
 
 
 @pytest.mark.parametrize("packing", PACKINGS, ids=lambda packing: "-".join(map(str, packing.values())))
