@@ -117,7 +117,8 @@ def run(
         state.require_startable(sweep, folder, is_resumed, accept_changes)
         before = len(state.runs_of(sweep.name, folder))
         require_disk(plan, before, folder)
-        say(f"{sweep.name}: {plan.runs:,} runs, about {size(plan.bytes)}; {before:,} are begun already.")
+        started = f"; {before:,} started before" if before else ""
+        say(f"{sweep.name}: {plan.runs:,} runs, about {size(plan.bytes)}{started}.")
         with (
             _worker_pool(workers, ray, plan.runs) as pool,
             interruptible(second=signal.SIG_DFL) as interrupt,
