@@ -116,7 +116,7 @@ def test_an_interrupted_upload_leaves_no_archive_and_is_repeated(archive, bucket
     if fail_at != -1:
         assert Store(URL).manifest("k3v9m2xq") is None
     else:
-        with pytest.raises(RecordingError, match="is no manifest"):
+        with pytest.raises(RecordingError, match="is not the manifest of an archive"):
             Store(URL).manifest("k3v9m2xq")
     store_copy(archive, "k3v9m2xq")
     with Store(URL).reading("k3v9m2xq") as folder:
