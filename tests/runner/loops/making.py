@@ -8,10 +8,12 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from click.testing import CliRunner
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 
 import runner
+from runner.cli import cli
 
 KWARGS = {"FrozenLake-v1": {"is_slippery": True}}
 
@@ -149,3 +151,10 @@ def parallel(env: Any, episodes: int) -> list[Any]:
             actions = {agent: int(generator.integers(env.action_space(agent).n)) for agent in env.agents}
             seen.append((actions, *env.step(actions)[:4]))
     return seen
+
+
+def dualtaxi(folder: Path, *words: str) -> Any:
+    """Run a command, whose output must not have a traceback."""
+    done = CliRunner().invoke(cli, [*words, "--recordings", str(folder)])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done

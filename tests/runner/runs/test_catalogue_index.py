@@ -20,14 +20,12 @@ from runner.config import from_mapping
 from runner.errors import RunNotFound
 from runner.recording.labels import LABELS_FILE, Labels, change_labels, read_labels
 from runner.runs.catalogue import folders
-from runner.runs.catalogue import usage as usages
 from runner.runs.catalogue.database import index_path, open_index
 from runner.runs.catalogue.filters import Filter, parse
-from runner.runs.catalogue.folders import Depth, Folders
+from runner.runs.catalogue.folders import Folders
 from runner.runs.catalogue.index import look
 from runner.runs.resolve import find_run
 from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
-from runner.util.files import EXPORTS, RESTORED
 
 CONFIG = from_mapping({"name": "some", "episodes": 5})
 ALL = Filter(None)
@@ -408,72 +406,3 @@ def test_rebuilding_the_index_never_empties_it(folder, monkeypatch):
     monkeypatch.setattr(folders, "row_of", looking_on)
     assert len(look([folder], lambda index: index.select(ALL), rebuild=True)) == 4
     assert seen == [len(runs)] * 4
-
-
-def test_what_a_folder_uses_is_kept_until_something_in_it_changes(folder, monkeypatch):
-    run = create_run(folder, CONFIG, 1).update(status="finished")
-    run.recording.write_bytes(bytes(1000))
-    aged(folder)
-
-    def used():
-        (usage,), sums = usages.usage_of(lambda work: look([folder], work), ALL, 5)
-        assert (sums.runs, sums.by_kind()["total"]) == (1, usage.total)
-        return usage.contents.recording, usage.contents.left_over
-
-    assert used() == (1000, 0)
-    with monkeypatch.context() as patched:
-        patched.setattr(usages, "contents_of", pytest.fail)
-        assert used() == (1000, 0)
-    (run.folder / "recording.damaged-1.mcap").write_bytes(bytes(50))
-    for depth in (Depth.FILES, Depth.FOLDERS):
-        look([folder], lambda _: None, depth=depth)
-    assert used() == (1000, 50)
-    run.recording.write_bytes(bytes(2000))
-    assert used() == (2000, 50)
-
-
-def test_the_largest_runs_and_the_sums_are_the_same_kept_or_measured(folder, tmp_path):
-    digest = "ab" * 32
-    runs = [create_run(folder, CONFIG, seed) for seed in range(6)]
-    for seed, run in enumerate(runs):
-        run.recording.write_bytes(bytes(10_000 * (seed + 1)))
-        run.update(status="failed" if seed == 2 else "finished", summary={"content_digest": digest})
-    (runs[3].folder / "recording.damaged-1.mcap").write_bytes(bytes(50))
-    for seed in (3, 5):
-        change_labels(runs[seed].folder, lambda _: Labels(tags=("keep", "other")))
-    exports = tmp_path / "cache" / "dualtaxi" / EXPORTS
-    exports.mkdir(parents=True)
-    (exports / f"{runs[0].run_id}-0123456789ab.rrd").write_bytes(bytes(1_000_000))
-    aged(folder)
-
-    def asked(limit):
-        largest, sums = usages.usage_of(lambda work: look([folder], work), ALL, limit)
-        return [(usage.row["id"], usage.row["same_as"], usage.total) for usage in largest], sums
-
-    measured, kept = asked(2), asked(2)
-    assert measured == kept
-    first, sums = kept
-    assert [run_id for run_id, _, _ in first] == [runs[0].run_id, runs[5].run_id]
-    assert (sums.runs, sums.recording, sums.exports) == (6, 210_000, 1_000_000)
-    every, _ = asked(None)
-    assert every[:2] == first
-    assert sums.by_kind()["total"] == sum(total for _, _, total in every)
-    copies = {run_id for run_id, same_as, _ in every if same_as}
-    assert len(copies) == 5
-    own = {run.run_id: usages.contents_of(run.folder).freed for run in runs}
-    tagged = {runs[3].run_id, runs[5].run_id}
-    assert sums.same_content == sum(own[run_id] for run_id in copies - tagged)
-    assert sums.unfinished == own[runs[2].run_id]
-    assert sums.left_over == 0
-
-
-def test_cached_files_count_for_the_run_whose_they_are(folder, tmp_path):
-    exports, restored = (tmp_path / "cache" / "dualtaxi" / part for part in (EXPORTS, RESTORED))
-    exports.mkdir(parents=True)
-    restored.mkdir()
-    (exports / "a-b-0123456789ab.rrd").write_bytes(bytes(1))
-    (exports / "a+b-0123456789ab.rrd").write_bytes(bytes(10))
-    (restored / "a-b-0123456789abcdef.mcap").write_bytes(bytes(100))
-    (restored / "a.c-0123456789abcdef.mcap").write_bytes(bytes(1000))
-    assert usages.cached(EXPORTS) == {"a-b": 1, "a": 10}
-    assert usages.cached(RESTORED) == {"a-b": 100, "a.c": 1000}

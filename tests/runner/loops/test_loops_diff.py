@@ -1,0 +1,141 @@
+"""Differences and comparisons of recorded loops."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import runner
+from runner.recording import schema
+from runner.recording.reader import open_recording
+from tests.runner.loops.making import dualtaxi, make, play
+
+
+def test_diff_names_the_step_at_which_loops_diverge(folder):
+    same = dualtaxi(folder, "diff", "lake", "again")
+    assert same.exit_code == 0
+    assert "the same, to the last byte" in same.stdout
+    differing = json.loads(dualtaxi(folder, "diff", "lake", "other", "--json").stdout)
+    divergence = differing["divergence"]
+    with (
+        open_recording(runner.find_run("lake", folder).recording) as a,
+        open_recording(runner.find_run("other", folder).recording) as b,
+    ):
+        left, right = (next(recording.blocks(schema.TRAIN_STEP)) for recording in (a, b))
+    names = [name for name in left.dtype.names if not name.startswith("tag_")]
+    first = next(k for k in range(len(left)) if left[k][names].tolist() != right[k][names].tolist())
+    assert divergence["step"] == first
+    assert divergence["field"] in ("state", "action", "next_state")
+    foreign = dualtaxi(folder, "diff", "pole", "rooms")
+    assert foreign.exit_code == 1
+    assert "other spaces" in foreign.stdout
+
+
+def test_loops_that_have_their_seed_among_their_settings_are_one_group(tmp_path):
+    for seed in (1, 2):
+        for rate in (0.1, 0.2):
+            args = {"seed": seed, "lr": rate}
+            with runner.record(make("CartPole-v1"), tmp_path, name="pole", seed=seed, config=args) as env:
+                list(play(env, 50, seed))
+    reply = json.loads(dualtaxi(tmp_path, "compare", "pole", "--json").stdout)
+    assert {label: len(ids) for label, ids in reply["groups"].items()} == {
+        "pole, config.lr=0.1": 2,
+        "pole, config.lr=0.2": 2,
+    }
+    dualtaxi(tmp_path, "plot", "pole", "-o", str(tmp_path / "plot.svg"))
+    assert (tmp_path / "plot.svg").read_text().count("2 runs: ") == 2
+
+
+def diff_of_two(folder: Path, tested: int = 0, logged: float = 0.0) -> str:
+    """Record the loops `one` and `two`, which may differ in evaluation and logs; return their diff."""
+    for name, seed, value in (("one", 0, 0.0), ("two", tested, logged)):
+        with runner.record(make("CartPole-v1"), folder, name=name) as env:
+            list(play(env, 50, 0))
+            with env.phase("eval"):
+                list(play(env, 50, seed))
+            env.log("loss", value)
+    reply = dualtaxi(folder, "diff", "one", "two")
+    assert reply.exit_code == 1
+    return str(reply.stdout)
+
+
+def test_diff_names_the_step_at_which_evaluations_of_loops_diverge(tmp_path):
+    reply = diff_of_two(tmp_path, tested=1)
+    assert "Training took the same steps, evaluation did not." in reply
+    assert "They diverge in the reset before evaluation step 0" in reply
+    diverged = json.loads(dualtaxi(tmp_path, "diff", "one", "two", "--json").stdout)
+    assert (diverged["divergence"], diverged["evaluation_divergence"]["step"]) == (None, 0)
+    page = tmp_path / "diff.html"
+    dualtaxi(tmp_path, "diff", "one", "two", "--html", str(page))
+    assert "They diverge in the reset before evaluation step 0" in page.read_text()
+
+
+def test_diff_names_the_topics_that_differ_between_loops_of_equal_steps(tmp_path):
+    reply = diff_of_two(tmp_path, logged=1.0)
+    assert "all steps are the same; what differs is in /scalar." in reply
+
+
+class Pictures(gymnasium.Env[Any, Any]):
+    """Observes many numbers, of which one is an argument."""
+
+    observation_space = gymnasium.spaces.Dict({"picture": gymnasium.spaces.Box(0, 255, (9, 9), np.uint8)})
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return {"picture": np.zeros((9, 9), np.uint8)}, {}
+
+    def step(self, action: Any) -> Any:
+        picture = np.zeros((9, 9), np.uint8)
+        picture[3, 4] = self.number
+        return {"picture": picture}, 0.0, True, False, {}
+
+
+class Starts(gymnasium.Env[Any, Any]):
+    """Starts one of its episodes at a given value, and is constant otherwise."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, start: float) -> None:
+        self.start, self.episode = start, -1
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.episode, self.t = self.episode + 1, 0
+        return np.full(2, self.start if self.episode == 2 else 0, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.t += 1
+        return np.ones(2, np.float32), 0.0, self.t == 3, False, {}
+
+
+def test_diff_names_the_reset_in_which_loops_diverge(tmp_path):
+    for start, actions in ((0.25, 0), (0.75, 0), (0.5, 1)):
+        with runner.record(Starts(start), tmp_path, name=f"at{start:g}") as env:
+            for episode in range(4):
+                env.reset()
+                for _ in range(3):
+                    env.step(actions if episode == 2 else 0)
+    for other in ("0.75", "0.5"):  # the actions of the last differ too, but after the reset
+        reply = dualtaxi(tmp_path, "diff", "at0.25", f"at{other}").stdout
+        assert (
+            "They diverge in the reset before training step 6, of episode 2: observation is [0.25, " in reply
+        )
+        assert f" in A, [{other}, " in reply
+    diverged = json.loads(dualtaxi(tmp_path, "diff", "at0.25", "at0.5", "--json").stdout)["divergence"]
+    assert (diverged["step"], diverged["episode"], diverged["field"]) == (6, 2, "reset.observation")
+
+
+def test_diff_names_the_frame_that_differs(tmp_path):
+    for number in (7, 8):
+        with runner.record(Pictures(number), tmp_path, name=f"of{number}") as env:
+            env.reset()
+            env.step(1)
+    divergence = json.loads(dualtaxi(tmp_path, "diff", "of7", "of8", "--json").stdout)["divergence"]
+    assert (divergence["field"], divergence["a"], divergence["b"]) == ("next_observation.picture[3, 4]", 7, 8)

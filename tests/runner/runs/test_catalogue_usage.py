@@ -1,0 +1,106 @@
+"""Disk usage of runs: cached until something changes, and equal to what is measured."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import pytest
+
+from runner.config import from_mapping
+from runner.recording.labels import Labels, change_labels
+from runner.runs.catalogue import usage as usages
+from runner.runs.catalogue.filters import Filter
+from runner.runs.catalogue.folders import Depth
+from runner.runs.catalogue.index import look
+from runner.runs.run import create_run
+from runner.util.files import EXPORTS, RESTORED
+
+CONFIG = from_mapping({"name": "some", "episodes": 5})
+ALL = Filter(None)
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "recordings"
+
+
+def aged(folder):
+    """Make everything in a folder look as if it had last changed an hour ago, and index it so."""
+    for path in folder.rglob("*"):
+        os.utime(path, (time.time() - 3600,) * 2)
+    look([folder], lambda index: index.select(ALL))
+
+
+def test_what_a_folder_uses_is_cached_until_something_in_it_changes(folder, monkeypatch):
+    run = create_run(folder, CONFIG, 1).update(status="finished")
+    run.recording.write_bytes(bytes(1000))
+    aged(folder)
+
+    def used():
+        (usage,), sums = usages.usage_of(lambda work: look([folder], work), ALL, 5)
+        assert (sums.runs, sums.by_kind()["total"]) == (1, usage.total)
+        return usage.contents.recording, usage.contents.left_over
+
+    assert used() == (1000, 0)
+    with monkeypatch.context() as patched:
+        patched.setattr(usages, "contents_of", pytest.fail)
+        assert used() == (1000, 0)
+    (run.folder / "recording.damaged-1.mcap").write_bytes(bytes(50))
+    for depth in (Depth.FILES, Depth.FOLDERS):
+        look([folder], lambda _: None, depth=depth)
+    assert used() == (1000, 50)
+    run.recording.write_bytes(bytes(2000))
+    assert used() == (2000, 50)
+
+
+def test_the_largest_runs_and_the_sums_are_the_same_cached_or_measured(folder, tmp_path):
+    digest = "ab" * 32
+    runs = [create_run(folder, CONFIG, seed) for seed in range(6)]
+    for seed, run in enumerate(runs):
+        run.recording.write_bytes(bytes(10_000 * (seed + 1)))
+        run.update(status="failed" if seed == 2 else "finished", summary={"content_digest": digest})
+    (runs[3].folder / "recording.damaged-1.mcap").write_bytes(bytes(50))
+    for seed in (3, 5):
+        change_labels(runs[seed].folder, lambda _: Labels(tags=("keep", "other")))
+    exports = tmp_path / "cache" / "dualtaxi" / EXPORTS
+    exports.mkdir(parents=True)
+    (exports / f"{runs[0].run_id}-0123456789ab.rrd").write_bytes(bytes(1_000_000))
+    aged(folder)
+
+    def usage_with(limit):
+        largest, sums = usages.usage_of(lambda work: look([folder], work), ALL, limit)
+        return [(usage.row["id"], usage.row["same_as"], usage.total) for usage in largest], sums
+
+    measured, cached = usage_with(2), usage_with(2)
+    assert measured == cached
+    first, sums = cached
+    assert [run_id for run_id, _, _ in first] == [runs[0].run_id, runs[5].run_id]
+    assert (sums.runs, sums.recording, sums.exports) == (6, 210_000, 1_000_000)
+    every, _ = usage_with(None)
+    assert every[:2] == first
+    assert sums.by_kind()["total"] == sum(total for _, _, total in every)
+    copies = {run_id for run_id, same_as, _ in every if same_as}
+    assert len(copies) == 5
+    own = {run.run_id: usages.contents_of(run.folder).freed for run in runs}
+    tagged = {runs[3].run_id, runs[5].run_id}
+    assert sums.same_content == sum(own[run_id] for run_id in copies - tagged)
+    assert sums.unfinished == own[runs[2].run_id]
+    assert sums.left_over == 0
+
+
+def test_cached_files_count_for_their_run(folder, tmp_path):
+    exports, restored = (tmp_path / "cache" / "dualtaxi" / part for part in (EXPORTS, RESTORED))
+    exports.mkdir(parents=True)
+    restored.mkdir()
+    (exports / "a-b-0123456789ab.rrd").write_bytes(bytes(1))
+    (exports / "a+b-0123456789ab.rrd").write_bytes(bytes(10))
+    (restored / "a-b-0123456789abcdef.mcap").write_bytes(bytes(100))
+    (restored / "a.c-0123456789abcdef.mcap").write_bytes(bytes(1000))
+    assert usages.cached(EXPORTS) == {"a-b": 1, "a": 10}
+    assert usages.cached(RESTORED) == {"a-b": 100, "a.c": 1000}
