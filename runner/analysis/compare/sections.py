@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.compare import Comparison, GroupResult, MetricResult, PairResult
-from runner.analysis.compare.statistics import Estimate
+from runner.analysis.compare.statistics import FEWEST_TOGETHER, Estimate
 from runner.analysis.sections import Grid, Section
 from runner.util.humanize import listed
 
@@ -21,7 +21,7 @@ EXPLANATION: Final = (
     "draws. P: the probability that a run of A does better than one of B, over all pairs of their seeds, "
     "equal ones counted half, with a score interval (Newcombe 2006). Intervals at 95 % hold one by one: of "
     "twenty such, one is wrong on average. Those under 'together' hold all at once, over all pairs and "
-    "metrics compared (max-T)."
+    f"metrics compared (t intervals of trimmed means; from {FEWEST_TOGETHER} seeds on)."
 )
 
 
@@ -75,7 +75,7 @@ def metric_section(metric: MetricResult, profile: bool = True) -> Section:
     if metric.pairs:
         word = "higher" if metric.higher_is_better is None else "better"
         count = f"{word} / equal / {'lower' if word == 'higher' else 'worse'}"
-        together = any(not math.isnan(pair.simultaneous.low) for pair in metric.pairs)
+        together = any(not math.isnan(pair.simultaneous.value) for pair in metric.pairs)
         headings = (
             *("A - B, seed by seed", "seeds", "median", "IQM", "95 %"),
             *(["together"] if together else []),
@@ -112,13 +112,14 @@ def _group(group: GroupResult) -> tuple[str, ...]:
 
 
 def _pair(pair: PairResult, together: bool) -> tuple[str, ...]:
+    few = "too few seeds" if len(pair.seeds) < FEWEST_TOGETHER else ""
     return (
         f"{pair.a} - {pair.b}",
         str(len(pair.seeds)),
         number(pair.median, signed=True),
         number(pair.iqm.value, signed=True),
         interval(pair.iqm, signed=True),
-        *([interval(pair.simultaneous, signed=True)] if together else []),
+        *([few or interval(pair.simultaneous, signed=True)] if together else []),
         number(pair.improvement.value),
         interval(pair.improvement),
         f"{pair.wins} / {pair.ties} / {pair.losses}",

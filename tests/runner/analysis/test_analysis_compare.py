@@ -104,16 +104,29 @@ def test_a_probability_of_improvement_of_one_is_not_certain():
     assert few.low < always.low
 
 
-def test_simultaneous_intervals_hold_all_at_once_as_often_as_they_say():
+@pytest.mark.parametrize("seeds", [6, 8, 20])
+def test_simultaneous_intervals_hold_all_at_once_as_often_as_they_say(seeds):
     rng = np.random.default_rng(3)
-    together, one_by_one = [], []
-    for _ in range(40):
-        shared = rng.normal(0, 0.5, 20)
-        samples = [shared + rng.normal(0, 1, 20) for _ in range(6)]  # six differences, none of them true
-        together.append(all(e.low <= 0 <= e.high for e in statistics.simultaneous(samples)))
-        one_by_one.append(all(e.low <= 0 <= e.high for e in map(statistics.interquartile_mean, samples)))
-    assert sum(together) >= 35  # 95 % of 40 is 38
-    assert sum(one_by_one) < sum(together)
+    together = []
+    for _ in range(300):
+        shared = rng.normal(0, 0.5, seeds)
+        samples = [shared + rng.normal(0, 1, seeds) for _ in range(6)]  # six differences, none of them true
+        estimates = statistics.simultaneous(samples)
+        together.append(all(each.low <= 0 <= each.high for each in estimates))
+        assert max(each.high - each.low for each in estimates) < 25  # standard deviations
+    assert 0.9 <= np.mean(together) <= 0.98
+
+
+def test_too_few_seeds_have_no_simultaneous_intervals():
+    rng = np.random.default_rng(5)
+    series = [
+        run(seed, [0, value], name=name, discount=discount)
+        for name, discount in (("a", 0.8), ("b", 0.9), ("c", 0.7))
+        for seed, value in enumerate(rng.normal(0, 1, 5))
+    ]
+    few = result(series)
+    assert all(math.isnan(pair.simultaneous.low) for pair in few.metrics[0].pairs)
+    assert text_of(few).count("too few seeds") == 3
 
 
 def test_intervals_that_hold_together_are_shown_where_there_are_several():
