@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp, step_counts
 from runner.loops.description import Described
-from runner.loops.values import leaves_of
+from runner.loops.values import warn_user
 from runner.recording import schema
+from runner.recording.gym_values import leaves_of
 from runner.recording.recorder import Recorder
 
 MAX_SEED: Final = 2**64 - 1
@@ -141,8 +142,8 @@ class Rows:
         self._fresh = True
 
     def _set_leaves(self, described: Described) -> None:
-        self._action_leaves = leaves_of(described.recorded_action, "action")
-        self._observation_leaves = leaves_of(described.observation, "observation")
+        self._action_leaves = leaves_of(described.recorded_action, "action", on_rounded=warn_user)
+        self._observation_leaves = leaves_of(described.observation, "observation", on_rounded=warn_user)
 
     def reshape(self, described: Described) -> None:
         """Take new blocks for actions of another dtype, before the first step."""

@@ -7,23 +7,14 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.loops.description import Described
 from runner.loops.rows import Rows
-from runner.loops.values import (
-    Leaf,
-    filler,
-    leaves_of,
-    lone_number,
-    require_reset,
-    value_bytes,
-    whole_number,
-)
+from runner.loops.values import lone_number, require_reset, warn_user, whole_number
 from runner.recording import schema
-from runner.recording.gym_spaces import Space
+from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent, value_bytes
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
 
@@ -200,34 +191,15 @@ class AgentRows(BlockRows):
         return super().place[0], self._ended + len(self._ends)
 
     def _set_leaves(self, described: Described) -> None:
-        self._own_observations = _leaves_by_agent(described.observation, "observation")
-        self._own_actions = _leaves_by_agent(described.recorded_action, "action")
+        self._own_observations = leaves_by_agent(described.observation, "observation", warn_user)
+        self._own_actions = leaves_by_agent(described.recorded_action, "action", warn_user)
 
     def _open_steps(self) -> tuple[int, int]:
         rooms = super()._open_steps()
-        self._action = self._filler(self._own_actions, self._block["action"])
-        self._next = self._filler(self._own_observations, self._block["next_observation"])
-        self._first = self._filler(self._own_observations, self._reset_block["observation"])
+        self._action = filler_by_agent(self._own_actions, self._block["action"])
+        self._next = filler_by_agent(self._own_observations, self._block["next_observation"])
+        self._first = filler_by_agent(self._own_observations, self._reset_block["observation"])
         return rooms
-
-    def _filler(
-        self, leaves: Mapping[str, list[Leaf]], column: NDArray[Any]
-    ) -> Callable[[int, Mapping[str, Any]], None]:
-        """Return a function that puts the values of some agents into a row, and zeros for the others."""
-        fillers = {agent: filler(own, column) for agent, own in leaves.items()}
-        zeros = np.zeros((), column.dtype)
-
-        def put(row: int, values: Mapping[str, Any]) -> None:
-            column[row] = zeros
-            for agent, value in values.items():
-                if agent not in fillers:
-                    names = ", ".join(self._agents)
-                    raise RecordingError(
-                        f"found the agent {agent!r}, expected one of possible_agents: {names}"
-                    )
-                fillers[agent](row, {agent: value})
-
-        return put
 
     def take_game(
         self,
@@ -261,12 +233,6 @@ class AgentRows(BlockRows):
 
     def _mask(self, flags: Mapping[str, bool]) -> int:
         return sum(bool(flags.get(agent)) << i for i, agent in enumerate(self._agents))
-
-
-def _leaves_by_agent(space: Space, what: str) -> dict[str, list[Leaf]]:
-    assert isinstance(space, spaces.Dict)
-    leaves = leaves_of(space, what, "the agents' spaces")
-    return {agent: [leaf for leaf in leaves if leaf.part.keys[0] == agent] for agent in space.spaces}
 
 
 class VariableRows(Rows):

@@ -1,11 +1,10 @@
-"""Values on their way into a recording, checked: values of spaces, logged numbers, arrays."""
+"""Values on their way into a recording, checked: rewards, logged numbers, arrays."""
 
 from __future__ import annotations
 
-import math
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,181 +14,11 @@ from numpy.typing import NDArray
 
 from runner.errors import ConfigError, RecordingError
 from runner.recording.chunks import MAX_CHUNK_BYTES
-from runner.recording.gym_spaces import Part, Space, parts_of
-from runner.recording.spaces import MAX_VALUE_BYTES, encode_text
 from runner.util.jsonable import as_mapping
 from runner.util.values import is_utf8
 
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
-_HERE: Final = str(Path(__file__).parent)
-_SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
-
-
-class Leaf:
-    """A part of a space, with the checks that its values pass before they are recorded.
-
-    Args:
-        part: where the part is in a value, and its dtype.
-        what: `observation` or `action`. An action may have another shape with as many numbers, because
-            only the environment knows which shapes it accepts.
-    """
-
-    def __init__(self, part: Part, what: str) -> None:
-        self.part = part
-        self.name = what + "".join(f"[{key!r}]" for key in part.keys)
-        self._what = what
-        if part.dtype is None:
-            return
-        self.base = np.dtype(part.dtype.base.str)
-        self.shape = part.dtype.shape
-        scalars = {kind for kind in _SCALARS if np.can_cast(kind, self.base)}
-        scalars |= {bool} | ({int} if self.base.kind in "iu" else {float} if self.base.char == "d" else set())
-        self.exact_scalars = frozenset(() if self.shape else scalars)
-        """Classes whose values are all recorded exactly, or refused by NumPy."""
-        self._is_rounded = False
-
-    def fit(self, value: Any, batch: tuple[int, ...] = ()) -> NDArray[Any]:
-        """Return a value as an array that can be recorded; warn the first time that one is rounded.
-
-        Args:
-            value: the value of this part alone.
-            batch: the shape of the batch that it is, if it is one.
-
-        Raises:
-            RecordingError: it has another shape, holds no numbers, or numbers out of the dtype's range.
-        """
-        array = np.asarray(value)
-        shape = batch + self.shape
-        if array.dtype.kind not in "biuf":
-            raise self.refused(f"found {array.dtype}, expected {self.base}")
-        if array.shape != shape:
-            if self._what != "action" or array.size != math.prod(shape):
-                raise RecordingError(
-                    f"found {self.name} of shape {array.shape}, expected {shape} by its space."
-                )
-            array = array.reshape(shape)
-        if array.dtype is self.base or np.can_cast(array.dtype, self.base):
-            return array
-        with np.errstate(all="ignore"):
-            rounded = array.astype(self.base)
-        if not np.array_equal(rounded, array, equal_nan=array.dtype.kind == "f"):
-            if self.base.kind in "iu":
-                limits = np.iinfo(self.base)
-                if not ((array >= limits.min) & (array <= limits.max)).all():
-                    raise self.refused(f"{self.base} holds {limits.min} to {limits.max}")
-            if not self._is_rounded:
-                self._is_rounded = True
-                warn_user(
-                    f"{self.name} comes as {array.dtype} and is recorded, rounded, as the {self.base} of its "
-                    "space. This warning is given once."
-                )
-        return rounded
-
-    def refused(self, reason: object) -> RecordingError:
-        """Return the error for a value that is not of the space."""
-        what = self._what
-        return RecordingError(f"found an {what} that is not of the environment's {what} space ({reason}).")
-
-
-def leaves_of(space: Space, what: str, where: str = "") -> list[Leaf]:
-    """Return the leaves of a space; `what` is `observation` or `action`."""
-    return [Leaf(part, what) for part in parts_of(space, where or f"the {what} space")]
-
-
-def filler(
-    leaves: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] = ()
-) -> Callable[[int, Any], None]:
-    """Return a function that puts a value of a space into a row of a column.
-
-    Args:
-        leaves: the leaves of the space.
-        column: [rows, *batch] values of the space.
-        batch: the shape of the batch that each value is, if it is one.
-
-    Raises:
-        RecordingError: (from the returned function) a value is not of its space.
-    """
-    if len(leaves) == 1 and not leaves[0].part.keys:
-        return _leaf_filler(leaves[0], column, batch)
-    fillers = [(leaf, leaf.part.keys, _leaf_filler(leaf, _column_of(leaf, column), batch)) for leaf in leaves]
-
-    def put(row: int, value: Any) -> None:
-        for leaf, keys, put_leaf in fillers:
-            inside = value
-            try:
-                for key in keys:
-                    inside = inside[key]
-            except (TypeError, LookupError) as error:
-                raise leaf.refused(error) from error
-            put_leaf(row, inside)
-
-    return put
-
-
-def _leaf_filler(leaf: Leaf, column: NDArray[Any], batch: tuple[int, ...]) -> Callable[[int, Any], None]:
-    base, shape, array = leaf.base, batch + leaf.shape, np.ndarray
-    scalars = frozenset() if batch else leaf.exact_scalars
-
-    def put(row: int, value: Any) -> None:
-        kind = value.__class__
-        try:
-            if kind is array:  # the usual case costs two comparisons
-                if value.dtype is not base or value.shape != shape:
-                    value = leaf.fit(value, batch)
-            elif kind not in scalars:
-                value = leaf.fit(value, batch)
-            column[row] = value
-        except (TypeError, ValueError, OverflowError) as error:
-            raise leaf.refused(error) from error
-
-    return put
-
-
-def _column_of(leaf: Leaf, column: NDArray[Any]) -> NDArray[Any]:
-    for name in leaf.part.fields:
-        column = column[name]
-    return column
-
-
-def value_bytes(leaves: Sequence[Leaf], value: Any) -> bytes:
-    """Return a value of a space as its bytes in a recording.
-
-    Raises:
-        RecordingError: it is not of the space, or too large.
-    """
-    pieces = []
-    for leaf in leaves:
-        try:
-            inside = leaf.part.of(value)
-            if leaf.part.text is not None:
-                pieces.append(encode_text(leaf.part.text(inside)))
-            else:
-                pieces.append(np.asarray(leaf.fit(inside), leaf.base, order="C").tobytes())
-        except (TypeError, ValueError, LookupError, AttributeError, OverflowError, RecursionError) as error:
-            raise leaf.refused(error) from error
-    if (size := sum(map(len, pieces))) > MAX_VALUE_BYTES:
-        raise leaves[0].refused(f"it takes {size:,} bytes, expected at most {MAX_VALUE_BYTES:,}")
-    return b"".join(pieces)
-
-
-def put_chosen(leaves: Sequence[Leaf], values: Any, into: NDArray[Any], which: NDArray[np.intp]) -> None:
-    """Put values of single environments into their rows, as a vector's info holds them.
-
-    Raises:
-        RecordingError: they are not of the space.
-    """
-    put = filler(leaves, into)
-    for i in which.tolist():
-        put(i, _element(values, i))
-
-
-def _element(values: Any, i: int) -> Any:
-    """Return the value of one environment in a batch of a `Dict` or `Tuple` space."""
-    if isinstance(values, Mapping):
-        return {key: _element(part, i) for key, part in values.items() if not str(key).startswith("_")}
-    if isinstance(values, tuple):
-        return tuple(_element(part, i) for part in values)
-    return values[i]
+_PACKAGE: Final = str(Path(__file__).parents[1])
 
 
 def lone_number(value: Any, what: str) -> float:
@@ -299,6 +128,6 @@ def require_reset(resets: int, phase: str) -> None:
 def warn_user(message: str) -> None:
     """Warn of something in the user's loop, at the line of the loop and not in this package."""
     level, frame = 1, sys._getframe()
-    while frame.f_back is not None and frame.f_code.co_filename.startswith(_HERE):
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
         level, frame = level + 1, frame.f_back
     warnings.warn(message, RuntimeWarning, stacklevel=level)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from runner.loops.description import Described
 from runner.loops.rows import MAX_SEED
-from runner.loops.values import filler, leaves_of, put_chosen, require_reset
+from runner.loops.values import require_reset, warn_user
 from runner.recording import schema
+from runner.recording.gym_values import filler, leaves_of, put_chosen
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
 
@@ -110,8 +111,8 @@ class VectorRows:
 
     def reshape(self, described: Described) -> None:
         """Prepare for actions of another dtype, before the first step."""
-        self._observation_leaves = leaves_of(described.observation, "observation")
-        self._action_leaves = leaves_of(described.recorded_action, "action")
+        self._observation_leaves = leaves_of(described.observation, "observation", on_rounded=warn_user)
+        self._action_leaves = leaves_of(described.recorded_action, "action", on_rounded=warn_user)
 
     def _make_room(self) -> None:
         """Allocate the block; the dtype of actions is known."""

@@ -1,0 +1,216 @@
+"""Values of Gymnasium's spaces on their way into a recording: checked, and put into columns of records."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording.gym_spaces import Part, Space, parts_of
+from runner.recording.spaces import MAX_VALUE_BYTES, encode_text
+
+_SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
+
+OnRounded = Callable[[str], None]
+"""Called with a warning: values are recorded rounded."""
+
+
+class Leaf:
+    """A part of a space, with the checks that its values pass before they are recorded.
+
+    Args:
+        part: where the part is in a value, and its dtype.
+        what: `observation` or `action`. An action may have another shape with as many numbers, because
+            only the environment knows which shapes it accepts.
+        on_rounded: called with a text the first time that a value is rounded.
+    """
+
+    def __init__(self, part: Part, what: str, on_rounded: OnRounded) -> None:
+        self.part = part
+        self._on_rounded = on_rounded
+        self.name = what + "".join(f"[{key!r}]" for key in part.keys)
+        self._what = what
+        if part.dtype is None:
+            return
+        self.base = np.dtype(part.dtype.base.str)
+        self.shape = part.dtype.shape
+        scalars = {kind for kind in _SCALARS if np.can_cast(kind, self.base)}
+        scalars |= {bool} | ({int} if self.base.kind in "iu" else {float} if self.base.char == "d" else set())
+        self.exact_scalars = frozenset(() if self.shape else scalars)
+        """Classes whose values are all recorded exactly, or refused by NumPy."""
+        self._is_rounded = False
+
+    def fit(self, value: Any, batch: tuple[int, ...] = ()) -> NDArray[Any]:
+        """Return a value as an array that can be recorded.
+
+        Args:
+            value: the value of this part alone.
+            batch: the shape of the batch that it is, if it is one.
+
+        Raises:
+            RecordingError: it has another shape, holds no numbers, or numbers out of the dtype's range.
+        """
+        array = np.asarray(value)
+        shape = batch + self.shape
+        if array.dtype.kind not in "biuf":
+            raise self.refused(f"found {array.dtype}, expected {self.base}")
+        if array.shape != shape:
+            if self._what != "action" or array.size != math.prod(shape):
+                raise RecordingError(
+                    f"found {self.name} of shape {array.shape}, expected {shape} by its space."
+                )
+            array = array.reshape(shape)
+        if array.dtype is self.base or np.can_cast(array.dtype, self.base):
+            return array
+        with np.errstate(all="ignore"):
+            rounded = array.astype(self.base)
+        if not np.array_equal(rounded, array, equal_nan=array.dtype.kind == "f"):
+            if self.base.kind in "iu":
+                limits = np.iinfo(self.base)
+                if not ((array >= limits.min) & (array <= limits.max)).all():
+                    raise self.refused(f"{self.base} holds {limits.min} to {limits.max}")
+            if not self._is_rounded:
+                self._is_rounded = True
+                self._on_rounded(
+                    f"{self.name} comes as {array.dtype} and is recorded, rounded, as the {self.base} of its "
+                    "space. This warning is given once."
+                )
+        return rounded
+
+    def refused(self, reason: object) -> RecordingError:
+        """Return the error for a value that is not of the space."""
+        what = self._what
+        return RecordingError(f"found an {what} that is not of the environment's {what} space ({reason}).")
+
+
+def leaves_of(space: Space, what: str, where: str = "", on_rounded: OnRounded = lambda _: None) -> list[Leaf]:
+    """Return the leaves of a space; `what` is `observation` or `action`."""
+    return [Leaf(part, what, on_rounded) for part in parts_of(space, where or f"the {what} space")]
+
+
+def filler(
+    leaves: Sequence[Leaf], column: NDArray[Any], batch: tuple[int, ...] = ()
+) -> Callable[[int, Any], None]:
+    """Return a function that puts a value of a space into a row of a column.
+
+    Args:
+        leaves: the leaves of the space.
+        column: [rows, *batch] values of the space.
+        batch: the shape of the batch that each value is, if it is one.
+
+    Raises:
+        RecordingError: (from the returned function) a value is not of its space.
+    """
+    if len(leaves) == 1 and not leaves[0].part.keys:
+        return _leaf_filler(leaves[0], column, batch)
+    fillers = [(leaf, leaf.part.keys, _leaf_filler(leaf, _column_of(leaf, column), batch)) for leaf in leaves]
+
+    def put(row: int, value: Any) -> None:
+        for leaf, keys, put_leaf in fillers:
+            inside = value
+            try:
+                for key in keys:
+                    inside = inside[key]
+            except (TypeError, LookupError) as error:
+                raise leaf.refused(error) from error
+            put_leaf(row, inside)
+
+    return put
+
+
+def _leaf_filler(leaf: Leaf, column: NDArray[Any], batch: tuple[int, ...]) -> Callable[[int, Any], None]:
+    base, shape, array = leaf.base, batch + leaf.shape, np.ndarray
+    scalars = frozenset() if batch else leaf.exact_scalars
+
+    def put(row: int, value: Any) -> None:
+        kind = value.__class__
+        try:
+            if kind is array:  # the usual case costs two comparisons
+                if value.dtype is not base or value.shape != shape:
+                    value = leaf.fit(value, batch)
+            elif kind not in scalars:
+                value = leaf.fit(value, batch)
+            column[row] = value
+        except (TypeError, ValueError, OverflowError) as error:
+            raise leaf.refused(error) from error
+
+    return put
+
+
+def _column_of(leaf: Leaf, column: NDArray[Any]) -> NDArray[Any]:
+    for name in leaf.part.fields:
+        column = column[name]
+    return column
+
+
+def leaves_by_agent(space: Any, what: str, on_rounded: OnRounded = lambda _: None) -> dict[str, list[Leaf]]:
+    """Return the leaves of each agent's space in the `Dict` of all of them."""
+    leaves = leaves_of(space, what, "the agents' spaces", on_rounded)
+    return {agent: [leaf for leaf in leaves if leaf.part.keys[0] == agent] for agent in space.spaces}
+
+
+def filler_by_agent(
+    leaves: Mapping[str, Sequence[Leaf]], column: NDArray[Any]
+) -> Callable[[int, Mapping[str, Any]], None]:
+    """Return a function that puts the values of some agents into a row, and zeros for the others.
+
+    Raises:
+        RecordingError: (from the returned function) there is no such agent, or a value is not of its space.
+    """
+    fillers = {agent: filler(own, column) for agent, own in leaves.items()}
+    zeros = np.zeros((), column.dtype)
+
+    def put(row: int, values: Mapping[str, Any]) -> None:
+        column[row] = zeros
+        for agent, value in values.items():
+            if agent not in fillers:
+                names = ", ".join(map(str, fillers))
+                raise RecordingError(f"found the agent {agent!r}, expected one of possible_agents: {names}")
+            fillers[agent](row, {agent: value})
+
+    return put
+
+
+def value_bytes(leaves: Sequence[Leaf], value: Any) -> bytes:
+    """Return a value of a space as its bytes in a recording.
+
+    Raises:
+        RecordingError: it is not of the space, or too large.
+    """
+    pieces = []
+    for leaf in leaves:
+        try:
+            inside = leaf.part.of(value)
+            if leaf.part.text is not None:
+                pieces.append(encode_text(leaf.part.text(inside)))
+            else:
+                pieces.append(np.asarray(leaf.fit(inside), leaf.base, order="C").tobytes())
+        except (TypeError, ValueError, LookupError, AttributeError, OverflowError, RecursionError) as error:
+            raise leaf.refused(error) from error
+    if (size := sum(map(len, pieces))) > MAX_VALUE_BYTES:
+        raise leaves[0].refused(f"it takes {size:,} bytes, expected at most {MAX_VALUE_BYTES:,}")
+    return b"".join(pieces)
+
+
+def put_chosen(leaves: Sequence[Leaf], values: Any, into: NDArray[Any], which: NDArray[np.intp]) -> None:
+    """Put values of single environments into their rows, as a vector's info holds them.
+
+    Raises:
+        RecordingError: they are not of the space.
+    """
+    put = filler(leaves, into)
+    for i in which.tolist():
+        put(i, _element(values, i))
+
+
+def _element(values: Any, i: int) -> Any:
+    """Return the value of one environment in a batch of a `Dict` or `Tuple` space."""
+    if isinstance(values, Mapping):
+        return {key: _element(part, i) for key, part in values.items() if not str(key).startswith("_")}
+    if isinstance(values, tuple):
+        return tuple(_element(part, i) for part in values)
+    return values[i]
