@@ -233,11 +233,11 @@ class Recording(RunDescription):
         blocks = list(self.blocks(topic, start, stop))
         return np.concatenate(blocks) if blocks else np.empty(0, self.dtypes[topic])
 
-    def episode_steps(self, phase: str, episode: int) -> NDArray[np.void]:
-        """Return the steps of one episode, also of one that never ended.
+    def episode_span(self, phase: str, episode: int) -> range:
+        """Return the numbers of the steps of one episode, also of one that never ended.
 
-        Where several environments take turns, episodes are numbered as they ended, and only ended ones are
-        returned.
+        Where several environments take turns, episodes are numbered as they ended, and only ended ones have
+        a span; its step is the number of environments.
 
         Raises:
             RecordingError: the recording has no such episode, or no steps.
@@ -258,37 +258,49 @@ class Recording(RunDescription):
             raise RecordingError(
                 f"{self.path}: has no {phase_name} episode {episode}; there are {ended}, from 0."
             )
-        if (stop - start) * self.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
+        return range(start, stop, stride)
+
+    def episode_steps(self, phase: str, episode: int) -> NDArray[np.void]:
+        """Return the steps of one episode, as `episode_span` finds them.
+
+        Raises:
+            RecordingError: the recording has no such episode or steps, or they are too large for an array.
+        """
+        span, topic = self.episode_span(phase, episode), self.topic(f"/{phase}/step")
+        phase_name = schema.PHASE_NAMES[phase]
+        if (span.stop - span.start) * self.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
             raise RecordingError(
-                f"{self.path}: {phase_name} episode {episode} has {stop - start:,} steps, too many for an "
-                f"array; read them in blocks, from {start}."
+                f"{self.path}: {phase_name} episode {episode} has {span.stop - span.start:,} steps, too many "
+                f"for an array; read them in blocks, from {span.start}."
             )
-        blocks = list(self.blocks(topic, start, stop))
+        blocks = list(self.blocks(topic, span.start, span.stop))
         if not blocks:
             raise RecordingError(f"{self.path}: the steps of {phase_name} episode {episode} were lost.")
-        return np.concatenate(blocks)[::stride]
+        return np.concatenate(blocks)[:: span.step]
 
     # --- messages, parsed -----------------------------------------------------------------------------
 
-    def transitions(self, phase: str) -> Iterator[Any]:
+    def transitions(self, phase: str, times: range | None = None) -> Iterator[Any]:
         """Yield the steps of a loop's phase one by one, with `action` and `next_observation` as values.
 
         Those of the kind `step` have `state`, `action` and `next_state`, counted from 0. They are NumPy
-        records where values have one size (`blocks` yields many at once), else dictionaries.
+        records where values have one size (`blocks` yields many at once), else dictionaries; of these
+        `times` selects some, as in `decoded`.
         """
-        yield from self._values(self.topic(f"/{phase}/step"), action="action", next_observation="observation")
+        topic = self.topic(f"/{phase}/step")
+        yield from self._values(topic, times, action="action", next_observation="observation")
 
     def resets(self, phase: str) -> Iterator[Any]:
         """Yield the resets of a phase one by one, as `transitions` yields steps."""
-        yield from self._values(self.topic(f"/{phase}/reset"), observation="observation")
+        yield from self._values(self.topic(f"/{phase}/reset"), None, observation="observation")
 
-    def _values(self, topic: Topic, **spaces: str) -> Iterator[Any]:
+    def _values(self, topic: Topic, times: range | None, **spaces: str) -> Iterator[Any]:
         """Yield a topic's messages one by one; `spaces` names the space of each field that is a value."""
         if topic in self.dtypes:
             for block in self.blocks(topic):
                 yield from block
             return
-        for fields in self.decoded(topic):
+        for fields in self.decoded(topic, times=times):
             where = f"{self.path}: {topic.name} at {fields['log_time']} ns"
             for name, space in spaces.items():
                 fields[name] = decode_value(self.spaces[space], fields[name], where)
@@ -296,13 +308,21 @@ class Recording(RunDescription):
                 fields["rewards"] = np.array(fields["rewards"])
             yield fields
 
-    def decoded(self, topic: Topic, max_bytes: int = MAX_CHUNK_BYTES) -> Iterator[dict[str, Any]]:
+    def decoded(
+        self, topic: Topic, max_bytes: int = MAX_CHUNK_BYTES, times: range | None = None
+    ) -> Iterator[dict[str, Any]]:
         """Yield the messages of a topic of variable size: `log_time` and the fields, by name.
+
+        Args:
+            topic: the topic.
+            max_bytes: the largest message that is accepted.
+            times: in ns, from the first to before the last; None for all.
 
         Raises:
             RecordingError: one cannot be read, or has more than `max_bytes` bytes.
         """
-        for time, fields in self._parsed(topic, partial(decode, topic.message), max_bytes=max_bytes):
+        parse = partial(decode, topic.message)
+        for time, fields in self._parsed(topic, parse, max_bytes=max_bytes, times=times):
             yield {"log_time": time} | fields
 
     def arrays(self) -> Iterator[Snapshot]:
@@ -367,13 +387,20 @@ class Recording(RunDescription):
         parse: Callable[[bytes], M],
         first_chunk: int = 0,
         max_bytes: int = MAX_CHUNK_BYTES,
+        times: range | None = None,
     ) -> Iterator[tuple[int, M]]:
         """Yield (log time in nanoseconds, parsed message) of a topic's messages, in order.
 
         Raises:
             RecordingError: one cannot be parsed, or has more than `max_bytes` bytes; it is named.
         """
-        for time, payload in self.messages(topic, first_chunk):
+        chunks = self._chunks(topic)
+        found = (
+            chunks.messages(first_chunk)
+            if times is None
+            else chunks.messages_between(times.start, times.stop)
+        )
+        for time, payload in found:
             try:
                 if len(payload) > max_bytes:
                     raise RecordingError(f"found {len(payload):,} bytes, expected at most {max_bytes:,}.")

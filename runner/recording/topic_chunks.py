@@ -202,18 +202,30 @@ class TopicChunks:
     def messages(self, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
         """Yield (log time in nanoseconds, payload) of the messages from a chunk on."""
         for k in range(first_chunk, len(self)):
-            data = self._store.chunk(self.entry(k))
-            at = 0
-            while at < len(data):
-                if at + HEADER_BYTES > len(data):
-                    raise self._damaged(k, f"stray bytes at {at}")
-                opcode, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
-                end = at + RECORD_HEAD.size + length
-                whole = at + HEADER_BYTES <= end <= len(data)
-                if opcode != MESSAGE or not whole or channel != self._topic.channel:
-                    raise self._damaged(k, f"no message of {self._topic.name} at {at}")
-                yield log_time, data[at + HEADER_BYTES : end]
-                at = end
+            yield from self._messages_of(k)
+
+    def messages_between(self, start_time: int, stop_time: int) -> Iterator[tuple[int, bytes]]:
+        """Yield the messages logged from `start_time` up to `stop_time`, in ns, as `messages` does."""
+        times = self._table.columns[self._places] if len(self) else self._table.columns[:0]
+        start, stop = np.uint64(max(start_time, 0)), np.uint64(max(stop_time, 0))
+        for k in np.flatnonzero((times["end_time"] >= start) & (times["start_time"] < stop)).tolist():
+            for time, payload in self._messages_of(k):
+                if start_time <= time < stop_time:
+                    yield time, payload
+
+    def _messages_of(self, k: int) -> Iterator[tuple[int, bytes]]:
+        data = self._store.chunk(self.entry(k))
+        at = 0
+        while at < len(data):
+            if at + HEADER_BYTES > len(data):
+                raise self._damaged(k, f"stray bytes at {at}")
+            opcode, length, channel, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, at)
+            end = at + RECORD_HEAD.size + length
+            whole = at + HEADER_BYTES <= end <= len(data)
+            if opcode != MESSAGE or not whole or channel != self._topic.channel:
+                raise self._damaged(k, f"no message of {self._topic.name} at {at}")
+            yield log_time, data[at + HEADER_BYTES : end]
+            at = end
 
     @cached_property
     def _numbers(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
