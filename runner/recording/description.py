@@ -12,6 +12,7 @@ from typing import Any
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
+from runner.recording.maker import MAKER_RECORD, EnvironmentMaker, parse_maker
 from runner.recording.metadata import (
     environment_description,
     environment_of,
@@ -170,6 +171,17 @@ class RunDescription(ABC):
     def environment(self) -> dict[str, Any]:
         """The environment's description without its arrays: agents, events, scene; not to be changed."""
         return environment_description(self.attachment("environment.json"), str(self.path))
+
+    @cached_property
+    def maker(self) -> EnvironmentMaker | None:
+        """How a loop's environment was made; None for jobs, and for recordings that do not state it.
+
+        Raises:
+            RecordingError: it is damaged.
+        """
+        if MAKER_RECORD not in self.metadata_names:
+            return None
+        return parse_maker(self._json(MAKER_RECORD), str(self.path))
 
     @property
     def event_names(self) -> tuple[str, ...]:

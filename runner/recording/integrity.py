@@ -134,8 +134,16 @@ def _reading(path: Path) -> Iterator[BinaryIO]:
 
 @cache
 def _beginnings() -> tuple[bytes, ...]:
-    """Return what follows the header in recordings of each kind."""
-    return tuple(b"".join(schemas_and_channels(topics)) for topics in schema.KINDS.values())
+    """Return what may follow the header: the schemas and channels of each kind, as every version wrote them.
+
+    A topic that is added gets the highest channel, so earlier versions wrote those up to some channel.
+    """
+    newest = max(topic.channel for topic in schema.ALL_TOPICS)
+    return tuple(
+        b"".join(schemas_and_channels(tuple(topic for topic in topics if topic.channel <= last)))
+        for topics in schema.KINDS.values()
+        for last in range(schema.FIRST_VERSION_CHANNELS, newest + 1)
+    )
 
 
 def _check_beginning(stream: BinaryIO) -> None:

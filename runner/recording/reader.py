@@ -33,6 +33,7 @@ from runner.recording.liveness import is_owned
 from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
 from runner.recording.metadata import check_file, sizes_of
 from runner.recording.record_store import RecordStore
+from runner.recording.reset_states import ResetState, decode_reset_state
 from runner.recording.run_file import run_title
 from runner.recording.schema import Topic
 from runner.recording.spaces import decode as decode_value
@@ -293,6 +294,18 @@ class Recording(RunDescription):
     def resets(self, phase: str) -> Iterator[Any]:
         """Yield the resets of a phase one by one, as `transitions` yields steps."""
         yield from self._values(self.topic(f"/{phase}/reset"), None, observation="observation")
+
+    def reset_states(self, phase: str) -> Iterator[ResetState]:
+        """Yield what resets of a loop's phase without a seed depend on, in the order of the resets.
+
+        Not every reset has one; recordings of earlier versions and jobs have none.
+
+        Raises:
+            RecordingError: one is damaged.
+        """
+        if not self.is_job:
+            for _, state in self._parsed(self.topic(f"/{phase}/reset_state"), decode_reset_state):
+                yield state
 
     def _values(self, topic: Topic, times: range | None, **spaces: str) -> Iterator[Any]:
         """Yield a topic's messages one by one; `spaces` names the space of each field that is a value."""

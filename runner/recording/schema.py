@@ -198,6 +198,19 @@ RESET = MessageType(
         Field(7, "seeded", _BOOL),
     ),
 )
+RESET_STATE = MessageType(
+    "ResetState",
+    (
+        Field(1, "reset", _SFIXED64),
+        Field(2, "environment", _FIXED32),
+        Field(3, "np_random_seed", _BYTES),
+        Field(4, "bit_generator", _BYTES),
+        Field(5, "has_ale_seed", _BOOL),
+        Field(6, "ale_seed", _SFIXED64),
+        Field(7, "ale_state", _BYTES),
+    ),
+)
+"""What a reset without a seed depends on; `reset_states` describes its fields."""
 INFO = MessageType(
     "Info",
     (
@@ -278,6 +291,10 @@ SCALAR_TOPIC = Topic("/scalar", 19, SCALAR)
 ARRAY_TOPIC = Topic("/array", 20, ARRAY)
 TRAIN_FRAME = Topic("/train/frame", 21, IMAGE, "train", digested=False)
 EVAL_FRAME = Topic("/eval/frame", 22, IMAGE, "eval", digested=False)
+FIRST_VERSION_CHANNELS: Final = 23
+"""The highest channel of the format's first version; topics with higher ones may be missing in a file."""
+TRAIN_RESET_STATE = Topic("/train/reset_state", 24, RESET_STATE, "train", digested=False)
+EVAL_RESET_STATE = Topic("/eval/reset_state", 25, RESET_STATE, "eval", digested=False)
 
 LOOP_TOPICS: Final = {
     "step": (TRAIN_STEP, EVAL_STEP, TRAIN_RESET, EVAL_RESET),
@@ -293,6 +310,7 @@ LOOP_TOPICS: Final = {
 _EVERY_LOOP: Final = (
     *(TRAIN_EPISODE, EVAL_EPISODE, TRAIN_INFO, EVAL_INFO),
     *(SCALAR_TOPIC, ARRAY_TOPIC, TRAIN_FRAME, EVAL_FRAME, LOG_TOPIC),
+    *(TRAIN_RESET_STATE, EVAL_RESET_STATE),
 )
 KINDS: Final = {
     "job": TOPICS,

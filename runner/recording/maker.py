@@ -1,0 +1,157 @@
+"""How a loop's environment was made, so that it can be made again: stored in its recording, read with checks.
+
+Nothing here imports or makes an environment.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final
+
+from runner.errors import RecordingError
+from runner.util.values import MAX_TEXT, is_whole
+
+MAKER_RECORD: Final = "environment_maker"
+"""The metadata record with the maker, as JSON."""
+KINDS: Final = ("gymnasium", "vector", "pettingzoo")
+MODES: Final = ("sync", "async", "custom")
+AUTORESET_MODES: Final = ("NextStep", "SameStep", "Disabled")
+MODULE_NAME: Final = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
+FUNCTION_NAME: Final = re.compile(rf"{MODULE_NAME.pattern}:{MODULE_NAME.pattern}")
+"""`module:function`, such as `train.envs:make_env`."""
+MAX_SPEC: Final = 1 << 20
+"""The most characters of a specification."""
+_MAX_NAMES: Final = 100
+_MAX_REASON: Final = 2_000
+_MAX_ENVIRONMENTS: Final = 10**7 - 1
+
+
+@dataclass(frozen=True)
+class VectorMaker:
+    """How environments were put together to a vector."""
+
+    number: int
+    mode: str
+    """`sync`: a `SyncVectorEnv`, `async`: an `AsyncVectorEnv`, `custom`: another class."""
+    autoreset: str
+    """The value of its `AutoresetMode`: `NextStep`, `SameStep` or `Disabled`."""
+    wrappers: tuple[str, ...] = ()
+    """The wrappers of the vector, `module:class`, from the outermost in."""
+
+
+@dataclass(frozen=True)
+class EnvironmentMaker:
+    """How an environment was made.
+
+    `reason` is empty if `spec` is complete: `gymnasium.make(EnvSpec.from_json(spec))` gives the environment
+    with all wrappers. For a vector of mode `sync` or `async` it gives one of the environments; for one of
+    mode `custom`, `gymnasium.make_vec` takes it.
+    """
+
+    kind: str
+    """`gymnasium`, `vector` or `pettingzoo`."""
+    spec: str = ""
+    """JSON: of Gymnasium's `EnvSpec`; of PettingZoo `{"entry_point": "module:function", "kwargs": {...}}`.
+
+    Empty if it is unknown.
+    """
+    registered_by: str = ""
+    """The module whose import registers the environment, such as `ale_py`; empty if none is needed."""
+    make: str = ""
+    """The function that the user named, `module:function`, which returns the environment; empty if none."""
+    reason: str = ""
+    """Why `spec` does not suffice to make the environment; empty if it does."""
+    wrappers: tuple[str, ...] = ()
+    """The wrappers of an environment, `module:class`, from the outermost in."""
+    vector: VectorMaker | None = None
+    packages: Mapping[str, str] = field(default_factory=dict)
+    """The versions of the distributions that determine what the environment does, by name."""
+    platform: str = ""
+    machine: str = ""
+
+    def to_metadata(self) -> dict[str, str]:
+        """Return the entries of the metadata record."""
+        return {"json": json.dumps(asdict(self), sort_keys=True)}
+
+
+def parse_maker(values: Mapping[str, Any], where: str) -> EnvironmentMaker:
+    """Return the maker in a metadata record.
+
+    Args:
+        values: the JSON object in it.
+        where: of the recording, for errors.
+
+    Raises:
+        RecordingError: a value is missing or not possible; it is named.
+    """
+    check = _Check(values, f"{where}: its {MAKER_RECORD}")
+    vector = values.get("vector")
+    return EnvironmentMaker(
+        kind=check.choice("kind", KINDS),
+        spec=check.text("spec", MAX_SPEC),
+        registered_by=check.text("registered_by", MAX_TEXT, MODULE_NAME),
+        make=check.text("make", MAX_TEXT, FUNCTION_NAME),
+        reason=check.text("reason", _MAX_REASON),
+        wrappers=check.names("wrappers"),
+        vector=None
+        if vector is None
+        else _parse_vector(vector, f"{where}: the vector in its {MAKER_RECORD}"),
+        packages=check.versions("packages"),
+        platform=check.text("platform", MAX_TEXT),
+        machine=check.text("machine", MAX_TEXT),
+    )
+
+
+def _parse_vector(values: Any, where: str) -> VectorMaker:
+    check = _Check(values, where)
+    number = check.values.get("number")
+    check.require("number", is_whole(number, 1, _MAX_ENVIRONMENTS))
+    return VectorMaker(
+        number=int(check.values["number"]),
+        mode=check.choice("mode", MODES),
+        autoreset=check.choice("autoreset", AUTORESET_MODES),
+        wrappers=check.names("wrappers"),
+    )
+
+
+class _Check:
+    """Returns the values of a JSON object, each after a check of its type and size."""
+
+    def __init__(self, values: Any, where: str) -> None:
+        if not isinstance(values, Mapping):
+            raise RecordingError(f"{where} is damaged: found {type(values).__name__}, expected an object.")
+        self.values = values
+        self._where = where
+
+    def require(self, key: str, is_valid: bool) -> None:
+        if not is_valid:
+            found = repr(self.values.get(key))[:MAX_TEXT]
+            raise RecordingError(f"{self._where} is damaged: found {key} {found}.")
+
+    def text(self, key: str, limit: int, pattern: re.Pattern[str] | None = None) -> str:
+        value = self.values.get(key)
+        is_valid = isinstance(value, str) and len(value) <= limit
+        self.require(key, is_valid and (not value or pattern is None or bool(pattern.fullmatch(str(value)))))
+        return str(value)
+
+    def choice(self, key: str, choices: tuple[str, ...]) -> str:
+        self.require(key, self.values.get(key) in choices)
+        return str(self.values[key])
+
+    def names(self, key: str) -> tuple[str, ...]:
+        value = self.values.get(key)
+        self.require(key, isinstance(value, list) and len(value) <= _MAX_NAMES)
+        names = tuple(self.values[key])
+        self.require(key, all(isinstance(name, str) and len(name) <= MAX_TEXT for name in names))
+        return names
+
+    def versions(self, key: str) -> dict[str, str]:
+        value = self.values.get(key)
+        self.require(key, isinstance(value, Mapping) and len(value) <= _MAX_NAMES)
+        versions = dict(self.values[key])
+        texts = [text for pair in versions.items() for text in pair]
+        self.require(key, all(isinstance(text, str) and len(text) <= MAX_TEXT for text in texts))
+        return versions

@@ -1,0 +1,108 @@
+"""What resets without a seed depend on: the state of the environment's random generators before them.
+
+A state is recorded at the first reset without a seed, and from then on at the first reset after
+`STEPS_BETWEEN` steps at the earliest: any episode can be repeated from the last recorded state, or the last
+reset with a seed, at or before it.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import Any, Final
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.messages import decode, encode
+
+SEED_BYTES: Final = 16
+MAX_ALE_STATE: Final = 1 << 20
+"""The most bytes of a state of the Arcade Learning Environment; one has some 14 kB."""
+_PCG64: Final = struct.Struct("<16s16sII")
+"""State, increment, `uinteger`, `has_uint32`."""
+
+
+@dataclass(frozen=True)
+class ResetState:
+    """What one reset without a seed depends on.
+
+    To repeat the episode that begins with it: set `bit_generator` and the ALE's state, as far as they are
+    there, and call `reset()` without a seed. If neither is there, call `reset(seed=np_random_seed)`.
+    """
+
+    reset: int
+    """The number of the reset in its phase, as in `dualtaxi.Reset`."""
+    environment: int
+    """Which environment of a vector; 0 for a generator that all environments share."""
+    np_random_seed: int | None = None
+    """The seed that the reset drew for the environment's generator; None if it drew none."""
+    bit_generator: dict[str, Any] | None = None
+    """The state of `unwrapped.np_random` before the reset, as `numpy.random.PCG64.state` takes it."""
+    ale_seed: int | None = None
+    """The `random_seed` of an Atari environment's emulator, which it was loaded with."""
+    ale_state: bytes = b""
+    """The emulator's state before the reset, as `ale_py.ALEState` takes it, with its generator; empty if not
+    recorded."""
+
+    def to_payload(self) -> bytes:
+        """Return the message."""
+        seed = self.np_random_seed
+        generator = self.bit_generator
+        return encode(
+            schema.RESET_STATE,
+            {
+                "reset": self.reset,
+                "environment": self.environment,
+                "np_random_seed": b"" if seed is None else seed.to_bytes(SEED_BYTES, "little"),
+                "bit_generator": b"" if generator is None else packed_generator(generator),
+                "has_ale_seed": self.ale_seed is not None,
+                "ale_seed": self.ale_seed or 0,
+                "ale_state": self.ale_state,
+            },
+        )
+
+
+def packed_generator(state: dict[str, Any]) -> bytes:
+    """Return the state of a PCG64 as bytes."""
+    inner = state["state"]
+    return _PCG64.pack(
+        inner["state"].to_bytes(16, "little"),
+        inner["inc"].to_bytes(16, "little"),
+        state["uinteger"],
+        state["has_uint32"],
+    )
+
+
+def decode_reset_state(payload: bytes) -> ResetState:
+    """Return the state in a `dualtaxi.ResetState`.
+
+    Raises:
+        RecordingError: a value has another size than expected.
+    """
+    fields = decode(schema.RESET_STATE, payload)
+    seed, packed, ale = fields["np_random_seed"], fields["bit_generator"], fields["ale_state"]
+    if len(seed) not in (0, SEED_BYTES) or len(packed) not in (0, _PCG64.size) or len(ale) > MAX_ALE_STATE:
+        raise RecordingError(
+            f"found a reset state with a seed of {len(seed)} bytes, a generator of {len(packed)} and an "
+            f"emulator of {len(ale):,}; expected {SEED_BYTES}, {_PCG64.size}, at most {MAX_ALE_STATE:,}"
+        )
+    generator: dict[str, Any] | None = None
+    if packed:
+        state, increment, uinteger, has_uint32 = _PCG64.unpack(packed)
+        inner = {"state": int.from_bytes(state, "little"), "inc": int.from_bytes(increment, "little")}
+        if not inner["inc"] % 2 or has_uint32 > 1:
+            raise RecordingError("found the state of a random generator that no PCG64 has")
+        generator = {
+            "bit_generator": "PCG64",
+            "state": inner,
+            "has_uint32": has_uint32,
+            "uinteger": uinteger,
+        }
+    return ResetState(
+        reset=fields["reset"],
+        environment=fields["environment"],
+        np_random_seed=int.from_bytes(seed, "little") if seed else None,
+        bit_generator=generator,
+        ale_seed=fields["ale_seed"] if fields["has_ale_seed"] else None,
+        ale_state=ale,
+    )
