@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
-from runner.recording.labels import Labels, change_labels, read_labels
+from runner.recording.labels import LABELS_FILE, Labels, as_json, change_labels, read_labels
 from runner.recording.liveness import is_alive, owner
 from runner.recording.run_file import RUN_ID, ArchiveReference, RunFile, Summary, parse_run_file, run_title
 from runner.util.files import read_object, storage_errors, write_object
@@ -216,6 +216,7 @@ def new_run(
     seed: int | None,
     name: str,
     run_id: str | None = None,
+    labels: Labels | None = None,
     **more: Any,
 ) -> Run:
     """Create the folder of a new run; `more` are further facts, the rest is as for `create_run`."""
@@ -241,6 +242,8 @@ def new_run(
             "config": dict(config),
             **more,
         }
+        if labels is not None:  # before the run is listed, so that it always has them
+            write_object(folder / LABELS_FILE, as_json(labels))
         write_object(folder / RUN_FILE, facts)
     return Run(folder, facts)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from collections import deque
 from collections.abc import Callable
@@ -9,7 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from runner.sweep import state, tag_of
+from runner.recording.labels import Labels
+from runner.runs.run import new_run, run_in
+from runner.sweep import tag_of
 from runner.sweep.local import Workers
 from runner.sweep.model import Sweep
 from runner.sweep.objective import Curve
@@ -123,8 +126,7 @@ class _Runner:
                         identity=identity,
                         seed=seed,
                         config=trial.config,
-                        name=self._sweep.name,
-                        tags=(tag_of(self._sweep.name), f"trial={trial.number}"),
+                        trial=trial.number,
                         recordings=str(self._recordings),
                         objective=self._sweep.objective,
                         bounds=bounds,
@@ -147,10 +149,9 @@ class _Runner:
                 status.running -= 1
                 if received is None and task.identity not in self._retried:  # its worker died
                     self._retried.add(task.identity)
-                    run = state.runs_of(self._sweep.name, self._recordings).get(task.identity)
-                    self._waiting.appendleft(replace(task, run_id=run.run_id if run else ""))
+                    self._waiting.appendleft(task)
                     continue
-                result = received or Result("failed", task.run_id, error="its worker died twice")
+                result = received or self._died_twice(task)
                 if result.status == "interrupted":
                     status.stopped = status.stopped or INTERRUPTED
                 self._results.add(task.identity, result)
@@ -165,11 +166,30 @@ class _Runner:
             task = self._waiting[0]
             status.stopped = self._limit(status, task)
             if not status.stopped:
-                self._workers.submit(self._waiting.popleft())
+                self._waiting.popleft()
+                self._workers.submit(replace(task, run_id=task.run_id or self._created(task)))
                 status.running += 1
                 if task.identity not in self._retried:
                     status.begun += 1
                     status.resumed += bool(task.run_id)
+
+    def _created(self, task: Task) -> str:
+        """Create the run of a task, interrupted before its first step; return its id.
+
+        A worker could be killed between creating a run and telling the sweep, and its run would be lost.
+        """
+        labels = Labels(tags=tuple(sorted((tag_of(self._sweep.name), f"trial={task.trial}"))))
+        facts = task.config, task.seed, self._sweep.name
+        return new_run(self._recordings, *facts, labels=labels, status="interrupted").run_id
+
+    def _died_twice(self, task: Task) -> Result:
+        """Return the result of a task whose worker died twice; remove its run if it has no recording."""
+        folder = self._recordings / task.run_id
+        run = run_in(folder)
+        if run is not None and run.recording.exists():
+            return Result("failed", task.run_id, error="its worker died twice")
+        shutil.rmtree(folder, ignore_errors=True)
+        return Result("failed", error="its worker died twice")
 
     def _add(self, trial: Trial, seed: int, result: Result) -> None:
         """Add a result to a trial and to the status."""

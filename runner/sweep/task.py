@@ -1,9 +1,12 @@
-"""One run of a sweep, as a worker runs it: started, resumed, or only read if it is over."""
+"""One run of a sweep, as a worker runs it: started, resumed, or only read if it is over.
+
+A worker may be killed at any moment, and its task is then run again. Therefore the sweep creates the folder
+of a run before a worker starts it, and whatever a worker leaves there is continued.
+"""
 
 from __future__ import annotations
 
 import json
-import secrets
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -20,14 +23,16 @@ from runner.environments.mdp import Mdp
 from runner.errors import RecordingError, RunnerError
 from runner.execution.resume import resume
 from runner.execution.session import Progress, run_job
-from runner.recording.labels import Labels, change_labels
+from runner.recording.labels import LABELS_FILE, Labels, change_labels
+from runner.recording.liveness import owner
 from runner.recording.reader import open_recording
+from runner.runs.locking import locked
 from runner.runs.resolve import find_run
-from runner.runs.run import Run, create_run, list_runs, unless_empty
+from runner.runs.run import RUN_FILE, Run, unless_empty
 from runner.sweep.model import Objective
 from runner.sweep.objective import Curve, curve_of, readings, should_prune
 from runner.sweep.state import PRUNED, is_over
-from runner.util.files import storage_errors
+from runner.util.files import replacing, storage_errors
 
 
 @dataclass(frozen=True)
@@ -38,14 +43,14 @@ class Task:
     """The identity of its job."""
     seed: int
     config: dict[str, Any]
-    name: str
-    tags: tuple[str, ...]
+    trial: int
+    """The number of the trial."""
     recordings: str
     objective: Objective
     bounds: Mapping[int, float] = field(default_factory=dict)
     """By episode, the bound below which the run is pruned."""
     run_id: str = ""
-    """The existing run to resume; empty to start a new one."""
+    """The run; empty until the sweep creates it, which is before a worker gets the task."""
     accept_changes: bool = False
     """Whether to resume a run that other code started."""
     on_own_disk: bool = False
@@ -81,43 +86,46 @@ def run_task(task: Task, stop: Callable[[], bool]) -> Result:
         run = _run(task, stop)
         return result_of(run, task.objective) if is_over(run) else Result("interrupted", run.run_id)
     except RunnerError as error:
-        return Result("failed", task.run_id, error=str(error))
+        exists = (Path(task.recordings) / task.run_id).is_dir()
+        return Result("failed", task.run_id if exists else "", error=str(error))
 
 
 def _run_on_own_disk(task: Task, stop: Callable[[], bool]) -> Result:
-    """Run a task in a temporary folder of this machine; then move its run into the recordings."""
-    recordings = Path(task.recordings)
-    with storage_errors(recordings), tempfile.TemporaryDirectory(prefix="dualtaxi-sweep-") as folder:
-        own = Path(folder)
-        if task.run_id:
-            shutil.copytree(recordings / task.run_id, own / task.run_id)
+    """Run a task in a temporary folder of this machine; then move its files into the recordings."""
+    target, prefix = Path(task.recordings) / task.run_id, f"dualtaxi-sweep-{task.run_id}-"
+    for left in Path(tempfile.gettempdir()).glob(f"{prefix}*"):  # by a worker that was killed
+        shutil.rmtree(left, ignore_errors=True)
+    with storage_errors(target), tempfile.TemporaryDirectory(prefix=prefix) as folder:
+        own = Path(folder) / task.run_id
+        shutil.copytree(target, own)
         result = run_task(replace(task, recordings=folder, on_own_disk=False), stop)
-        for run in list_runs(own):
-            move_whole(run.folder, recordings)
+        if own.is_dir():
+            move_files(own, target)
+            if result.status == "pruned":
+                _mark_pruned(target)
+        else:  # nothing was recorded
+            shutil.rmtree(target)
     return result
 
 
-def move_whole(run: Path, recordings: Path) -> None:
-    """Copy a run's folder into the recordings, where it replaces an older copy at once.
+def move_files(own: Path, target: Path) -> None:
+    """Replace the files of a run by those of a copy that was continued; labels stay as they are.
+
+    Each file is replaced atomically, `run.json` last: a run that was moved in part is as good as one whose
+    process was killed.
 
     Raises:
-        OSError: it cannot be copied; the older copy stays.
+        OSError: a file cannot be replaced.
     """
-    target, suffix = recordings / run.name, secrets.token_hex(4)
-    fresh, old = (recordings / f".{run.name}.{suffix}.{kind}" for kind in ("fresh", "old"))
-    try:
-        shutil.copytree(run, fresh)
-        if target.exists():
-            target.rename(old)
-        try:
-            fresh.rename(target)
-        except OSError:
-            if old.exists():
-                old.rename(target)
-            raise
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
-    shutil.rmtree(old, ignore_errors=True)
+
+    def names(folder: Path) -> set[str]:
+        return {path.name for path in folder.iterdir() if path.name != LABELS_FILE and path.suffix != ".lock"}
+
+    for name in sorted(names(own), key=lambda name: name == RUN_FILE):
+        with replacing(target / name) as fresh:
+            shutil.copyfile(own / name, fresh)
+    for name in names(target) - names(own):  # a replacement that is complete, or what a killed worker copied
+        (target / name).unlink()
 
 
 def result_of(run: Run, objective: Objective) -> Result:
@@ -149,25 +157,27 @@ def _curve_of(path: Path, size: int, modified: int, metric: str) -> Curve:  # no
 
 
 def _run(task: Task, stop: Callable[[], bool]) -> Run:
-    recordings = Path(task.recordings)
-    run = find_run(task.run_id, recordings) if task.run_id else None
-    if run is not None and is_over(run):
+    run = find_run(task.run_id, Path(task.recordings))
+    if is_over(run):
         return run
     env = task.config["env"]
     mdp = _load_mdp(env["id"], json.dumps(env["kwargs"], sort_keys=True), task.config["rewards"])
     pruner = _Pruner(task, mdp, stop)
-    if run is not None:
+    if run.recording.exists():
         run = resume(run, task.accept_changes, pruner.report, pruner.stop)
     else:
         job = Job(from_mapping(task.config), task.seed)
-        run = create_run(recordings, job.config, task.seed, task.name)
-        with unless_empty(run):
-            change_labels(run.folder, lambda _: Labels(tags=tuple(sorted(task.tags))))
-            run = run_job(job, run, pruner.report, pruner.stop, mdp=mdp, threads=task.threads)
+        with locked(run) as new, unless_empty(new):
+            begun = new.update(status="running", owner=owner())
+            run = run_job(job, begun, pruner.report, pruner.stop, mdp=mdp, threads=task.threads)
     if pruner.is_pruned and run.status != "finished":
-        change_labels(run.folder, lambda now: Labels(now.name, (*now.tags, PRUNED), now.note))
+        _mark_pruned(run.folder)
         return Run(run.folder, run.facts)
     return run
+
+
+def _mark_pruned(folder: Path) -> None:
+    change_labels(folder, lambda now: Labels(now.name, (*now.tags, PRUNED), now.note))
 
 
 @lru_cache(maxsize=4)
