@@ -16,14 +16,20 @@ from pathlib import Path
 from typing import Any, Final
 
 import runner
+from runner.analysis.evaluations import (
+    EvaluationRecord,
+    TrainingRecord,
+    evaluation_records,
+    training_records,
+)
 
 CONFIGS: Final = Path(__file__).resolve().parent.parent / "configs"
 
-FINISHED = ("trials finished, of 200", lambda e: e["successes"], 0)
-LENGTH = ("mean length", lambda e: e["mean_length"], 1)
-PENALTIES = ("mean penalties", lambda e: e["mean_penalties"], 1)
-RECENT = ("recent training length", lambda e: e["training"]["mean_length"], 1)
-FILLED = ("filled, %", lambda e: min(e["training"]["percent_filled"].values()), 2)
+FINISHED = ("trials finished, of 200", lambda e: e.successes, 0)
+LENGTH = ("mean length", lambda e: e.value("mean_length"), 1)
+PENALTIES = ("mean penalties", lambda e: e.value("mean_penalties"), 1)
+RECENT = ("recent training length", lambda e: e.training.mean_length, 1)
+FILLED = ("filled, %", lambda e: min(e.training.percent_filled.values()), 2)
 MEASURES: Final = (FINISHED, LENGTH, PENALTIES, RECENT, FILLED)
 
 PUBLISHED: Final[dict[str, dict[int, Sequence[float | None]]]] = {
@@ -84,9 +90,9 @@ SLIPS: Final[dict[str, list[dict[str, bool]]]] = {
 class Outcome:
     """The metrics of one run."""
 
-    evaluations: dict[int, dict[str, Any]]
+    evaluations: dict[int, EvaluationRecord]
     """By number of training episodes."""
-    reports: list[dict[str, Any]]
+    reports: list[TrainingRecord]
 
 
 def run(job: str, overrides: Sequence[str], seeds: int) -> list[Outcome]:
@@ -97,9 +103,9 @@ def run(job: str, overrides: Sequence[str], seeds: int) -> list[Outcome]:
     with tempfile.TemporaryDirectory() as folder:
         for done in runner.run_all(config, overrides=changes, recordings=folder):
             with runner.open_recording(done.recording) as recording:
-                evaluations = runner.frames.evaluation_records(recording)
-                reports = runner.frames.training_records(recording)
-            outcomes.append(Outcome({e["episode"]: e for e in evaluations}, reports))
+                evaluations = evaluation_records(recording)
+                reports = training_records(recording)
+            outcomes.append(Outcome({e.episode: e for e in evaluations}, reports))
     return outcomes
 
 
@@ -120,7 +126,7 @@ def volatility(outcomes: list[Outcome]) -> str:
     """Return the mean change of the success rate between evaluations in the second half, in points."""
     changes = []
     for outcome in outcomes:
-        percent = [e["success_percent"] for _, e in sorted(outcome.evaluations.items())]
+        percent = [e.value("success_percent") for _, e in sorted(outcome.evaluations.items())]
         changes += [abs(after - before) for before, after in pairwise(percent[len(percent) // 2 :])]
     return f"{statistics.mean(changes):.1f}"
 
@@ -146,8 +152,8 @@ def print_moments(job: str, outcomes: list[Outcome]) -> None:
 def print_rewards(job: str, outcomes: list[Outcome]) -> None:
     """Print a published reward distribution and that of our nearest reports."""
     episode, published = REWARDS[job]
-    near = [min(o.reports, key=lambda report: abs(report["episode"] - episode)) for o in outcomes]
-    counts = [{c["reward"]: c["steps"] for c in report["reward_counts"]} for report in near]
+    near = [min(o.reports, key=lambda report: abs(report.episode - episode)) for o in outcomes]
+    counts = [dict(report.reward_counts) for report in near]
     rows = [
         (f"{reward:+}", f"{n:,}", spread([c.get(reward, 0) for c in counts], 0))
         for reward, n in sorted(published.items())
@@ -162,7 +168,7 @@ def print_curves(found: dict[str, list[Outcome]]) -> None:
     rows = []
     for job, outcomes in found.items():
         medians = [
-            f"{statistics.median(o.evaluations[episode]['success_percent'] for o in outcomes):.1f}"
+            f"{statistics.median(o.evaluations[episode].value('success_percent') for o in outcomes):.1f}"
             if episode in outcomes[0].evaluations
             else ""
             for episode in at
@@ -189,8 +195,8 @@ def print_corrections(seeds: int) -> None:
             changes = [f"quirks.{name}={str(value).lower()}" for name, value in corrected.items()]
             outcomes = run(job, ["evaluation={every: 100000, trials: 2880, start: each}", *changes], seeds)
             last = [outcome.evaluations[max(outcome.evaluations)] for outcome in outcomes]
-            percent = spread([evaluation["success_percent"] for evaluation in last], 1)
-            length = spread([evaluation["mean_length"] for evaluation in last], 1)
+            percent = spread([evaluation.value("success_percent") for evaluation in last], 1)
+            length = spread([evaluation.value("mean_length") for evaluation in last], 1)
             rows.append((job, " and ".join(corrected) or "nothing", percent, length))
     heads = ("job", "corrected", "success, %", "mean length")
     table("**From each of the 2,880 start states**, after training", heads, rows)

@@ -13,13 +13,92 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.metrics import METRICS, defined_metrics, finite_mean, is_usable
 from runner.recording.reader import Recording
+from runner.recording.run_file import EvaluationMetrics, RecentTraining, Summary
 from runner.util.values import finite
 
 RECENT_EPISODES: Final = 100
 """Training episodes that the summary of a loop averages, the last ones."""
 
-Record = dict[str, Any]
-"""The values of an evaluation or a report by name, as JSON can hold them."""
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """A report of training, or how far training was at an evaluation."""
+
+    episode: int
+    """Training episodes before it."""
+    step: int
+    """Training steps before it."""
+    mean_length: float | None
+    """None before the first episode ends."""
+    reward_counts: tuple[tuple[float, int], ...]
+    """Each reward of the last steps, and the number of steps that it was paid for."""
+    zero_cells: Mapping[str, int]
+    """By learner."""
+    percent_filled: Mapping[str, float]
+    """By learner."""
+    epsilon: float
+    step_size: float
+    discount: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the record as JSON can hold it."""
+        rewards = [{"reward": reward, "steps": steps} for reward, steps in self.reward_counts]
+        return {**vars(self), "reward_counts": rewards}
+
+
+@dataclass(frozen=True)
+class EvaluationRecord:
+    """The results of an evaluation; those of a loop are of the trials between two training episodes."""
+
+    number: int
+    episode: int
+    """Training episodes before it."""
+    trials: int
+    successes: int | None
+    """None if the environment does not define success."""
+    values: Mapping[str, Mapping[str, float | None]]
+    """Name of a metric to its values: by agent, or under the empty name; None where unknown."""
+    terminations: int
+    events: Mapping[str, int]
+    """Event to its count over all trials."""
+    training: TrainingRecord | None = None
+    """How far training was; None for a loop."""
+    not_finite: int = 0
+    """Number of values of a loop that are left out of the means, because they are not finite."""
+
+    def value(self, metric: str) -> float | None:
+        """Return the value of a metric, summed over agents; None if any is unknown."""
+        values = self.values[metric].values()
+        known = [value for value in values if value is not None]
+        return sum(known) if len(known) == len(values) else None
+
+    def summary(self) -> EvaluationMetrics:
+        """Return the figures that people quote."""
+        return EvaluationMetrics(
+            self.episode, self.trials, {metric.name: self.value(metric.name) for metric in METRICS}
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the record as JSON can hold it, each metric under its `key`."""
+        training = self.training.as_json() if self.training else {}
+        position = {"episode": self.episode} | ({"step": training.pop("step")} if training else {})
+        training.pop("episode", None)
+        return {
+            "evaluation": self.number,
+            **position,
+            "trials": self.trials,
+            "successes": self.successes,
+            **{
+                metric.key: dict(self.values[metric.name])
+                if metric.per_agent
+                else self.values[metric.name][""]
+                for metric in METRICS
+            },
+            "terminations": self.terminations,
+            **({} if training else {"not_finite": self.not_finite}),
+            "events": dict(self.events),
+            **({"training": training} if training else {}),
+        }
 
 
 @dataclass(frozen=True)
@@ -94,15 +173,11 @@ def evaluation_after(evaluations: Sequence[Evaluation], episodes: int, where: st
     raise RecordingError(f"{where}: found no evaluation after {episodes:,} episodes; {known}")
 
 
-def evaluation_records(recording: Recording) -> list[Record]:
+def evaluation_records(recording: Recording) -> list[EvaluationRecord]:
     """Return the evaluations of a recording, in order.
 
-    Each has `episode` (training episodes before it), the metrics by their keys (`success_percent`,
-    `mean_length`, ...; None where the environment does not define them), `events` by name, summed over the
-    trials, and under `training` the values of `training_records`.
-
-    The evaluations of a loop are its evaluation episodes between two training episodes. They have neither
-    `step` nor `training`; values that are not finite are left out of the means and counted in `not_finite`.
+    The evaluations of a loop are its evaluation episodes between two training episodes; values that are not
+    finite are left out of their means.
     """
     agents, events = recording.agents, recording.event_names
     if recording.is_job:
@@ -111,101 +186,89 @@ def evaluation_records(recording: Recording) -> list[Record]:
     return [_loop_record(recording, one, trials[one.start : one.stop]) for one in evaluations_of(recording)]
 
 
-def evaluation_record(metrics: Mapping[str, Any], agents: Sequence[str], events: Sequence[str]) -> Record:
-    """Return the recorded metrics of a job's evaluation under the names of `evaluation_records`."""
+def evaluation_record(
+    metrics: Mapping[str, Any], agents: Sequence[str], events: Sequence[str]
+) -> EvaluationRecord:
+    """Return the record of a job's evaluation from its message, in which NaN stands for unknown."""
+    return EvaluationRecord(
+        number=metrics["evaluation"],
+        episode=metrics["episode"],
+        trials=metrics["trials"],
+        successes=metrics["successes"] if metrics["successes"] >= 0 else None,
+        values={
+            each.name: dict(zip(agents, map(finite, metrics[each.field]), strict=True))
+            if each.per_agent
+            else {"": finite(metrics[each.field])}
+            for each in METRICS
+        },
+        terminations=metrics["terminations"],
+        events=dict(zip(events, metrics["events"], strict=True)),
+        training=_training_record(metrics, agents),
+    )
 
-    def known(value: Any) -> Any:  # NaN stands for unknown
-        return dict(zip(agents, value, strict=True)) if isinstance(value, list) else finite(value)
 
-    return {
-        "evaluation": metrics["evaluation"],
-        "episode": metrics["episode"],
-        "step": metrics["step"],
-        "trials": metrics["trials"],
-        "successes": metrics["successes"] if metrics["successes"] >= 0 else None,
-        **{each.key: known(metrics[each.field]) for each in METRICS},
-        "terminations": metrics["terminations"],
-        "events": dict(zip(events, metrics["events"], strict=True)),
-        "training": _training_values(metrics, agents),
-    }
-
-
-def _loop_record(recording: Recording, evaluation: Evaluation, trials: NDArray[np.void]) -> Record:
+def _loop_record(recording: Recording, evaluation: Evaluation, trials: NDArray[np.void]) -> EvaluationRecord:
     agents, environment = recording.agents, recording.environment
     defined = defined_metrics(bool(environment["success_events"]), environment["penalty_below"] is not None)
-    values = {metric: metric.of_trials(trials) for metric in defined}
+    own = {metric.name: metric.of_trials(trials) for metric in defined}
+    unknown = np.empty(0)
     means = {
-        metric.key: dict(zip(agents, map(finite_mean, each.T), strict=True))
+        metric.name: dict(zip(agents, map(finite_mean, own[metric.name].T), strict=True))
         if metric.per_agent
-        else finite_mean(each)
-        for metric, each in values.items()
+        else {"": finite_mean(own.get(metric.name, unknown))}
+        for metric in METRICS
     }
     counts = trials["events"].sum(axis=0, dtype=int).tolist()
-    return {
-        "evaluation": evaluation.number,
-        "episode": evaluation.after,
-        "trials": len(trials),
-        "successes": int(trials["success"].sum()) if environment["success_events"] else None,
-        **{metric.key: means.get(metric.key) for metric in METRICS},
-        "terminations": int(trials["terminated"].sum()),
-        "not_finite": sum(int((~is_usable(each)).sum()) for each in values.values()),
-        "events": dict(zip(recording.event_names, counts, strict=True)),
-    }
+    return EvaluationRecord(
+        number=evaluation.number,
+        episode=evaluation.after,
+        trials=len(trials),
+        successes=int(trials["success"].sum()) if environment["success_events"] else None,
+        values=means,
+        terminations=int(trials["terminated"].sum()),
+        events=dict(zip(recording.event_names, counts, strict=True)),
+        not_finite=sum(int((~is_usable(each)).sum()) for each in own.values()),
+    )
 
 
-def evaluation_summary(record: Mapping[str, Any]) -> Record:
-    """Return the metrics of an evaluation record by name, summed over agents; None if any is unknown."""
-    summary = {"episode": record["episode"], "trials": record["trials"]}
-    for metric in METRICS:
-        value = record[metric.key]
-        if metric.per_agent:
-            value = None if None in value.values() else sum(value.values())
-        summary[metric.name] = value
-    return summary
-
-
-def training_records(recording: Recording) -> list[Record]:
+def training_records(recording: Recording) -> list[TrainingRecord]:
     """Return the reports of training of a job, in order."""
     agents = recording.agents
-    return [
-        {"episode": metrics["episode"], "step": metrics["step"]} | _training_values(metrics, agents)
-        for metrics in recording.metrics("train")
-    ]
+    return [_training_record(metrics, agents) for metrics in recording.metrics("train")]
 
 
-def _training_values(metrics: Mapping[str, Any], agents: Sequence[str]) -> Record:
-    """Return the progress of training in a report, or at an evaluation."""
-    rewards = zip(metrics["rewards"], metrics["reward_counts"], strict=True)
-    return {
-        "mean_length": finite(metrics["mean_length"]),  # unknown before the first episode ends
-        "reward_counts": [{"reward": reward, "steps": steps} for reward, steps in rewards],
-        "zero_cells": dict(zip(agents, metrics["zero_cells"], strict=True)),
-        "percent_filled": dict(zip(agents, metrics["percent_filled"], strict=True)),
-        **{name: metrics[name] for name in ("epsilon", "step_size", "discount")},
-    }
+def _training_record(metrics: Mapping[str, Any], agents: Sequence[str]) -> TrainingRecord:
+    return TrainingRecord(
+        episode=metrics["episode"],
+        step=metrics["step"],
+        mean_length=finite(metrics["mean_length"]),
+        reward_counts=tuple(zip(metrics["rewards"], metrics["reward_counts"], strict=True)),
+        zero_cells=dict(zip(agents, metrics["zero_cells"], strict=True)),
+        percent_filled=dict(zip(agents, metrics["percent_filled"], strict=True)),
+        epsilon=metrics["epsilon"],
+        step_size=metrics["step_size"],
+        discount=metrics["discount"],
+    )
 
 
-def loop_summary(recording: Recording) -> Record:
+def loop_summary(recording: Recording) -> Summary:
     """Return the last results of a loop, computed from its recording.
 
-    Keys: `last_evaluation` (an `evaluation_summary`, or None), `recent_training` with `episodes`,
-    `mean_length` and `mean_return` of the last `RECENT_EPISODES`, and `logged`, the last value logged under
-    each name. A value that is unknown or not finite is None.
+    It has `last_evaluation` (None without one), `recent_training`, over the last `RECENT_EPISODES`, and
+    `logged`, the last value logged under each name. A value that is unknown or not finite is None.
     """
     total = recording.count(schema.TRAIN_EPISODE)
     evaluations = evaluation_records(recording)
     recent = recording.episodes("train", max(0, total - RECENT_EPISODES), total)
     logged = (
-        dict(recording.result.logged)
+        recording.result.logged
         if "logged" in recording.result
         else {one["name"]: finite(one["value"]) for one in recording.decoded(schema.SCALAR_TOPIC)}
     )
-    return {
-        "last_evaluation": evaluation_summary(evaluations[-1]) if evaluations else None,
-        "recent_training": {
-            "episodes": len(recent),
-            "mean_length": finite_mean(recent["length"]),
-            "mean_return": finite_mean(recent["returns"].sum(axis=1)),
-        },
-        "logged": logged,
-    }
+    return Summary(
+        last_evaluation=evaluations[-1].summary() if evaluations else None,
+        recent_training=RecentTraining(
+            len(recent), finite_mean(recent["length"]), finite_mean(recent["returns"].sum(axis=1))
+        ),
+        logged=logged,
+    )

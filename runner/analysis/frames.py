@@ -54,7 +54,7 @@ def evaluations(run: Source) -> pd.DataFrame:
         RecordingError: the recording cannot be read.
     """
     with _opened(run) as recording:
-        records = [_flat(record) for record in evaluation_records(recording)]
+        records = [_flat(record.as_json()) for record in evaluation_records(recording)]
         return _frame([{_evaluation_column(key): value for key, value in each.items()} for each in records])
 
 
@@ -66,7 +66,7 @@ def training(run: Source) -> pd.DataFrame:
         RecordingError: the recording cannot be read.
     """
     with _opened(run) as recording:
-        return _frame([_flat(record) for record in training_records(recording)])
+        return _frame([_flat(record.as_json()) for record in training_records(recording)])
 
 
 def episodes(

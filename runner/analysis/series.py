@@ -11,7 +11,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.evaluations import evaluation_records, training_records
+from runner.analysis.evaluations import (
+    EvaluationRecord,
+    TrainingRecord,
+    evaluation_records,
+    training_records,
+)
 from runner.environments.naming import event_in_words, spoken
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
@@ -164,13 +169,13 @@ def read_series(recording: Recording) -> RunSeries:
     if recording.is_job:
         agents = recording.agents
         exact = {each["evaluation"]: exact_readings(each, agents) for each in recording.optimality()}
-        readings = [evaluation_readings(each) | exact.get(each["evaluation"], {}) for each in evaluations]
-        training = [(each["episode"], training_readings(each)) for each in training_records(recording)]
-        training += [(each["episode"], training_readings(each["training"])) for each in evaluations]
+        readings = [evaluation_readings(each) | exact.get(each.number, {}) for each in evaluations]
+        reports = [*training_records(recording), *(each.training for each in evaluations if each.training)]
+        training = [(each.episode, training_readings(each)) for each in reports]
     else:
         readings = [_single_agent_unnamed(evaluation_readings(each)) for each in evaluations]
         training = list(_loop_training(recording, not_finite).items())
-        if left_out := sum(each["not_finite"] for each in evaluations):
+        if left_out := sum(each.not_finite for each in evaluations):
             not_finite["mean_return"] = left_out
         own = config.get("config")
         if isinstance(own, Mapping) and own.get("seed") == recording.seed:  # as in vars(args)
@@ -181,24 +186,22 @@ def read_series(recording: Recording) -> RunSeries:
         seed=recording.seed,
         status=recording.status,
         config=config,
-        evaluation=[(each["episode"], own) for each, own in zip(evaluations, readings, strict=True)],
+        evaluation=[(each.episode, own) for each, own in zip(evaluations, readings, strict=True)],
         training=sorted(training, key=lambda entry: entry[0]),
         content_digest=recording.result.content_digest or "",
         not_finite=dict(not_finite),
     )
 
 
-def evaluation_readings(record: Mapping[str, Any]) -> Readings:
-    """Return the readings of a record of `evaluation_records`."""
+def evaluation_readings(record: EvaluationRecord) -> Readings:
+    """Return the readings of an evaluation."""
     readings: Readings = {}
-    for metric in METRICS:
-        value = record[metric.key]
-        lines = value if metric.per_agent else {"": value}
+    for name, lines in record.values.items():
         if known := {line: value for line, value in lines.items() if value is not None}:
-            readings[metric.name] = known
-    for name, count in record["events"].items():
+            readings[name] = known
+    for name, count in record.events.items():
         agent, _, kind = name.rpartition(".")
-        readings.setdefault(f"event.{kind}", {})[agent] = count / record["trials"]
+        readings.setdefault(f"event.{kind}", {})[agent] = count / record.trials
     return readings
 
 
@@ -216,20 +219,24 @@ def exact_readings(measures: Mapping[str, Any], agents: Sequence[str]) -> Readin
     return {f"exact.{name}": lines for name, lines in readings.items()}
 
 
-def training_readings(report: Mapping[str, Any]) -> Readings:
-    """Return the readings of a record of `training_records`, or of what an evaluation has of training."""
-    counts = {entry["reward"]: entry["steps"] for entry in report["reward_counts"]}
+def training_readings(report: TrainingRecord) -> Readings:
+    """Return the readings of a report of training."""
+    counts = dict(report.reward_counts)
     steps = sum(counts.values())
-    length = report["mean_length"]
+    length = report.mean_length
     readings: Readings = {} if length is None else {"training.mean_length": {"": length}}
     if steps:
         mean = sum(reward * count for reward, count in counts.items()) / steps
         readings["training.mean_reward"] = {"": mean}
         readings[SHARES] = {f"{r:g}": 100 * count / steps for r, count in counts.items()}
     return readings | {
-        "training.percent_filled": dict(report["percent_filled"]),
-        "training.zero_cells": dict(report["zero_cells"]),
-        "training.schedule": {spoken(key): report[key] for key in ("epsilon", "step_size", "discount")},
+        "training.percent_filled": dict(report.percent_filled),
+        "training.zero_cells": {agent: float(cells) for agent, cells in report.zero_cells.items()},
+        "training.schedule": {
+            "epsilon": report.epsilon,
+            spoken("step_size"): report.step_size,
+            "discount": report.discount,
+        },
     }
 
 

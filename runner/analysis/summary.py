@@ -1,63 +1,123 @@
-"""All about one run, as JSON can hold it: the output of `show --json` and of the service."""
+"""All about one run: what `show` and the service report."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
-from runner.analysis.evaluations import evaluation_records, loop_summary, training_records
+from runner.analysis.evaluations import (
+    EvaluationRecord,
+    TrainingRecord,
+    evaluation_records,
+    loop_summary,
+    training_records,
+)
 from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
+from runner.recording.run_file import Summary
 from runner.runs.run import Run
 
 
-def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Return all about a run; only the contents of `run.json` if its recording is missing or unreadable.
+@dataclass(frozen=True)
+class TableFill:
+    """How full a learner's Q-table is, as last reported; None where nothing was."""
+
+    agent: str
+    step: int | None = None
+    """Training steps before the report."""
+    zero_cells: int | None = None
+    percent_filled: float | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what is known, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class RunDetails:
+    """All about a run; of one whose recording is missing or unreadable the contents of `run.json`."""
+
+    run: Run
+    config: Mapping[str, Any]
+    episodes: int | None = None
+    train_steps: int | None = None
+    eval_steps: int | None = None
+    bytes: int = 0
+    """Size of the recording; 0 if it is missing or unreadable."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    success_events: tuple[str, ...] = ()
+    tables: tuple[TableFill, ...] = ()
+    evaluations: tuple[EvaluationRecord, ...] = ()
+    optimality: tuple[Mapping[str, Any], ...] = ()
+    """The exact measures of the evaluations."""
+    training: tuple[TrainingRecord, ...] = ()
+    loop: Summary | None = None
+    """The last results of a loop; None for a job."""
+
+    def facts(self) -> dict[str, Any]:
+        """Return everything but the series, as JSON can hold it."""
+        run, summary = self.run, self.run.summary
+        return {
+            "run_id": run.run_id,
+            "name": run.name,
+            "seed": run.seed if run.has_seed else None,
+            "status": run.status,
+            "created": run.created_text,
+            **({"damage": run.problem} if run.problem else {}),
+            "path": str(run.recording.absolute()),
+            "bytes": self.bytes,
+            "content_digest": summary.content_digest,
+            "topic_digests": dict(summary.topic_digests) if "topic_digests" in summary else None,
+            **{key: getattr(self, key) for key in ("episodes", "train_steps", "eval_steps")},
+            "seconds": summary.seconds,
+            "config": dict(self.config),
+            "provenance": dict(self.provenance),
+            "success_events": list(self.success_events),
+            "tables": [table.as_json() for table in self.tables],
+            "loop": None if self.loop is None else _loop_as_json(self.loop),
+        }
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything, as JSON can hold it."""
+        return self.facts() | {
+            "eval": [record.as_json() for record in self.evaluations],
+            "optimality": [dict(measures) for measures in self.optimality],
+            "train": [record.as_json() for record in self.training],
+        }
+
+
+def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> RunDetails:
+    """Return all about a run.
 
     Args:
         run: the run.
         report: called with a sentence if the recording cannot be read.
     """
+    summary, config = run.summary, run.file.config
     if run.recording.is_file():
         try:
             with open_recording(run.recording) as recording:
-                return describe_recorded(run, recording)
+                done = recording.done() | {key: summary[key] for key in recording.done() if key in summary}
+                return RunDetails(
+                    run,
+                    config if config == recording.config else recording.config,  # the former in better order
+                    **done,
+                    bytes=recording.size,
+                    provenance=recording.provenance,
+                    success_events=tuple(recording.environment["success_events"]),
+                    tables=_tables(recording),
+                    evaluations=tuple(evaluation_records(recording)),
+                    optimality=tuple(
+                        {key: value for key, value in measures.items() if key != "log_time"}
+                        for measures in recording.optimality()
+                    ),
+                    training=tuple(training_records(recording)),
+                    loop=None if recording.is_job else loop_summary(recording),
+                )
         except RecordingError as error:
             report(f"Only what run.json says: {error}")
-    summary_keys = ("content_digest", "train_steps", "eval_steps", "episodes", "seconds")
-    return {
-        **_identity(run),
-        **{key: run.summary.get(key) for key in summary_keys},
-        "bytes": 0,
-        "provenance": {},
-        **{key: [] for key in ("tables", "eval", "optimality", "train")},
-        "loop": None,
-        "config": dict(run.file.config),
-    }
-
-
-def describe_recorded(run: Run, recording: Recording) -> dict[str, Any]:
-    """Return all about a run whose recording is open."""
-    summary, config = run.summary, dict(run.file.config)
-    return {
-        **_identity(run),
-        "bytes": recording.size,
-        "content_digest": summary.content_digest,
-        "topic_digests": dict(summary.topic_digests) if "topic_digests" in summary else None,
-        **{key: summary.get(key, count) for key, count in recording.done().items()},
-        "seconds": summary.seconds,
-        "config": config if config == recording.config else recording.config,  # run.json has the better order
-        "provenance": recording.provenance,
-        "success_events": recording.environment["success_events"],
-        "tables": _tables(recording),
-        "eval": evaluation_records(recording),
-        "optimality": [
-            {key: value for key, value in measures.items() if key != "log_time"}
-            for measures in recording.optimality()
-        ],
-        "train": training_records(recording),
-        "loop": None if recording.is_job else loop_summary(recording),
-    }
+    return RunDetails(run, config, summary.episodes, summary.train_steps, summary.eval_steps)
 
 
 def random_policy_sentence(recording: Recording) -> str:
@@ -74,29 +134,22 @@ def random_policy_sentence(recording: Recording) -> str:
     return baseline.sentence if baseline else ""
 
 
-def _identity(run: Run) -> dict[str, Any]:
+def _loop_as_json(loop: Summary) -> dict[str, Any]:
+    last, recent = loop.last_evaluation, loop.recent_training
     return {
-        "run_id": run.run_id,
-        "name": run.name,
-        "seed": run.seed if run.has_seed else None,
-        "status": run.status,
-        "created": run.created_text,
-        **({"damage": run.problem} if run.problem else {}),
-        "path": str(run.recording.absolute()),
+        "last_evaluation": last.as_json() if last else None,
+        "recent_training": vars(recent) if recent else None,
+        "logged": dict(loop.logged),
     }
 
 
-def _tables(recording: Recording) -> list[dict[str, Any]]:
-    """Return the fill of each table as last reported; nothing of a loop, whose learning is its own."""
+def _tables(recording: Recording) -> tuple[TableFill, ...]:
+    """Return the fill of each table; nothing of a loop, whose learning is its own."""
     if not recording.is_job:
-        return []
+        return ()
     reports = [*recording.metrics("train"), *recording.metrics("eval")]
     last = max(reports, key=lambda report: report["step"], default=None)
     if last is None:
-        return [{"agent": agent} for agent in recording.agents]
-    return [
-        {"agent": agent, "step": last["step"], "zero_cells": zero, "percent_filled": filled}
-        for agent, zero, filled in zip(
-            recording.agents, last["zero_cells"], last["percent_filled"], strict=True
-        )
-    ]
+        return tuple(map(TableFill, recording.agents))
+    fill = zip(recording.agents, last["zero_cells"], last["percent_filled"], strict=True)
+    return tuple(TableFill(agent, last["step"], zero, filled) for agent, zero, filled in fill)

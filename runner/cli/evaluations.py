@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from runner.cli.output import UNBOUNDED, table
 from runner.environments.naming import spoken
@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from runner.analysis.evaluations import EvaluationRecord
+
 MAX_SHOWN: Final = 20
 """Evaluations in the summary of a run."""
 _DISPENSABLE: Final = ("pickup",)
 """Events left out first where a terminal is narrow, because they follow from others."""
 
-Record = Mapping[str, Any]
 Columns = dict[str, list[str]]
 """Heading to cells."""
 
@@ -32,20 +33,22 @@ class _Event(NamedTuple):
     is_success: bool
 
 
-def spread(records: Sequence[Record]) -> list[Record]:
+def spread(records: Sequence[EvaluationRecord]) -> list[EvaluationRecord]:
     """Return at most `MAX_SHOWN` evaluations, evenly spread, with the first and the last."""
     if len(records) <= MAX_SHOWN:
         return list(records)
     return [records[round(i * (len(records) - 1) / (MAX_SHOWN - 1))] for i in range(MAX_SHOWN)]
 
 
-def evaluation_table(records: Sequence[Record], success_events: Sequence[str], console: Console) -> Table:
+def evaluation_table(
+    records: Sequence[EvaluationRecord], success_events: Sequence[str], console: Console
+) -> Table:
     """Return the table of evaluations.
 
     Successes are shown for each agent (`12/9`), other events summed over the agents. Events that do not fit
     the terminal are left out, and named in the caption.
     """
-    events = _events(records[0]["events"], success_events)
+    events = _events(records[0].events, success_events)
     unbounded = console.options.update(width=UNBOUNDED)
     left_out: list[str] = []
     while True:
@@ -69,26 +72,25 @@ def _events(names: Iterable[str], success_events: Sequence[str]) -> list[_Event]
     return sorted(events, key=lambda event: (not event.is_success, len(event.names)))
 
 
-def _measures(records: Sequence[Record]) -> Columns:
+def _measures(records: Sequence[EvaluationRecord]) -> Columns:
     """Return the columns of the metrics; of a loop also the returns, and only the metrics that it has."""
-    columns = {"episode": [f"{record['episode']:,}" for record in records]}
-    is_job = all("training" in record for record in records)
+    columns = {"episode": [f"{record.episode:,}" for record in records]}
+    is_job = all(record.training for record in records)
     if not is_job:
-        columns["trials"] = [f"{record['trials']:,}" for record in records]
+        columns["trials"] = [f"{record.trials:,}" for record in records]
     for metric in METRICS:
-        values = [record.get(metric.key) for record in records]
-        if metric.per_agent and not is_job:
-            columns[metric.heading] = ["/".join(map(number, own.values())) for own in values if own]
-        elif not metric.per_agent and (is_job or any(value is not None for value in values)):
-            columns[metric.heading] = [number(value) for value in values]
+        values = [record.values[metric.name].values() for record in records]
+        is_known = any(value is not None for own in values for value in own)
+        if not metric.per_agent if is_job else metric.per_agent or is_known:
+            columns[metric.heading] = ["/".join(map(number, own)) for own in values]
     return columns
 
 
-def _counts(records: Sequence[Record], events: Sequence[_Event]) -> Columns:
+def _counts(records: Sequence[EvaluationRecord], events: Sequence[_Event]) -> Columns:
     """Return how often each kind of event occurred."""
     columns = {}
     for event in events:
-        counts = [[record["events"][name] for name in event.names] for record in records]
+        counts = [[record.events[name] for name in event.names] for record in records]
         if event.is_success and len(event.names) > 1:
             agents = [name.rpartition(".")[0].rpartition("_")[2] for name in event.names]
             heading = f"{spoken(event.kind)} {'/'.join(agents)}"
@@ -98,11 +100,11 @@ def _counts(records: Sequence[Record], events: Sequence[_Event]) -> Columns:
     return columns
 
 
-def _fill(records: Sequence[Record]) -> Columns:
+def _fill(records: Sequence[EvaluationRecord]) -> Columns:
     """Return the share of non-zero table cells, in whole percent of several tables; empty for a loop."""
-    if not all("training" in record for record in records):
+    filled = [list(record.training.percent_filled.values()) for record in records if record.training]
+    if not filled:
         return {}
-    filled = [list(record["training"]["percent_filled"].values()) for record in records]
     digits = 0 if len(filled[0]) > 1 else 1
     return {"filled %": ["/".join(f"{percent:.{digits}f}" for percent in own) for own in filled]}
 

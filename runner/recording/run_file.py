@@ -49,6 +49,10 @@ class EvaluationMetrics:
         values = {metric.name: record.get(metric.name) for metric in METRICS}
         return cls(record.get("episode"), record.get("trials"), values)
 
+    def as_json(self) -> dict[str, float | None]:
+        """Return the figures by name."""
+        return {"episode": self.episode, "trials": self.trials, **self.values}
+
 
 @dataclass(frozen=True)
 class RecentTraining:

@@ -84,10 +84,10 @@ def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> 
         if kind == "optimality":
             found = list(recording.optimality())
         elif kind == "evaluations":
-            found = evaluation_records(recording)
+            found = [each.as_json() for each in evaluation_records(recording)]
         else:
             recording.require_job("a report of training", "Its metrics can be had all the same.")
-            found = training_records(recording)
+            found = [each.as_json() for each in training_records(recording)]
         shown = found[start:stop]
         if len(shown) > limit:
             raise too_many(len(shown), limit)

@@ -59,7 +59,9 @@ def readings(
         events: the events of the environment.
     """
     record = evaluation_record(metrics, agents, events)
-    by_metric = evaluation_readings(record) | training_readings(record["training"])
+    by_metric = evaluation_readings(record)
+    if record.training:
+        by_metric |= training_readings(record.training)
     if exact is not None:
         by_metric |= exact_readings(exact, agents)
     flat = {

@@ -239,7 +239,7 @@ def _print_run(run: Run, number: int, as_json: bool) -> None:
             show = command_for(run, "show")
             parts.append(f"{len(shown)} of {len(records)} evaluations; `{show}` has all.")
         parts.append("")
-    draw(*parts, facts(_result(run, records[-1]["episode"] if records else None)))
+    draw(*parts, facts(_result(run, records[-1].episode if records else None)))
     sys.stdout.flush()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -18,8 +19,9 @@ from runner.util.humanize import UNKNOWN, age, duration, number, size
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from runner.analysis.summary import RunDetails
     from runner.recording.reader import Recording
-    from runner.runs.run import Run
+    from runner.recording.run_file import Summary
 
 MAX_CYCLES: Final = 8
 """Cycles of states shown, in which episodes reach the step limit."""
@@ -45,79 +47,81 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     from runner.analysis.summary import describe_run
 
     run = restored(find(run_name, recordings))
-    values = describe_run(run, say)
+    details = describe_run(run, say)
     if as_json:
-        print_json(values)
+        print_json(details.as_json())
     else:
-        draw(*_parts(run, values))
+        draw(*_parts(details))
 
 
-def _parts(run: Run, values: dict[str, Any]) -> list[RenderableType]:
+def _parts(details: RunDetails) -> list[RenderableType]:
     from runner.analysis.summary import random_policy_sentence
     from runner.cli.evaluations import evaluation_table
     from runner.recording.reader import open_recording
 
-    parts: list[RenderableType] = [facts(_head(run, values))]
-    if values["eval"]:
-        parts += [title("Evaluations"), evaluation_table(values["eval"], values["success_events"], console())]
+    run = details.run
+    parts: list[RenderableType] = [facts(_head(details))]
+    if details.evaluations:
+        table = evaluation_table(details.evaluations, details.success_events, console())
+        parts += [title("Evaluations"), table]
         with stage_line("evaluating a random policy"), open_recording(run.recording) as recording:
             sentence = random_policy_sentence(recording)
         parts += [sentence] if sentence else []
-    if values["loop"]:
-        parts += [title("Last results"), facts(_loop_results(values["loop"]))]
-    if values["optimality"]:
+    if details.loop is not None:
+        parts += [title("Last results"), facts(_loop_results(details.loop))]
+    if details.optimality:
         with open_recording(run.recording) as recording:
-            measures = _optimality(recording, values["optimality"][-1])
+            measures = _optimality(recording, details.optimality[-1])
         parts += [title("Greedy policy, exactly"), facts(measures)]
-    if values["tables"]:
+    if details.tables:
         fill = {
-            each["agent"]: f"{each['percent_filled']:.1f} % filled, {each['zero_cells']:,} cells are still "
-            f"zero, after {each['step']:,} steps"
-            if "step" in each
-            else UNKNOWN
-            for each in values["tables"]
+            each.agent: UNKNOWN
+            if each.step is None
+            else f"{each.percent_filled:.1f} % filled, {each.zero_cells:,} cells are still zero, "
+            f"after {each.step:,} steps"
+            for each in details.tables
         }
         parts += [title("Tables"), facts(fill)]
-    config = {key: _yaml(value) for key, value in values["config"].items()}
+    config = {key: _yaml(value) for key, value in details.config.items()}
     parts += [title("Configuration"), facts(config)]
-    if values["provenance"]:
-        parts += [title("Provenance"), facts(values["provenance"])]
+    if details.provenance:
+        parts += [title("Provenance"), facts(details.provenance)]
     return parts
 
 
-def _head(run: Run, values: dict[str, Any]) -> dict[str, str]:
+def _head(details: RunDetails) -> dict[str, str]:
+    run, summary = details.run, details.run.summary
     ago = age((datetime.now(UTC) - run.created).total_seconds())
-    took = "" if values["seconds"] is None else f", took {duration(values['seconds'])}"
+    took = "" if summary.seconds is None else f", took {duration(summary.seconds)}"
     steps = ""
-    if None not in (values["train_steps"], values["episodes"], values["eval_steps"]):
-        steps = f"{values['train_steps']:,} of training in {values['episodes']:,} episodes, "
-        steps += f"{values['eval_steps']:,} of evaluation"
+    if not (details.train_steps is None or details.episodes is None or details.eval_steps is None):
+        steps = f"{details.train_steps:,} of training in {details.episodes:,} episodes, "
+        steps += f"{details.eval_steps:,} of evaluation"
     head = {
         "run": f"{run.run_id}  {run.title}",
-        "status": f"{values['status']}, begun {ago} ago{took}",
-        "damage": values.get("damage", ""),
-        "error": run.summary.error or "",
+        "status": f"{run.status}, begun {ago} ago{took}",
+        "damage": run.problem,
+        "error": summary.error or "",
         "steps": steps,
-        "digest": values["content_digest"] or f"{UNKNOWN} (written when a run ends properly)",
-        "file": f"{run.recording}  {size(values['bytes'])}" if values["bytes"] else "no recording",
+        "digest": summary.content_digest or f"{UNKNOWN} (written when a run ends properly)",
+        "file": f"{run.recording}  {size(details.bytes)}" if details.bytes else "no recording",
     }
     return {key: text for key, text in head.items() if text}
 
 
-def _loop_results(loop: dict[str, Any]) -> dict[str, str]:
+def _loop_results(loop: Summary) -> dict[str, str]:
     """Return the means of a loop's last training episodes and the values it logged last."""
-    recent = loop["recent_training"]
-    episodes = f"last {recent['episodes']:,} episodes" if recent["episodes"] > 1 else "one episode"
-    results = {"training": "no episode ended"}
-    if recent["episodes"]:
-        means = f"mean return {number(recent['mean_return'])}, mean length {number(recent['mean_length'])}"
+    results, recent = {"training": "no episode ended"}, loop.recent_training
+    if recent and recent.episodes:
+        episodes = f"last {recent.episodes:,} episodes" if recent.episodes > 1 else "one episode"
+        means = f"mean return {number(recent.mean_return)}, mean length {number(recent.mean_length)}"
         results["training"] = f"{means} ({episodes})"
-    for name, value in loop["logged"].items():
+    for name, value in loop.logged.items():
         results[f"logged {name}"] = "not finite" if value is None else f"{value:,.6g}"
     return results
 
 
-def _optimality(recording: Recording, measures: dict[str, Any]) -> dict[str, str]:
+def _optimality(recording: Recording, measures: Mapping[str, Any]) -> dict[str, str]:
     """Return the last exact measures, next to the optimum."""
     from runner.environments.naming import states_in_words
 

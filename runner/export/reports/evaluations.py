@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from runner.analysis.evaluations import EvaluationRecord
 from runner.analysis.sections import Grid
 from runner.environments.naming import event_in_words, spoken
 from runner.recording.metrics import METRICS
@@ -21,11 +21,13 @@ class EvaluationTable:
 
 
 def evaluation_table(
-    records: Sequence[Mapping[str, Any]], agents: Sequence[str], event_names: Sequence[str], is_job: bool
+    records: Sequence[EvaluationRecord], agents: Sequence[str], event_names: Sequence[str], is_job: bool
 ) -> EvaluationTable:
     """Return records of evaluations as a table; one of a loop leaves out metrics that it does not know."""
     metrics = [
-        metric for metric in METRICS if is_job or any(record[metric.key] is not None for record in records)
+        metric
+        for metric in METRICS
+        if is_job or any(record.value(metric.name) is not None for record in records)
     ]
     headings = ["episode"] if is_job else ["episode", "trials"]
     for metric in metrics:
@@ -34,16 +36,15 @@ def evaluation_table(
     headings += [_event_heading(name) for name in event_names]
     rows = []
     for record in records:
-        cells = [f"{record['episode']:,}"] if is_job else [f"{record['episode']:,}", f"{record['trials']:,}"]
+        cells = [f"{record.episode:,}"] if is_job else [f"{record.episode:,}", f"{record.trials:,}"]
         for metric in metrics:
-            value = record[metric.key]
-            cells += [humanize.number(each) for each in (value.values() if metric.per_agent else [value])]
-        cells += [f"{count:,}" for count in record["events"].values()]
-        if is_job:
-            cells.append("/".join(map(humanize.number, record["training"]["percent_filled"].values())))
+            cells += map(humanize.number, record.values[metric.name].values())
+        cells += [f"{count:,}" for count in record.events.values()]
+        if record.training:
+            cells.append("/".join(map(humanize.number, record.training.percent_filled.values())))
         rows.append(tuple(cells))
     explanation = (
-        f"Each row: {records[0]['trials']} trials with the greedy policy after that number of training "
+        f"Each row: {records[0].trials} trials with the greedy policy after that number of training "
         "episodes. Events are counted over all trials."
         if is_job
         else "Each row: the evaluation episodes of the loop after that number of training episodes. Events "

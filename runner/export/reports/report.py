@@ -9,9 +9,9 @@ import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
-from runner.analysis.evaluations import evaluation_records, evaluation_summary
+from runner.analysis.evaluations import EvaluationRecord, evaluation_records
 from runner.analysis.groups import groups_of
 from runner.analysis.series import RunSeries, read_series, values_left_out
 from runner.analysis.summary import random_policy_sentence
@@ -66,9 +66,8 @@ class ReportedRun:
     is_random: bool
     made_by: str
     """The program that recorded a loop; empty for a job."""
-    last: Mapping[str, Any] | None
-    """The record of the last evaluation."""
-    last_return: float | None
+    last: EvaluationRecord | None
+    """The last evaluation."""
     random_policy: str
     """A sentence on what a random policy achieves; empty if unknown."""
     has_steps: bool
@@ -166,7 +165,6 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> Reporte
         is_random=is_job and recording.config["algorithm"] == "random",
         made_by="" if is_job else recording.config["made_by"],
         last=evaluations[-1] if evaluations else None,
-        last_return=evaluation_summary(evaluations[-1])["mean_return"] if evaluations else None,
         random_policy=random_policy_sentence(recording),
         has_steps=recording.has_steps,
         evaluations=table,

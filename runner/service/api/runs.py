@@ -129,14 +129,14 @@ def summary_of(run: Run, settings: Settings) -> dict[str, Any]:
     """Return everything about a run except its series; only `run.json` if its recording cannot be read."""
     problems: list[str] = []
     error = run.summary.error
-    facts = describe_run(run, problems.append)
-    series = {name: facts.pop(name) for name in ("eval", "train", "optimality")}
+    details = describe_run(run, problems.append)
+    facts = details.facts()
     del facts["path"]
     return facts | {
         "tags": list(run.tags),
         "note": run.note,
-        "last_evaluation": (series["eval"] or [None])[-1],
-        "last_optimality": (series["optimality"] or [None])[-1],
+        "last_evaluation": details.evaluations[-1].as_json() if details.evaluations else None,
+        "last_optimality": details.optimality[-1] if details.optimality else None,
         "error": settings.without_folders(str(error)) if error else None,
         "problems": [settings.without_folders(problem) for problem in problems],
     }

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from runner.analysis.evaluations import loop_summary
 from runner.errors import RecordingError
 from runner.export.reports.rendering import View
 from runner.recording.reader import open_recording
-from runner.recording.run_file import EvaluationMetrics
+from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.runs.run import Run
 
 TABS: Final = (
@@ -64,18 +64,17 @@ def is_loop(run: Run) -> bool:
     return "made_by" in run.file.config
 
 
-def loop_results(run: Run) -> dict[str, Any]:
+def loop_results(run: Run) -> Summary:
     """Return the last results of a loop as `loop_summary` does; empty if the recording cannot be read."""
     try:
         with open_recording(run.recording) as recording:
             return loop_summary(recording)
     except RecordingError:
-        recent = {"episodes": 0, "mean_length": None, "mean_return": None}
-        return {"last_evaluation": None, "recent_training": recent, "logged": {}}
+        return Summary()
 
 
 def last_evaluation(run: Run) -> EvaluationMetrics:
     """Return the measures of the last evaluation of a run; all unknown without one."""
     if is_loop(run):
-        return EvaluationMetrics.of(loop_results(run)["last_evaluation"] or {})
+        return loop_results(run).last_evaluation or EvaluationMetrics()
     return run.summary.last_evaluation or EvaluationMetrics()

@@ -24,6 +24,7 @@ from runner.recording import schema
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
+from runner.recording.run_file import EvaluationMetrics, RecentTraining
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.api.replay import LONG
@@ -183,7 +184,7 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
         last = deque(recording.iter_metrics("eval"), MAX_EVALUATIONS)
         records = [evaluation_record(metrics, agents, events) for metrics in last]
         total = recording.count(recording.topic("/eval/metrics"))
-        links = [f"/runs/{run.run_id}/replay/eval/{record['episode']}/0" for record in records]
+        links = [f"/runs/{run.run_id}/replay/eval/{record.episode}/0" for record in records]
     else:
         every = evaluation_records(recording)
         records, total, links = every[-MAX_EVALUATIONS:], len(every), []
@@ -244,7 +245,7 @@ def _status(run: Run, jobs: JobPool, settings: Settings) -> Status:
     number, live = _job_of(run, jobs)
     summary = live or run.summary
     episodes = summary.get("episode", summary.get("episodes"))
-    facts = _results(run, summary.get("last_evaluation") or {}) | {
+    facts = _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
         "Training episodes": humanize.number(episodes, 0),
         "Training steps": humanize.number(summary.get("train_steps"), 0),
         "Evaluation steps": humanize.number(summary.get("eval_steps"), 0),
@@ -265,28 +266,29 @@ def _status(run: Run, jobs: JobPool, settings: Settings) -> Status:
     )
 
 
-def _results(run: Run, last: Mapping[str, Any]) -> dict[str, str]:
+def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
     """Return the last results of a run by name; of a loop, the known ones."""
 
-    def of_evaluation(values: Mapping[str, Any], names: Sequence[str]) -> dict[str, str]:
+    def of_evaluation(metrics: EvaluationMetrics, names: Sequence[str]) -> dict[str, str]:
         headings = {metric.name: metric.heading.capitalize() for metric in METRICS}
         return {
-            f"{headings[name]} in the last evaluation": humanize.number(values.get(name)) for name in names
+            f"{headings[name]} in the last evaluation": humanize.number(metrics.values.get(name))
+            for name in names
         }
 
     if not is_loop(run):
         return of_evaluation(last, [metric.name for metric in METRICS if not metric.per_agent])
     results = loop_results(run)
-    recent = results["recent_training"]
-    episodes = f"the last {recent['episodes']:,} training episodes"
+    recent = results.recent_training or RecentTraining(episodes=0)
+    episodes = f"the last {recent.episodes:,} training episodes"
     measures = {
-        **of_evaluation(results["last_evaluation"] or {}, [metric.name for metric in METRICS]),
-        f"Mean return of {episodes}": humanize.number(recent["mean_return"]),
-        f"Mean length of {episodes}": humanize.number(recent["mean_length"]),
+        **of_evaluation(results.last_evaluation or EvaluationMetrics(), [metric.name for metric in METRICS]),
+        f"Mean return of {episodes}": humanize.number(recent.mean_return),
+        f"Mean length of {episodes}": humanize.number(recent.mean_length),
     }
     logged = {
         f"Logged last: {name}": "not finite" if value is None else f"{value:,.4g}"
-        for name, value in islice(results["logged"].items(), MAX_LOGGED)
+        for name, value in islice(results.logged.items(), MAX_LOGGED)
     }
     return {name: text for name, text in measures.items() if humanize.UNKNOWN not in text} | logged
 

@@ -109,7 +109,7 @@ def test_where_success_is_unknown(corridor_run):
     assert {"return.agent"} <= set(frames.episodes(corridor_run))
     with runner.open_recording(corridor_run.recording) as recording:
         (first, *_) = evaluation_records(recording)
-    assert (first["success_percent"], first["successes"], first["events"]) == (None, None, {})
+    assert (first.value("success_percent"), first.successes, first.events) == (None, None, {})
 
 
 def test_the_transition_table():

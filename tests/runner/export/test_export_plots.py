@@ -47,7 +47,7 @@ def test_seeds_are_one_group_with_median_and_band(seeds):
     lengths = []
     for run in seeds:
         with open_recording(run.recording) as recording:
-            lengths.append([record["mean_length"] for record in evaluation_records(recording)])
+            lengths.append([record.value("mean_length") for record in evaluation_records(recording)])
     assert curve.episodes.tolist() == [0, 20, 40]
     assert curve.median.tolist() == [median(each) for each in zip(*lengths, strict=True)]
     assert curve.low.tolist() == [min(each) for each in zip(*lengths, strict=True)]

@@ -71,10 +71,10 @@ def test_the_summary_of_a_loop_equals_that_of_its_recording(folder, name):
     run = runner.find_run(name, folder)
     with open_recording(run.recording) as recording:
         counted = loop_summary(recording)
-        assert counted["last_evaluation"] == pytest.approx(recording.result["last_evaluation"])
-        assert counted["recent_training"] == pytest.approx(recording.result["recent_training"])
+        assert counted.last_evaluation.as_json() == pytest.approx(recording.result["last_evaluation"])
+        assert vars(counted.recent_training) == pytest.approx(recording.result["recent_training"])
         recording.result = Summary()  # as in recordings made before, which say nothing of logged values
-        assert loop_summary(recording)["logged"] == counted["logged"]
+        assert loop_summary(recording).logged == counted.logged
 
 
 def test_a_report_of_a_loop_has_no_learning_section(folder, tmp_path):
