@@ -50,6 +50,18 @@ def action_names(mdp: Mdp) -> list[list[str]] | None:
     return [names for _ in mdp.agents]
 
 
+def deeds_in_words(mdp: Mdp) -> list[str]:
+    """Return every joint action as text, with its agents: `taxi 1 south, taxi 2 pickup`."""
+    words = [str(word) for word in actions_in_words(mdp)]
+    if len(mdp.agents) < 2 or action_names(mdp) is None:
+        return words
+    names = [spoken(agent) for agent in mdp.agents]
+    return [
+        ", ".join(f"{name} {own}" for name, own in zip(names, word.split(" + "), strict=True))
+        for word in words
+    ]
+
+
 def numbered_actions(mdp: Mdp) -> list[list[str]]:
     """Return the names of each agent's actions; `action 3` where the scene does not name them."""
     return action_names(mdp) or [[f"action {i}" for i in range(count)] for count in mdp.action_counts]

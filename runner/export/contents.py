@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Final
 
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.util.values import flatten, is_whole
+
+ENDINGS: Final = {
+    "success": "ended in success",
+    "terminated": "ended",
+    "truncated": "ended by the step limit",
+    "reset": "reset before its end",
+    "cut off": "cut off with the recording",
+}
+"""How an episode may end, and its description."""
 
 Ranges = tuple[tuple[int, int | None], ...]
 """Ranges of episodes: the first, and the one after the last or None for the end."""
@@ -50,6 +59,16 @@ def why_no_steps(recording: Recording) -> str:
             f"they were left out (recording.steps: none); `dualtaxi rerecord {recording.run_id}` records them"
         )
     return "it ended before one was recorded"
+
+
+def ending_of(recording: Recording, phase: str, number: int, last: Any) -> str:
+    """Return how an episode ended, a key of `ENDINGS`, from its last step."""
+    if not (last["terminated"] or last["truncated"]):
+        return "reset" if number < recording.count(recording.topic(f"/{phase}/episode")) else "cut off"
+    record = recording.episodes(phase, number, number + 1)
+    if len(record) and record[0]["success"]:
+        return "success"
+    return "terminated" if last["terminated"] else "truncated"
 
 
 def whole_ranges(

@@ -20,9 +20,15 @@ import numpy as np
 
 from runner.drawing import palette, svg
 from runner.environments.mdp import Mdp
-from runner.environments.naming import events_in_words, exploration_in_words, spoken, states_in_words
+from runner.environments.naming import (
+    deeds_in_words,
+    events_in_words,
+    exploration_in_words,
+    spoken,
+    states_in_words,
+)
 from runner.errors import RecordingError
-from runner.export.reports.episode import Episode, deeds_in_words
+from runner.export.reports.episode import Episode
 from runner.recording.reader import Recording
 from runner.util.extras import missing, require
 

@@ -220,9 +220,16 @@ class Recording(RunDescription):
 
     def blocks_of_episodes(self, phase: str, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
         """Yield the steps of the episodes number `start` up to `stop`; None for all that follow."""
-        steps = self._chunks(self.topic(f"/{phase}/step"))
-        end = None if stop is None else steps.first_from("episode", stop)
-        return steps.blocks(steps.first_from("episode", start), end)
+        steps = self.topic(f"/{phase}/step")
+        end = None if stop is None else self.first_from(steps, "episode", stop)
+        return self.blocks(steps, self.first_from(steps, "episode", start), end)
+
+    def first_from(self, topic: Topic, field: str, value: int) -> int:
+        """Return the number of a fixed-width topic's first message of that value or more.
+
+        The values of the field must never decrease.
+        """
+        return self._chunks(topic).first_from(field, value)
 
     def messages(self, topic: Topic, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
         """Yield (log time in nanoseconds, payload) of a topic's messages, in order."""

@@ -25,10 +25,9 @@ from runner.analysis.sections import Grid, Section
 from runner.analysis.series import read_series
 from runner.drawing import svg, svg_maps
 from runner.environments.mdp import Mdp
-from runner.environments.naming import exploration_in_words, spoken, states_in_words
+from runner.environments.naming import deeds_in_words, exploration_in_words, spoken, states_in_words
 from runner.export.plots.comparisons import tables_svg
 from runner.export.plots.curves import Plot, plots_of
-from runner.export.reports.episode import deeds_in_words
 from runner.export.reports.maps import situation, situation_in_words
 from runner.export.reports.rendering import LegendEntry, Link, View, render
 from runner.recording.reader import Recording

@@ -16,9 +16,9 @@ from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.drawing import svg
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import (
-    action_names,
     actions_in_words,
     agent_actions,
+    deeds_in_words,
     event_in_words,
     numbered_actions,
     spoken,
@@ -26,7 +26,7 @@ from runner.environments.naming import (
     trial_in_words,
 )
 from runner.errors import RecordingError
-from runner.export.contents import require_steps
+from runner.export.contents import ENDINGS, ending_of, require_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.steps import check_steps
@@ -50,7 +50,7 @@ class Episode:
     total: float
     """Sum of the rewards of the whole episode."""
     ended: str
-    """`success`, `terminated`, `truncated`, `reset` (before its end) or `cut off`."""
+    """A key of `ENDINGS`."""
     states: NDArray[np.int64]
     actions: NDArray[np.int64]
     rewards: NDArray[np.float64]
@@ -91,10 +91,7 @@ class Episode:
     @property
     def outcome(self) -> str:
         """Length, end and return as text."""
-        words = {"success": "ended in success", "terminated": "ended", "truncated": "ended by the step limit"}
-        words["reset"] = "reset before its end"
-        ended = words.get(self.ended, "cut off with the recording")
-        return f"{self.length:,} steps, {ended}. Rewards sum to {self.total:g}."
+        return f"{self.length:,} steps, {ENDINGS[self.ended]}. Rewards sum to {self.total:g}."
 
 
 def training_episode(recording: Recording, number: int, limit: int = MAX_STEPS, first: int = 0) -> Episode:
@@ -137,18 +134,6 @@ def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
         (-records["length"].astype(np.int64), records["returns"].sum(axis=1), records["success"])
     )
     return int(order[0]), int(order[len(order) // 2]), int(order[-1])
-
-
-def deeds_in_words(mdp: Mdp) -> list[str]:
-    """Return every joint action as text, with its agents: `taxi 1 south, taxi 2 pickup`."""
-    words = [str(word) for word in actions_in_words(mdp)]
-    if len(mdp.agents) < 2 or action_names(mdp) is None:
-        return words
-    names = [spoken(agent) for agent in mdp.agents]
-    return [
-        ", ".join(f"{name} {own}" for name, own in zip(names, word.split(" + "), strict=True))
-        for word in words
-    ]
 
 
 def typical_trial(recording: Recording) -> tuple[int, int]:
@@ -237,7 +222,7 @@ def _episode(
         number=number,
         length=len(steps),
         total=float(steps["rewards"].sum()),
-        ended=_end(recording, phase, number, last),
+        ended=ending_of(recording, phase, number, last),
         states=np.append(shown["state"], shown["next_state"][-1]).astype(np.int64),
         actions=shown["action"].astype(np.int64),
         rewards=shown["rewards"].astype(np.float64),
@@ -247,15 +232,6 @@ def _episode(
         first=part.start,
         before=tuple(steps["rewards"][: part.start].sum(axis=0).tolist()) if part.start else (),
     )
-
-
-def _end(recording: Recording, phase: str, number: int, last: np.void) -> str:
-    if not (last["terminated"] or last["truncated"]):
-        return "reset" if number < recording.count(recording.topic(f"/{phase}/episode")) else "cut off"
-    record = recording.episodes(phase, number, number + 1)
-    if len(record) and record[0]["success"]:
-        return "success"
-    return "terminated" if last["terminated"] else "truncated"
 
 
 def _values(

@@ -1,0 +1,180 @@
+"""Drawings as pixels: SVG rendered by resvg, and the grid of a scene composed of cached parts.
+
+Everything that never moves, and each thing, is rendered once, from the SVG of `drawing.svg`; Pillow composes
+a picture of these parts and of trails. The font is the one that Matplotlib includes, so that a picture looks
+the same everywhere.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+import math
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.drawing import palette, svg
+from runner.util.extras import missing, require
+
+if TYPE_CHECKING:
+    from PIL import Image
+    from PIL.ImageFont import FreeTypeFont
+
+Pixels = NDArray[np.uint8]
+"""A picture: [height, width, 3], red, green and blue."""
+
+_SPRITE: Final = 130
+"""Side of the square in which a thing is drawn, in hundredths of a cell."""
+_FINE: Final = 4
+"""Trails are drawn at this multiple of the resolution, for smooth edges."""
+_PURPOSE: Final = "a picture"
+
+
+def require_packages() -> None:
+    """Check that the packages that draw pictures are installed.
+
+    Raises:
+        MissingExtra: one is not.
+    """
+    require("resvg_py", "PIL", extra="plots", purpose=_PURPOSE)
+    _fonts()
+
+
+class SceneRaster:
+    """Draws states of a scene as pixels.
+
+    Args:
+        drawing: the drawing of the scene.
+        width: the largest width of a picture in pixels.
+        height: the largest height of a picture in pixels.
+    """
+
+    def __init__(self, drawing: svg.Drawing, width: int, height: int) -> None:
+        self._drawing = drawing
+        self._scale = min(width / drawing.width, height / drawing.height)
+        self._size = round(drawing.width * self._scale), round(drawing.height * self._scale)
+        self._sprites: dict[tuple[int, int], Image.Image] = {}
+        self._segments: dict[tuple[int, ...], tuple[int, int, Pixels]] = {}
+
+    @functools.cached_property
+    def _ground(self) -> Image.Image:
+        """The cells, landmarks and walls on white."""
+        from PIL import Image
+
+        cells = _rendered(
+            self._drawing.still(), f"0 0 {self._drawing.width} {self._drawing.height}", *self._size
+        )
+        ground = Image.new("RGB", self._size, palette.WHITE)
+        ground.paste(cells, (0, 0), cells)
+        return ground
+
+    def draw(self, places: NDArray[np.int16]) -> Pixels:
+        """Return the picture of a state, and of the trail that leads there.
+
+        Args:
+            places: int16 [states, things, 3], as `Drawing.places` returns them: of the states so far, in
+                order, at least the last `svg.TRAIL`; the last one is shown.
+        """
+        picture = self._ground.copy()
+        trail = places[-svg.TRAIL :]
+        for mover in self._drawing.movers:
+            picture.paste(self._drawing.colour(mover), (0, 0), self._trail(trail[:, mover, :2]))
+        for thing in self._drawing.order():
+            x, y, percent = places[-1, thing].tolist()
+            if (thing, percent) not in self._sprites:
+                self._sprites[thing, percent] = self._sprite(thing, percent)
+            sprite = self._sprites[thing, percent]
+            left = round(x * self._scale - sprite.width / 2)
+            top = round(y * self._scale - sprite.height / 2)
+            picture.paste(sprite, (left, top), sprite)
+        return np.asarray(picture)
+
+    def _sprite(self, thing: int, percent: int) -> Image.Image:
+        """Return the picture of a thing at a size, centred on a transparent ground."""
+        pixels = math.ceil(_SPRITE * self._scale)
+        half = pixels / self._scale / 2
+        shape = f'<g transform="scale({percent / 100:g})">{self._drawing.shape(thing)}</g>'
+        return _rendered(shape, f"{-half} {-half} {2 * half} {2 * half}", pixels, pixels)
+
+    def _trail(self, points: NDArray[np.int16]) -> Image.Image:
+        """Return the coverage of each pixel by a trail through points [states, 2]."""
+        from PIL import Image
+
+        mask = np.zeros((self._size[1], self._size[0]), np.uint8)
+        for ends in {tuple(pair) for pair in np.column_stack([points[:-1], points[1:]]).tolist()}:
+            if ends not in self._segments:
+                self._segments[ends] = self._segment(ends)
+            x, y, cover = self._segments[ends]
+            part = mask[y : y + cover.shape[0], x : x + cover.shape[1]]
+            np.maximum(part, cover[: part.shape[0], : part.shape[1]], out=part)
+        return Image.fromarray(mask)
+
+    def _segment(self, ends: tuple[int, ...]) -> tuple[int, int, Pixels]:
+        """Return the corner of a line with round ends, and the coverage of the pixels from there."""
+        from PIL import Image, ImageDraw
+
+        scaled = np.array(ends, np.float64).reshape(2, 2) * self._scale
+        radius = svg.TRAIL_WIDTH * self._scale / 2
+        corner = np.maximum(np.floor(scaled.min(axis=0) - radius), 0)
+        width, height = np.ceil(scaled.max(axis=0) + radius - corner).astype(int).tolist()
+        large = Image.new("L", (width * _FINE, height * _FINE))
+        points = [tuple(point) for point in ((scaled - corner) * _FINE).tolist()]
+        pen, ink = ImageDraw.Draw(large), round(255 * svg.TRAIL_OPACITY)
+        pen.line(points, fill=ink, width=round(2 * radius * _FINE))
+        for point in points:
+            pen.circle(point, radius * _FINE, fill=ink)
+        return int(corner[0]), int(corner[1]), np.asarray(large.reduce(_FINE))
+
+
+def render_svg(picture: str, width: int, height: int) -> Image.Image:
+    """Return an SVG as an RGBA image of a width and a height in pixels."""
+    import resvg_py
+    from PIL import Image
+
+    files: list[Any] = [str(path) for path in _fonts()]
+    png = resvg_py.svg_to_bytes(
+        svg_string=picture,
+        width=width,
+        height=height,
+        font_files=files,
+        skip_system_fonts=True,
+        font_family="DejaVu Sans",
+    )
+    return Image.open(BytesIO(bytes(png))).convert("RGBA")
+
+
+@functools.cache
+def font(size: int, bold: bool = False) -> FreeTypeFont:
+    """Return DejaVu Sans of a size in pixels."""
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(_fonts()[bold]), size, layout_engine=ImageFont.Layout.BASIC)
+
+
+def shortened(text: str, width: float, size: int, bold: bool = False) -> str:
+    """Return a text that is at most `width` pixels wide, its end replaced by an ellipsis if it is longer."""
+    drawn, text = font(size, bold), text[: int(width)]
+    if drawn.getlength(text) <= width:
+        return text
+    while text and drawn.getlength(f"{text}…") > width:
+        text = text[:-1]
+    return f"{text}…"
+
+
+def _rendered(content: str, box: str, width: int, height: int) -> Image.Image:
+    """Return elements as an RGBA image of the part of the plane in a box."""
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" width="{width}" height="{height}">'
+    return render_svg(f"{head}<style>{svg.STYLE}</style>{content}</svg>", width, height)
+
+
+def _fonts() -> tuple[Path, Path]:
+    """Return the files of the regular and the bold font, without importing Matplotlib."""
+    found = importlib.util.find_spec("matplotlib")
+    if found is None or found.origin is None:
+        raise missing("matplotlib", "plots", _PURPOSE)
+    folder = Path(found.origin).parent / "mpl-data" / "fonts" / "ttf"
+    return folder / "DejaVuSans.ttf", folder / "DejaVuSans-Bold.ttf"

@@ -1,0 +1,108 @@
+"""Values of a loop's spaces for display: their numbers with names, images, texts, and any value in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.drawing.raster import Pixels
+from runner.recording.spaces import Leaf, leaves_of
+
+MAX_NUMBERS: Final = 64
+"""Leaves of more numbers are not shown number by number."""
+_FEW: Final = 8
+"""An array of at most so many numbers is written out in words."""
+_LEAST_SIDE: Final = 16
+"""An array of bytes is an image if it has at least this height and width."""
+
+
+class Values:
+    """What can be shown of the values of a space.
+
+    Args:
+        description: of the space, as the recording has it.
+        name: of a value that has no parts, such as `observation`.
+
+    Attributes:
+        names: of the numbers, in the order of `numbers_in`.
+        image: the part that is an image, the first one; None if there is none.
+    """
+
+    def __init__(self, description: Mapping[str, Any], name: str) -> None:
+        leaves = leaves_of(description, f"the {name} space")
+        self._leaves = [leaf for leaf in leaves if 0 < _count(leaf) <= MAX_NUMBERS]
+        self._texts = [leaf for leaf in leaves if leaf.dtype is None]
+        self.names = [each for leaf in self._leaves for each in _names(leaf, name)]
+        self.image = next((leaf for leaf in leaves if _is_image(leaf)), None)
+
+    def numbers_in(self, value: Any) -> NDArray[np.float64]:
+        """Return the numbers of a value, float64 [names]."""
+        parts = [np.asarray(_part(value, leaf), np.float64).ravel() for leaf in self._leaves]
+        return np.concatenate([np.empty(0), *parts])
+
+    def texts_in(self, value: Any) -> str:
+        """Return the texts of a value on one line."""
+        return ", ".join(f"{'.'.join(leaf.path)} {_part(value, leaf)!r}".strip() for leaf in self._texts)
+
+    def pixels_in(self, value: Any) -> Pixels:
+        """Return the image of a value as red, green and blue; of stacked ones the last."""
+        assert self.image is not None
+        pixels = np.asarray(_part(value, self.image))
+        while pixels.ndim > 3:
+            pixels = pixels[-1]
+        if pixels.ndim == 3 and pixels.shape[0] < _LEAST_SIDE:  # channels, or stacked pictures, first
+            pixels = np.moveaxis(pixels, 0, -1)
+        if pixels.ndim == 3:
+            pixels = pixels if pixels.shape[2] == 3 else pixels[..., -1]
+        return np.ascontiguousarray(np.stack([pixels] * 3, axis=-1) if pixels.ndim == 2 else pixels)
+
+
+def value_in_words(value: Any) -> str:
+    """Return a value of any space as text on one line: `3`, `[0.12 -0.5]`, `go 3, push [0.5]`.
+
+    Arrays of more than a few numbers are described by their shape.
+    """
+    if isinstance(value, np.void) and value.dtype.names:
+        value = {name: value[name] for name in value.dtype.names}
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {value_in_words(part)}" for name, part in value.items())
+    if isinstance(value, tuple):
+        return f"({', '.join(map(value_in_words, value))})"
+    if isinstance(value, str):
+        return repr(value)
+    array = np.asarray(value)
+    if array.size > _FEW:
+        return f"{array.dtype} [{', '.join(map(str, array.shape))}]"
+    if array.ndim:
+        return f"[{' '.join(f'{number:.3g}' for number in array.ravel().tolist())}]"
+    return f"{array.item():.3g}" if array.dtype.kind == "f" else f"{array.item()}"
+
+
+def _part(value: Any, leaf: Leaf) -> Any:
+    for key in leaf.path:
+        value = value[int(key) if isinstance(value, tuple) else key]
+    return value
+
+
+def _count(leaf: Leaf) -> int:
+    return 0 if leaf.dtype is None else math.prod(leaf.dtype.shape)
+
+
+def _names(leaf: Leaf, name: str) -> Iterator[str]:
+    """Yield a name for each number of a leaf: `position[0]`."""
+    own = ".".join(leaf.path) or name
+    shape = leaf.dtype.shape if leaf.dtype is not None else ()
+    for place in np.ndindex(shape):
+        yield f"{own}[{', '.join(map(str, place))}]" if place else own
+
+
+def _is_image(leaf: Leaf) -> bool:
+    """Return whether a leaf holds bytes of a picture: [height, width], perhaps with channels or stacked."""
+    if leaf.dtype is None or leaf.dtype.base != np.uint8:
+        return False
+    large = [side for side in leaf.dtype.shape if side >= _LEAST_SIDE]
+    return len(large) == 2 and len(leaf.dtype.shape) <= 4

@@ -1,0 +1,161 @@
+"""The pictures of an episode, against the recording, the environment's own pictures and the pages' SVG."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from PIL import Image
+
+import runner
+from runner.drawing.raster import render_svg
+from runner.drawing.svg import Drawing
+from runner.errors import RecordingError
+from runner.export.pictures import Source, pictures
+from runner.recording.reader import open_recording
+from tests.runner.loops.making import Rooms, make, play
+
+
+def recorded(folder, env, steps=60, **options):
+    """Return the recording of a random loop, opened, and the pictures that the environment drew."""
+    drawn = []
+
+    def render():
+        drawn[-1].append(env.render())
+
+    with runner.record(env, folder, **options) as rec:
+        for entry in play(rec, steps):
+            if entry[0] == "reset":
+                drawn.append([])
+            if env.render_mode == "rgb_array":
+                render()
+    return open_recording(rec.run.recording), drawn
+
+
+def test_there_is_a_picture_of_every_state_with_its_step(recording):
+    steps = recording.episode_steps("train", 3)
+    shown = list(pictures(recording, "train", 3))
+    assert [picture.t for picture in shown] == list(range(len(steps) + 1))
+    assert len({picture.pixels.shape for picture in shown}) == 1
+    assert not any(shown[0].rewards)
+    assert not shown[0].action
+    np.testing.assert_array_equal([picture.rewards for picture in shown[1:]], steps["rewards"])
+    np.testing.assert_array_equal([one.returns for one in shown[1:]], steps["rewards"].cumsum(axis=0))
+    assert all(picture.action for picture in shown[1:])
+    assert [bool(picture.ended) for picture in shown] == [False] * len(steps) + [True]
+
+
+def test_scenes_look_like_the_pictures_of_the_pages(recording):
+    mdp, steps = recording.mdp, recording.episode_steps("train", 3)[:30]
+    shown = pictures(recording, "train", 3)
+    if mdp.scene is None:
+        assert shown.source is Source.VALUES
+        return
+    assert shown.source is Source.SCENE
+    drawing = Drawing(mdp.scene)
+    places = drawing.places(mdp, np.append(steps["state"], steps["next_state"][-1]))
+    for picture in shown:
+        if picture.t % 7 or picture.t > 30:
+            continue
+        svg = drawing.frame(places[picture.t], "", places[: picture.t + 1])
+        height, width, _ = picture.pixels.shape
+        expected = render_svg(
+            svg.replace("<svg ", f'<svg width="{width}" height="{height}" ', 1), width, height
+        )
+        ground = Image.new("RGBA", (width, height), "#ffffff")
+        pixels = np.asarray(Image.alpha_composite(ground, expected).convert("RGB"), np.int16)
+        difference = np.abs(picture.pixels.astype(np.int16) - pixels)
+        assert difference.mean() < 1.5
+        assert (difference.max(axis=2) > 100).mean() < 0.005
+
+
+def test_recorded_frames_are_those_that_the_environment_drew(tmp_path):
+    recording, drawn = recorded(
+        tmp_path, gymnasium.make("CartPole-v1", render_mode="rgb_array"), frames_every=1
+    )
+    with recording:
+        for episode in (0, 1, len(drawn) - 1):
+            shown = pictures(recording, "train", episode)
+            assert shown.source is Source.RECORDED
+            np.testing.assert_array_equal([picture.pixels for picture in shown], drawn[episode])
+
+
+def test_a_frame_is_shown_until_the_next_recorded_one(tmp_path):
+    recording, drawn = recorded(
+        tmp_path, gymnasium.make("CartPole-v1", render_mode="rgb_array"), frames_every=4
+    )
+    with recording:
+        for episode, frames in enumerate(drawn[:-1]):
+            last = len(frames) - 1
+            expected = [frames[t if t == last else t - t % 4] for t in range(last + 1)]
+            np.testing.assert_array_equal(
+                [one.pixels for one in pictures(recording, "train", episode)], expected
+            )
+
+
+def test_values_are_drawn_as_bars_that_follow_them(tmp_path):
+    recording, _ = recorded(tmp_path, make("CartPole-v1"))
+    with recording:
+        shown = pictures(recording, "train", 0)
+        assert shown.source is Source.VALUES
+        assert "no frames were recorded" in shown.reason
+        frames = [picture.pixels for picture in shown]
+        values = recording.episode_steps("train", 0)["next_observation"][:, 2]
+    blue = [(frame[50:70] == [0, 0x72, 0xB2]).all(axis=2).sum() for frame in frames[1:]]
+    for number, value in zip(blue, values, strict=True):
+        assert (number > 0) == (value > 0)
+    assert np.corrcoef(blue, values.clip(0))[0, 1] > 0.99
+
+
+def test_observations_that_are_images_are_shown(tmp_path):
+    class Camera(Rooms):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = gymnasium.spaces.Box(0, 255, (4, 20, 24), np.uint8)
+
+    recording, _ = recorded(tmp_path, Camera(), 20)
+    with recording:
+        shown = pictures(recording, "train", 0)
+        assert shown.source is Source.OBSERVATION
+        last = recording.episode_steps("train", 0)["next_observation"][:, -1]
+        np.testing.assert_array_equal([picture.pixels[..., 0] for picture in shown][1:], last)
+
+
+def test_games_and_vectors_have_pictures(tmp_path):
+    pettingzoo = pytest.importorskip("mpe2.simple_spread_v3")
+    game = runner.record_parallel(pettingzoo.parallel_env(max_cycles=5), tmp_path, name="spread")
+    game.reset(seed=0)
+    while game.agents:
+        game.step(dict.fromkeys(game.agents, 1))
+    game.close()
+    with open_recording(game.run.recording) as recording:
+        last = list(pictures(recording, "train", 0))[-1]
+        assert last.action == "agent_0 1, agent_1 1, agent_2 1"
+        assert len(last.returns) == 3
+        np.testing.assert_allclose(last.returns, recording.episodes("train")[0]["returns"])
+    envs = runner.record_vector(gymnasium.make_vec("CartPole-v1", 3), tmp_path, name="vector")
+    envs.reset(seed=0)
+    for _ in range(60):
+        envs.step(np.ones(3, np.int64))
+    envs.close()
+    with open_recording(envs.run.recording) as recording:
+        for episode, record in enumerate(recording.episodes("train")):
+            shown = list(pictures(recording, "train", episode))
+            assert len(shown) == record["length"] + 1
+            assert shown[-1].returns[0] == record["returns"][0]
+            assert shown[-1].ended == "ended"
+
+
+def test_texts_of_an_observation_are_named(tmp_path):
+    recording, _ = recorded(tmp_path, make("RoomsText"))
+    with recording:
+        shown = list(pictures(recording, "train", 1))
+        missions = [step["next_observation"]["mission"] for step in recording.transitions("train")]
+    assert all(picture.events.startswith("mission ") for picture in shown[1:])
+    assert any(repr(mission) in shown[1].events for mission in missions)
+    assert shown[1].action.startswith("go ")
+
+
+def test_an_episode_that_is_not_there_is_refused(recording):
+    with pytest.raises(RecordingError, match="has no training episode 999; there are 40, from 0"):
+        pictures(recording, "train", 999)
