@@ -41,6 +41,7 @@ class UploadSource:
     run_id: str = ""
     content_digest: str | None = None
     run: Mapping[str, Any] = field(default_factory=dict)
+    """What `run.json` has of the run and its recording does not."""
     labels: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
@@ -57,15 +58,9 @@ class UploadSource:
         source = cls(run.recording, run.name, run.run_id, run.summary.content_digest)
         if run.stands_alone:  # an exported recording carries its own record of the run
             return source
-        details = {
-            "name": run.file.name,
-            "status": run.status,
-            "proof": run.file.proof,
-            "seconds": run.summary.seconds,
-            "error": run.summary.error,
-        }
-        known = {key: value for key, value in details.items() if value is not None}
-        return replace(source, run=known, labels=as_json(run.labels))
+        summary = {"seconds": run.summary.seconds, "error": run.summary.error}
+        facts = {"name": run.file.name, "status": run.status, "proof": run.file.proof, "summary": summary}
+        return replace(source, run=facts, labels=as_json(run.labels))
 
 
 @dataclass(frozen=True)
@@ -154,45 +149,38 @@ class Client(Connection):
         return upload
 
     def _deliver(
-        self, source: UploadSource, size: int, digest: str, report: Report, upload: UploadStatus | None
+        self, source: UploadSource, size: int, digest: str, report: Report, begun: UploadStatus | None
     ) -> UploadStatus:
         """Take the next step of an upload until it is stored or refused, and return it.
 
-        A step that fails for now is repeated, after a look at what the server has (`is_stale`).
+        After a step that failed for now, the upload is taken up again as the server has it.
         """
-        is_stale, furthest, backoff = upload is not None, -1, self.backoff()
+        announced = {"digest": digest, "size": size, "name": source.name, "run_id": source.run_id}
+        announced["content_digest"] = source.content_digest
+        upload, furthest, backoff = None, -1, self.backoff()
         while upload is None or upload.state not in ("stored", "refused"):
             try:
                 if upload is None:
-                    upload = self.begin_upload(
-                        digest=digest,
-                        size=size,
-                        name=source.name,
-                        run_id=source.run_id,
-                        content_digest=source.content_digest,
-                    )
-                elif is_stale:
-                    upload = self.upload_status(upload)
+                    upload = begun = self.upload_status(begun) if begun else self.begin_upload(**announced)
                 elif upload.state == "verifying":
                     upload = self.upload_status(upload, _WAIT_SECONDS)
                     if upload.state == "receiving" and upload.problem:
                         raise ServerUnavailable(f"{self.url}: {upload.problem}")
-                elif upload.offset > size:  # the file became shorter, as one does whose disk was full
-                    self.delete_upload(upload)
-                    upload = None
-                    continue
                 elif upload.offset < size:
                     upload = self.append_upload(upload, source.path, size)
-                else:
+                elif upload.offset == size:
                     upload = self.complete_upload(upload, source, size, digest)
-                is_stale = False
+                else:  # the file became shorter, as one does whose disk was full
+                    self.delete_upload(upload)
+                    upload = begun = None
+                    continue
             except ServerError as error:
                 is_lost = error.status == HTTPStatus.NOT_FOUND
                 is_behind = error.status == HTTPStatus.CONFLICT
                 if not (is_lost or is_behind or isinstance(error, ServerUnavailable)):
                     raise
                 backoff.wait(error)
-                upload, is_stale = None if is_lost else upload, True
+                upload, begun = None, None if is_lost else begun
                 continue
             if upload.offset > furthest:
                 furthest = upload.offset

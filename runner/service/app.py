@@ -31,8 +31,7 @@ from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
 from runner.service.settings import Settings
 from runner.service.tokens import Sessions, Tokens
-from runner.service.upload_model import Upload, UploadLimits
-from runner.service.uploads import Uploads
+from runner.service.uploads import Upload, Uploads
 from runner.sweep import sweeps_in
 from runner.util.version import __version__
 
@@ -129,8 +128,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             JobPool(settings.recordings[0], settings.workers, max_unfinished=limits.jobs, ray=settings.ray)
         )
         app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
-        upload_limits = UploadLimits(max_bytes=limits.upload_bytes)
-        app.state.uploads = stack.enter_context(Uploads(settings.recordings[0], upload_limits, log_upload))
+        app.state.uploads = stack.enter_context(Uploads(settings.recordings[0], limits, log_upload))
         app.state.processes = stack.enter_context(
             ProcessPool(PROCESSES, limits.work_seconds, limits.work_bytes)
         )

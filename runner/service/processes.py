@@ -24,8 +24,6 @@ from runner.util.processes import CallFailed, ChildProcess, ProcessDied, process
 Args = ParamSpec("Args")
 Result = TypeVar("Result")
 
-MAX_WAITING: Final = 32
-"""Calls that may wait for a process; more are refused."""
 PRELOADED: Final = (
     "runner.analysis.diff",
     "runner.analysis.qtable",
@@ -35,6 +33,7 @@ PRELOADED: Final = (
     "runner.execution.initial_tables",
     "runner.runs.importing",
     "runner.service.computed",
+    "runner.service.uploads",
 )
 """Modules that every process has from its start, where processes can be forked."""
 
@@ -47,13 +46,21 @@ class ProcessPool:
         seconds: the time limit of a call, after which its process is killed.
         memory_bytes: how much a call may allocate; not limited on Windows.
         keep_seconds: how long after a call its process may serve the next one; 0 for a new one each time.
+        max_waiting: how many calls may wait for a process; more are refused.
     """
 
-    def __init__(self, processes: int, seconds: float, memory_bytes: int, keep_seconds: float = 0.0) -> None:
+    def __init__(
+        self,
+        processes: int,
+        seconds: float,
+        memory_bytes: int,
+        keep_seconds: float = 0.0,
+        max_waiting: int = 32,
+    ) -> None:
         self._seconds, self._memory_bytes, self._keep_seconds = seconds, memory_bytes, keep_seconds
         self._context = process_context(PRELOADED)
         self._threads = ThreadPoolExecutor(processes, "processes")
-        self._places = threading.Semaphore(processes + MAX_WAITING)
+        self._places = threading.Semaphore(processes + max_waiting)
         self._lock = threading.Lock()
         self._children: set[ChildProcess] = set()
         self._thread = threading.local()
@@ -99,29 +106,37 @@ class ProcessPool:
             Busy: too many calls are waiting. The future raises the function's own `RunnerError` or `OSError`,
                 or `TimedOut`, `OutOfMemory`, `ProcessDied`.
         """
+        return self.submit_within(self._seconds, function, *args, **keywords)
+
+    def submit_within(
+        self, seconds: float, function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs
+    ) -> Future[Result]:
+        """Do as `submit`, with another time limit."""
         if not self._places.acquire(blocking=False):
             raise Busy
         try:
-            future = self._threads.submit(self._call, function, args, keywords)
+            future = self._threads.submit(self._call, seconds, function, args, keywords)
         except BaseException:
             self._places.release()
             raise
         future.add_done_callback(lambda _: self._places.release())
         return future
 
-    def _call(self, function: Callable[..., Any], args: Any, keywords: Any) -> Any:
+    def _call(self, seconds: float, function: Callable[..., Any], args: Any, keywords: Any) -> Any:
         child: ChildProcess | None = self._thread.__dict__.pop("child", None)
         if child is not None and time.monotonic() - self._thread.used < self._keep_seconds:
             with contextlib.suppress(ProcessDied):  # perhaps while it was idle; a new process shows why
-                return self._call_in(child, function, args, keywords)
+                return self._call_in(child, seconds, function, args, keywords)
         elif child is not None:
             self._end(child)
-        return self._call_in(self._start(), function, args, keywords)
+        return self._call_in(self._start(), seconds, function, args, keywords)
 
-    def _call_in(self, child: ChildProcess, function: Callable[..., Any], args: Any, keywords: Any) -> Any:
+    def _call_in(
+        self, child: ChildProcess, seconds: float, function: Callable[..., Any], args: Any, keywords: Any
+    ) -> Any:
         is_reusable = self._keep_seconds > 0
         try:
-            return child.call(function, self._seconds, *args, **keywords)
+            return child.call(function, seconds, *args, **keywords)
         except CallFailed:
             is_reusable = False
             raise

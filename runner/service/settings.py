@@ -37,6 +37,12 @@ class Limits:
     """Body of a request, other than uploads, which are streamed."""
     upload_bytes: int = 1 << 40
     """Size of an upload."""
+    uploads: int = 1000
+    """Uploads that are being received or verified, and results that are remembered."""
+    uploads_each: int = 100
+    """Uploads of one client that are being received or verified."""
+    spare_bytes: int = 256 << 20
+    """Disk space that uploads leave free for runs that are being recorded."""
     connections: int = 1000
     header_seconds: float = 10.0
     """Time until a request's head is complete."""

@@ -1,10 +1,10 @@
 """Uploads: recordings on their way into a recordings folder.
 
     recordings/.uploads/4f0c…/upload.json    the upload and its state; replaced atomically
-    recordings/.uploads/4f0c…/body           the bytes so far: its length is the offset to continue from
+    recordings/.uploads/4f0c…/body           the bytes so far
 
 An upload is received, in pieces and in order; then verified, by a child process; and then stored, which is
-one renaming, or refused. The folder is the truth: a server that was killed continues from it.
+one renaming, or refused. A server that was killed continues from these folders.
 """
 
 from __future__ import annotations
@@ -13,29 +13,125 @@ import contextlib
 import os
 import secrets
 import shutil
+import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
-from typing import Final, Self
+from typing import Annotated, Final, Literal, Self
 
-from runner.errors import RunNotFound, StorageError
+from filelock import FileLock
+from pydantic import BaseModel, ConfigDict, Field
+
+from runner.errors import RunnerError, RunNotFound, StorageError
+from runner.recording.labels import labels_from
+from runner.runs.importing import import_recording
 from runner.runs.resolve import run_of_id
-from runner.service.errors import TooManyUploads, UploadConflict, UploadTooLarge
-from runner.service.jobs.store import lock_folder
-from runner.service.upload_model import Announcement, Completion, Upload, UploadLimits
-from runner.service.verification import Verifier
-from runner.util.files import storage_errors, sync, write_object
+from runner.service.errors import Busy, TooManyUploads, UploadConflict, UploadTooLarge
+from runner.service.jobs.store import lock_folder, now
+from runner.service.logs import LOG
+from runner.service.processes import ProcessPool
+from runner.service.settings import Limits, without_folders
+from runner.util.files import hash_of, storage_errors, sync, write_object
+from runner.util.processes import CallFailed
 
 FOLDER: Final = ".uploads"
 STATE_FILE: Final = "upload.json"
 BODY_FILE: Final = "body"
-CLEANUP_SECONDS: Final = 600.0
-"""Time between searches for uploads to forget."""
+IDLE_SECONDS: Final = 7 * 86_400
+"""An upload that receives nothing for so long is forgotten."""
+OVER_SECONDS: Final = 86_400
+"""How long the result of an upload is remembered."""
+VERIFY_SECONDS: Final = 120.0
+VERIFY_BYTES_A_SECOND: Final = 2 << 20
+"""The time limit of a verification grows with the size of the upload."""
+VERIFY_MEMORY: Final = 2 << 30
+NICENESS: Final = 5
 _DISK: Final = "the server's disk"
-"""What a client learns of the place of an error."""
+"""How clients see the place of an error."""
+
+State = Literal["receiving", "verifying", "stored", "refused"]
+Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+Size = Annotated[int, Field(ge=0, lt=1 << 62)]
+Text = Annotated[str, Field(max_length=100)]
+Fact = str | float | None
+
+
+class Announcement(BaseModel):
+    """What a client announces; nothing of it is trusted, and all of it may be unknown yet."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    digest: Digest | None = None
+    """BLAKE3 of all bytes."""
+    size: Size | None = None
+    """Number of bytes."""
+    run_id: Text = ""
+    name: Text = ""
+    content_digest: Digest | None = None
+
+
+class Completion(BaseModel):
+    """What was sent, when all of it was."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+    digest: Digest
+    size: Size
+    run: dict[str, Fact | dict[str, Fact]] = {}
+    """What `run.json` has of the run and its recording does not; an exported recording has its own."""
+    labels: dict[str, str | list[str]] = {}
+    """Its name, tags and note; likewise."""
+
+
+class UploadStatus(BaseModel):
+    """An upload and its state, as clients see them."""
+
+    id: str
+    state: State = "receiving"
+    """`receiving`, `verifying`, `stored` as a run, or `refused`."""
+    offset: int = 0
+    """Number of bytes received: the next ones begin here."""
+    size: int | None
+    """Number of bytes when it is complete, if that is known."""
+    name: str
+    run_id: str
+    """The announced run; when it is stored, the run that it is."""
+    already: bool = False
+    """Whether that run was there before."""
+    problem: str = ""
+    """Why it was refused; of one that is being received again, why it could not be stored."""
+    created: str
+    """In UTC, as ISO 8601."""
+
+
+class Upload(UploadStatus):
+    """An upload as the server stores it; replaced, never changed."""
+
+    model_config = ConfigDict(frozen=True)
+    owner: str
+    """Who may continue it."""
+    digest: str | None
+    completion: Completion | None = None
+    changed: float = Field(default_factory=time.time)
+    """When it last changed, in seconds since 1970."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether its result is final."""
+        return self.state in ("stored", "refused")
+
+    def replace(self, **changes: object) -> Upload:
+        """Return the upload with other values of some fields, and without its problem."""
+        return self.model_copy(update={"problem": "", "changed": time.time()} | changes)
+
+    def refused(self, problem: str) -> Upload:
+        """Return the upload when it can never be a run."""
+        return self.replace(state="refused", problem=problem)
+
+    def returned(self, problem: str) -> Upload:
+        """Return the upload when it is to be completed again: the problem is the server's."""
+        return self.replace(state="receiving", problem=problem)
 
 
 class Uploads:
@@ -54,24 +150,31 @@ class Uploads:
     def __init__(
         self,
         recordings: Path,
-        limits: UploadLimits = UploadLimits(),  # noqa: B008 - frozen
+        limits: Limits = Limits(),  # noqa: B008 - frozen
         on_verified: Callable[[Upload], object] = lambda _: None,
     ) -> None:
-        self.limits, self._on_verified = limits, on_verified
+        self._limits, self._on_verified = limits, on_verified
         self._recordings, self._folder = recordings, recordings / FOLDER
         self._lock = threading.RLock()
-        """Held for moments only, never during disk access: the server's event loop may wait for it."""
-        self._begin_lock = threading.Lock()
-        """Held while an upload begins, so that the same bytes do not begin twice."""
-        self._cleaned = float("-inf")
-        self._in_use: set[str] = set()
+        """Held while uploads change, not while they are read: the server's event loop must not wait."""
         self._file_lock = lock_folder(recordings, f"{FOLDER}/lock")
-        self._uploads = {upload.upload_id: upload for upload in _read_uploads(self._folder)}
-        self._verifier, self._threads = Verifier(), ThreadPoolExecutor(1, "verification")
+        self._uploads: dict[str, Upload] = {}
+        self._is_stopping = False
+        self._processes = ProcessPool(1, VERIFY_SECONDS, VERIFY_MEMORY, max_waiting=limits.uploads)
+        for folder in [entry for entry in self._folder.iterdir() if entry.is_dir()]:
+            try:
+                upload = Upload.model_validate_json((folder / STATE_FILE).read_bytes())
+                facts = {path.name: path.stat() for path in folder.iterdir()}
+            except (OSError, ValueError):
+                shutil.rmtree(folder, ignore_errors=True)
+                continue
+            offset = facts[BODY_FILE].st_size if BODY_FILE in facts else upload.offset
+            changed = max(stat.st_mtime for stat in facts.values())
+            self._uploads[upload.id] = upload.model_copy(update={"offset": offset, "changed": changed})
         self._forget()
         for upload in self.all():
             if upload.state == "verifying":
-                self._threads.submit(self._verify, upload)
+                self._verify(upload)
 
     def __enter__(self) -> Self:
         return self
@@ -81,14 +184,13 @@ class Uploads:
 
     def close(self) -> None:
         """Stop; an unfinished verification is repeated by the next server."""
-        self._verifier.stop()
-        self._threads.shutdown(wait=True, cancel_futures=True)
+        self._is_stopping = True
+        self._processes.close()
         self._file_lock.release()
 
     def all(self) -> list[Upload]:
         """Return every upload, the newest first."""
-        with self._lock:
-            return sorted(self._uploads.values(), key=lambda upload: upload.created, reverse=True)
+        return sorted(self._uploads.copy().values(), key=lambda upload: upload.created, reverse=True)
 
     def get(self, upload_id: str, owner: str) -> Upload:
         """Return an upload of this owner.
@@ -96,18 +198,10 @@ class Uploads:
         Raises:
             RunNotFound: there is none with this id, or it is another owner's.
         """
-        with self._lock:
-            upload = self._uploads.get(upload_id)
-        if upload is None or not secrets.compare_digest(upload.owner.encode(), owner.encode()):
+        upload = self._uploads.get(upload_id)
+        if upload is None or upload.owner != owner:
             raise RunNotFound("no such upload: it was deleted, is long over, or belongs to another token.")
         return upload
-
-    def offset(self, upload: Upload) -> int:
-        """Return how many bytes of it were received."""
-        if upload.state != "receiving":
-            return upload.size or 0
-        with storage_errors(_DISK):
-            return self._body(upload).stat().st_size
 
     def begin(self, owner: str, announced: Announcement) -> tuple[Upload, bool]:
         """Return the upload of what is announced, and whether it is a new one.
@@ -120,32 +214,44 @@ class Uploads:
             StorageError: the disk has no room.
         """
         self._forget()
-        with self._begin_lock:
+        with self._lock:
             same = (owner, announced.digest, announced.size)
             for known in self.all() if announced.digest else ():
-                if (known.owner, known.announced.digest, known.announced.size) != same:
+                if (known.owner, known.digest, known.size) != same:
                     continue
                 if not known.is_over:
                     return known, False
                 if known.state == "stored" and run_of_id(known.run_id, self._recordings) is not None:
-                    return known.stored(known.run_id, already=True), False
-            created = datetime.now(UTC).isoformat(timespec="milliseconds")
+                    return known.replace(already=True), False
             upload = Upload(
-                upload_id=secrets.token_hex(16), owner=owner, created=created, announced=announced
+                id=secrets.token_hex(16),
+                owner=owner,
+                created=now(),
+                **announced.model_dump(exclude={"content_digest"}),
             )
             run = run_of_id(announced.run_id, self._recordings) if announced.content_digest else None
             if run is not None and run.summary.content_digest == announced.content_digest:
-                upload = upload.stored(run.run_id, already=True)
+                upload = upload.replace(state="stored", offset=announced.size or 0, already=True)
             else:
-                self._check_limits(owner, announced.size or 0)
+                owners = [known.owner for known in self.all() if not known.is_over]
+                if owners.count(owner) >= self._limits.uploads_each:
+                    raise TooManyUploads(
+                        f"{self._limits.uploads_each:,} of your uploads are open, the maximum of a client; "
+                        "complete or delete some."
+                    )
+                if len(owners) >= self._limits.uploads:
+                    raise TooManyUploads(f"{len(owners):,} uploads are open; try again when some are done.")
+                self._require_room(upload, announced.size or 0)
             with storage_errors(_DISK):
-                (self._folder / upload.upload_id).mkdir(parents=True)
+                self._body(upload).parent.mkdir()
                 self._body(upload).touch()
             self._save(upload)
         return upload, True
 
-    def append(self, upload_id: str, owner: str, offset: int, data: bytes | bytearray, more: int = 0) -> int:
-        """Append bytes, and return the offset after them. Of bytes that are too many, none is written.
+    def append(
+        self, upload_id: str, owner: str, offset: int, data: bytes | bytearray, more: int = 0
+    ) -> Upload:
+        """Append bytes, and return the upload after them. Of bytes that are too many, none is written.
 
         Args:
             upload_id: the upload.
@@ -159,20 +265,21 @@ class Uploads:
             UploadTooLarge: they are more than announced, or than the server accepts.
             StorageError: the disk is full, apart from the reserve, or fails; what was written stays.
         """
-        with self._exclusive(upload_id, owner) as upload:
-            received = self.offset(upload)
-            if upload.state != "receiving" or offset != received:
+        with self._lock:
+            upload = self.get(upload_id, owner)
+            if upload.state != "receiving" or offset != upload.offset:
                 found = f"found bytes from {offset:,} on"
-                raise UploadConflict(f"{found}, expected {received:,} ({upload.state}).")
-            limit = self.limits.max_bytes if upload.size is None else upload.size
-            if (end := offset + len(data) + more) > limit:
-                raise UploadTooLarge(f"found {end:,} bytes, expected at most {limit:,}.")
-            self._require_free(len(data) + more)
+                raise UploadConflict(f"{found}, expected {upload.offset:,} ({upload.state}).")
+            self._require_room(upload, len(data) + more)
             with storage_errors(_DISK), self._body(upload).open("ab", buffering=0) as stream:
-                view = memoryview(data)
-                while view:
-                    view = view[os.write(stream.fileno(), view) :]
-        return offset + len(data)
+                try:
+                    view = memoryview(data)
+                    while view:
+                        view = view[os.write(stream.fileno(), view) :]
+                finally:
+                    received = offset + len(data) - len(view)
+                    upload = self._uploads[upload_id] = upload.replace(offset=received)
+            return upload
 
     def complete(self, upload_id: str, owner: str, completion: Completion) -> Upload:
         """Finish an upload: it is synced to disk, and queued for verification. Returns its new state.
@@ -180,125 +287,123 @@ class Uploads:
         Raises:
             UploadConflict: bytes are missing, or another digest was announced or completed.
         """
-        with self._exclusive(upload_id, owner) as upload:
+        upload = self.get(upload_id, owner)
+        if upload.state == "receiving":
+            with storage_errors(_DISK):
+                sync(self._body(upload))  # without the lock, as it may take seconds
+        with self._lock:
+            offset, upload = upload.offset, self.get(upload_id, owner)
             if upload.state != "receiving":
                 if upload.completion is not None and upload.completion.digest != completion.digest:
                     raise UploadConflict("the upload was completed with another digest; begin another one.")
                 return upload
-            if (received := self.offset(upload)) != completion.size:
+            if offset != completion.size:
                 raise UploadConflict(
-                    f"found {received:,} bytes, expected the {completion.size:,} of the completion."
+                    f"found {offset:,} bytes, expected the {completion.size:,} of the completion."
                 )
-            if upload.announced.digest not in (None, completion.digest):
+            if upload.digest not in (None, completion.digest):
                 raise UploadConflict("found another digest than the one announced; begin another upload.")
-            with storage_errors(_DISK):
-                sync(self._body(upload))
-            completed = upload.completed(completion)
-            self._save(completed)
-        self._threads.submit(self._verify, completed)
-        return completed
+            upload = upload.replace(state="verifying", completion=completion, size=completion.size)
+            self._save(upload)
+        self._verify(upload)
+        return upload
 
     def delete(self, upload_id: str, owner: str) -> None:
         """Forget an upload, and remove what was received.
 
         Raises:
-            UploadConflict: it is being verified, or changed by another request.
+            UploadConflict: it is being verified.
         """
-        with self._exclusive(upload_id, owner) as upload:
-            if upload.state == "verifying":
-                raise UploadConflict("the upload is being verified; wait for its end.")
-            with self._lock:
-                del self._uploads[upload_id]
-            shutil.rmtree(self._folder / upload_id, ignore_errors=True)
-
-    @contextlib.contextmanager
-    def _exclusive(self, upload_id: str, owner: str) -> Iterator[Upload]:
-        """Yield an upload that no other request changes during the block."""
         with self._lock:
             upload = self.get(upload_id, owner)
-            if upload_id in self._in_use:
-                raise UploadConflict("another request changes this upload; wait for its end.")
-            self._in_use.add(upload_id)
-        try:
-            yield upload
-        finally:
-            with self._lock:
-                self._in_use.discard(upload_id)
+            if upload.state == "verifying":
+                raise UploadConflict("the upload is being verified; wait for its end.")
+            del self._uploads[upload_id]
+        shutil.rmtree(self._body(upload).parent, ignore_errors=True)
 
     def _body(self, upload: Upload) -> Path:
-        return self._folder / upload.upload_id / BODY_FILE
-
-    def _write(self, upload: Upload) -> None:
-        with storage_errors(_DISK):
-            write_object(self._folder / upload.upload_id / STATE_FILE, upload.model_dump(mode="json"))
+        return self._folder / upload.id / BODY_FILE
 
     def _save(self, upload: Upload) -> None:
-        self._write(upload)
-        with self._lock:
-            self._uploads[upload.upload_id] = upload
+        with storage_errors(_DISK):
+            write_object(self._body(upload).with_name(STATE_FILE), upload.model_dump(mode="json"))
+        self._uploads[upload.id] = upload
 
-    def _check_limits(self, owner: str, size: int) -> None:
-        limits = self.limits
-        if size > limits.max_bytes:
-            raise UploadTooLarge(f"found {size:,} bytes, expected at most {limits.max_bytes:,}.")
-        owners = [upload.owner for upload in self.all() if not upload.is_over]
-        if owners.count(owner) >= limits.max_open_each:
-            raise TooManyUploads(
-                f"{limits.max_open_each:,} of your uploads are open, the maximum of a client; complete or "
-                "delete some."
-            )
-        if len(owners) >= limits.max_open:
-            raise TooManyUploads(f"{limits.max_open:,} uploads are open; try again when some are done.")
-        self._require_free(size)
-
-    def _require_free(self, size: int) -> None:
-        free = shutil.disk_usage(self._folder).free - self.limits.spare_bytes
-        if size > free:
-            raise StorageError(f"the server has room for {max(free, 0):,} bytes, expected {size:,}.")
-
-    def _verify(self, upload: Upload) -> None:
-        """Verify an upload and save the result; the bytes are removed when they are needed no more."""
-        verified = self._verifier.verify(upload, self._body(upload), self._recordings)
-        if verified is None:
-            return  # the server is stopping
-        with contextlib.suppress(StorageError):  # after a restart it is verified again, with the same result
-            self._write(verified)
-        if verified.is_over:
-            with contextlib.suppress(OSError):  # removed with the rest of it, when it is forgotten
-                self._body(verified).unlink(missing_ok=True)
-        try:
-            self._on_verified(verified)
-        finally:
-            with self._lock:
-                self._uploads[upload.upload_id] = verified
+    def _require_room(self, upload: Upload, more: int) -> None:
+        """Refuse an upload if there is no room for more of its bytes."""
+        end, limit = upload.offset + more, self._limits.upload_bytes
+        limit = limit if upload.size is None else min(limit, upload.size)
+        if end > limit:
+            raise UploadTooLarge(f"found {end:,} bytes, expected at most {limit:,}.")
+        free = shutil.disk_usage(self._folder).free - self._limits.spare_bytes
+        if more > free:
+            raise StorageError(f"the server has room for {max(free, 0):,} bytes, expected {more:,}.")
 
     def _forget(self) -> None:
         """Forget uploads that receive nothing any more, are long over, or are over and too many."""
-        over = [upload for upload in reversed(self.all()) if upload.is_over]
-        forgotten = over[: -self.limits.max_open]
-        if time.monotonic() - self._cleaned > CLEANUP_SECONDS:
-            self._cleaned = time.monotonic()
-            for upload in self.all():
-                days = self.limits.over_days if upload.is_over else self.limits.idle_days
-                if self._last_change(upload) < time.time() - days * 86_400:
-                    forgotten.append(upload)
+        uploads, moment = self.all(), time.time()
+        forgotten = [upload for upload in uploads if upload.is_over][self._limits.uploads :]
+        for upload in uploads:
+            if moment - upload.changed > (OVER_SECONDS if upload.is_over else IDLE_SECONDS):
+                forgotten.append(upload)
         for upload in forgotten:
-            with contextlib.suppress(UploadConflict, RunNotFound):  # in verification or use, or gone
-                self.delete(upload.upload_id, upload.owner)
+            with contextlib.suppress(UploadConflict, RunNotFound):  # in verification, or gone
+                self.delete(upload.id, upload.owner)
 
-    def _last_change(self, upload: Upload) -> float:
-        """Return when an upload last changed, in seconds since 1970."""
-        times = [0.0]
-        for path in (self._body(upload), self._folder / upload.upload_id / STATE_FILE):
-            with contextlib.suppress(OSError):
-                times.append(path.stat().st_mtime)
-        return max(times)
+    def _verify(self, upload: Upload) -> None:
+        seconds = VERIFY_SECONDS + (upload.size or 0) / VERIFY_BYTES_A_SECOND
+        future = self._processes.submit_within(seconds, verify, upload, self._body(upload), self._recordings)
+        future.add_done_callback(partial(self._end, upload))
 
-
-def _read_uploads(folder: Path) -> Iterator[Upload]:
-    """Yield the uploads in a folder; what is no upload is removed."""
-    for entry in [entry for entry in folder.iterdir() if entry.is_dir()]:
+    def _end(self, upload: Upload, verification: Future[Upload]) -> None:
+        """Save the result of a verification; the bytes are removed when they are needed no more."""
         try:
-            yield Upload.model_validate_json((entry / STATE_FILE).read_bytes())
-        except (OSError, ValueError):
-            shutil.rmtree(entry, ignore_errors=True)
+            upload = verification.result()
+        except CallFailed as error:
+            if self._is_stopping:
+                return
+            upload = upload.refused(f"its verification failed: {error}")
+        except Busy as error:
+            upload = upload.returned(str(error))
+        except Exception:  # else it would remain in verification until the server is started again
+            LOG.exception("verification", extra={"upload": upload.id})
+            upload = upload.returned(
+                "something unexpected went wrong while it was verified; complete it again."
+            )
+        try:
+            self._on_verified(upload)
+        finally:
+            with contextlib.suppress(StorageError):  # after a restart it is verified again, equally
+                self._save(upload)
+            self._uploads[upload.id] = upload
+            if upload.is_over:
+                with contextlib.suppress(OSError):  # removed with the rest of it, when it is forgotten
+                    self._body(upload).unlink(missing_ok=True)
+
+
+def verify(upload: Upload, body: Path, recordings: Path) -> Upload:
+    """Return an upload after its verification: stored as a run, refused, or to be completed again.
+
+    For a process of its own.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # not on Windows
+        os.nice(NICENESS)
+        # A signal to stop may go to all processes of the service, which then kills this one itself: its end
+        # must not look like that of a recording that is too large.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with FileLock(body.with_name("verifying.lock")):  # that of a server that was killed may still run
+        try:
+            sent = upload.completion
+            if sent is None or hash_of(body)[1] != sent.digest:
+                return upload.refused(
+                    "found another digest than sent: bytes changed on the way; send it again."
+                )
+            labels = labels_from(sent.labels) if sent.labels else None
+            imported = import_recording(body, recordings, sent.run or None, labels)
+            return upload.replace(state="stored", run_id=imported.run.run_id, already=imported.already)
+        except RunnerError as error:
+            problem = without_folders(str(error).replace(os.fspath(body), "the upload"), recordings)
+            return (upload.returned if isinstance(error, StorageError) else upload.refused)(problem)
+        except OSError as error:
+            return upload.returned(f"the server's disk cannot be used ({error.strerror}).")

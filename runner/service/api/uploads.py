@@ -17,8 +17,7 @@ from runner.service.dependencies import UploadsOf
 from runner.service.errors import Refused
 from runner.service.problems import error_docs
 from runner.service.tokens import Token
-from runner.service.upload_model import Announcement, Completion, State, Upload
-from runner.service.uploads import Uploads
+from runner.service.uploads import Announcement, Completion, State, UploadStatus
 
 router = APIRouter(tags=["uploads"])
 
@@ -30,30 +29,10 @@ MAX_WAIT: Final = 30.0
 POLL_SECONDS: Final = 0.1
 
 
-class UploadResponse(BaseModel):
-    """An upload and its state."""
-
-    id: str
-    state: State
-    """`receiving`, `verifying`, `stored` as a run, or `refused`."""
-    offset: int
-    """Number of bytes received: the next ones begin here."""
-    size: int | None
-    """Number of bytes when it is complete, if that is known."""
-    name: str
-    run_id: str
-    """The announced run; when it is stored, the run that it is."""
-    already: bool
-    """Whether that run was there before."""
-    problem: str
-    """Why it was refused; of one that is being received again, why it could not be stored."""
-    created: str
-
-
 class UploadsResponse(BaseModel):
     """All uploads."""
 
-    uploads: list[UploadResponse]
+    uploads: list[UploadStatus]
 
 
 def owner_of(request: Request) -> str:
@@ -73,25 +52,28 @@ def list_uploads(
     uploads: UploadsOf, owner: OwnerOf, state: Annotated[State | None, Query()] = None
 ) -> UploadsResponse:
     """List uploads, the newest first; ids and problems only of one's own."""
+    hidden = {"id": "", "problem": ""}
     chosen = [upload for upload in uploads.all() if state in (None, upload.state)]
-    return UploadsResponse(uploads=[_response(uploads, upload, owner) for upload in chosen])
+    return UploadsResponse(
+        uploads=[each if each.owner == owner else each.model_copy(update=hidden) for each in chosen]
+    )
 
 
 @router.post(
     "/uploads",
     status_code=HTTPStatus.CREATED,
-    responses={200: {"model": UploadResponse, "description": "It had begun, or the run is there already."}},
+    responses={200: {"model": UploadStatus, "description": "It had begun, or the run is there already."}},
     summary="Begin an upload, or find the one of the same bytes.",
 )
 def begin(
     uploads: UploadsOf, owner: OwnerOf, announced: Announcement, request: Request, response: Response
-) -> UploadResponse:
+) -> UploadStatus:
     """Announce a recording; all of it may be unknown yet."""
     upload, is_new = uploads.begin(owner, announced)
     if not is_new or upload.state == "stored":
         response.status_code = HTTPStatus.OK
-    response.headers["Location"] = f"{request.url.path}/{upload.upload_id}"
-    return _response(uploads, upload, owner)
+    response.headers["Location"] = f"{request.url.path}/{upload.id}"
+    return upload
 
 
 @router.get(
@@ -105,14 +87,14 @@ async def one(
     upload_id: UploadId,
     request: Request,
     wait: Annotated[float, Query(ge=0, le=MAX_WAIT, description="Seconds.")] = 0.0,
-) -> UploadResponse:
+) -> UploadStatus:
     """Return the state of an upload; while it is being verified, wait at most the given time."""
     end, stopping = time.monotonic() + wait, request.app.state.stopping
     upload = uploads.get(upload_id, owner)
     while upload.state == "verifying" and time.monotonic() < end and not stopping.is_set():
         await asyncio.sleep(POLL_SECONDS)
         upload = uploads.get(upload_id, owner)
-    return await run_sync(_response, uploads, upload, owner, limiter=request.app.state.writers)
+    return upload
 
 
 @router.patch(
@@ -128,11 +110,12 @@ async def append(
     request: Request,
     upload_offset: Annotated[int, Header(ge=0, lt=1 << 62)],
     content_length: Annotated[int | None, Header(ge=0, lt=1 << 62, include_in_schema=False)] = None,
-) -> UploadResponse:
+) -> UploadStatus:
     """Append bytes; those that were received stay, even if the connection breaks."""
-    writers, offset, collected = request.app.state.writers, upload_offset, bytearray()
+    offset, collected = upload_offset, bytearray()
 
-    async def write(data: bytes | bytearray, more: int = 0) -> int:
+    async def write(data: bytes | bytearray, more: int = 0) -> UploadStatus:
+        writers = request.app.state.writers
         return await run_sync(uploads.append, upload_id, owner, offset, data, more, limiter=writers)
 
     await write(b"", content_length or 0)  # refused before anything is read
@@ -141,7 +124,7 @@ async def append(
             collected += data
             if len(collected) >= PIECE:
                 piece, collected = collected, bytearray()
-                offset = await write(piece)
+                offset = (await write(piece)).offset
     except ClientDisconnect:
         raise Refused(
             HTTPStatus.BAD_REQUEST, "the connection was closed; continue from the offset."
@@ -149,7 +132,7 @@ async def append(
     finally:
         if collected:
             await write(collected)
-    return await run_sync(_response, uploads, uploads.get(upload_id, owner), owner, limiter=writers)
+    return uploads.get(upload_id, owner)
 
 
 @router.post(
@@ -160,11 +143,10 @@ async def append(
 )
 async def complete(
     uploads: UploadsOf, owner: OwnerOf, upload_id: UploadId, completion: Completion, request: Request
-) -> UploadResponse:
+) -> UploadStatus:
     """Sync an upload to disk, and queue it for verification, which makes it a run."""
     writers = request.app.state.writers
-    upload = await run_sync(uploads.complete, upload_id, owner, completion, limiter=writers)
-    return await run_sync(_response, uploads, upload, owner, limiter=writers)
+    return await run_sync(uploads.complete, upload_id, owner, completion, limiter=writers)
 
 
 @router.delete(
@@ -178,18 +160,3 @@ def delete(uploads: UploadsOf, owner: OwnerOf, upload_id: UploadId) -> Response:
     """Forget an upload, and remove what was received."""
     uploads.delete(upload_id, owner)
     return Response(status_code=HTTPStatus.NO_CONTENT)
-
-
-def _response(uploads: Uploads, upload: Upload, owner: str) -> UploadResponse:
-    is_own = upload.owner == owner
-    return UploadResponse(
-        id=upload.upload_id if is_own else "",
-        state=upload.state,
-        offset=uploads.offset(upload),
-        size=upload.size,
-        name=upload.announced.name,
-        run_id=upload.run_id or upload.announced.run_id,
-        already=upload.already,
-        problem=upload.problem if is_own else "",
-        created=upload.created,
-    )

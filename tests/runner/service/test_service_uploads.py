@@ -23,14 +23,8 @@ from runner.recording.labels import Labels, change_labels
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
 from runner.service.errors import TooManyUploads, UploadConflict, UploadTooLarge
-from runner.service.upload_model import (
-    Announcement,
-    Completion,
-    RunDetails,
-    RunLabels,
-    UploadLimits,
-)
-from runner.service.uploads import FOLDER, Uploads
+from runner.service.settings import Limits
+from runner.service.uploads import FOLDER, Announcement, Completion, Uploads
 from tests.runner.recording.making import TAXIS, experiment, make_run, stopping_after, with_id
 from tests.waiting import until
 
@@ -39,13 +33,13 @@ ANNA, BEN = "anna", "ben"
 
 @pytest.fixture
 def uploads(tmp_path):
-    made = Uploads(tmp_path / "runs", UploadLimits(spare_bytes=0))
+    made = Uploads(tmp_path / "runs", Limits(spare_bytes=0))
     yield made
     made.close()
 
 
 def completion(data: bytes, **details) -> Completion:
-    return Completion(digest=blake3(data).hexdigest(), size=len(data), run=RunDetails(**details))
+    return Completion(digest=blake3(data).hexdigest(), size=len(data), run=details)
 
 
 def announced(data: bytes, **more) -> Announcement:
@@ -55,14 +49,12 @@ def announced(data: bytes, **more) -> Announcement:
 def send(uploads, data, owner=ANNA, whole=None, **details):
     """Upload bytes in one go, and return the upload when its verification is over."""
     upload, _ = uploads.begin(owner, announced(data))
-    uploads.append(upload.upload_id, owner, 0, data)
-    return over(uploads, uploads.complete(upload.upload_id, owner, whole or completion(data, **details)))
+    uploads.append(upload.id, owner, 0, data)
+    return over(uploads, uploads.complete(upload.id, owner, whole or completion(data, **details)))
 
 
 def over(uploads, upload):
-    return until(
-        lambda upload: upload.state != "verifying", lambda: uploads.get(upload.upload_id, upload.owner)
-    )
+    return until(lambda upload: upload.state != "verifying", lambda: uploads.get(upload.id, upload.owner))
 
 
 def visible(folder: Path) -> list[str]:
@@ -75,18 +67,20 @@ def test_a_recording_becomes_its_run(uploads, taxis, tmp_path):
     assert new
     for offset in range(0, len(data), 10_000):
         piece = data[offset : offset + 10_000]
-        assert uploads.append(upload.upload_id, ANNA, offset, piece) == offset + len(piece)
-    assert uploads.offset(upload) == len(data)
+        assert uploads.append(upload.id, ANNA, offset, piece).offset == offset + len(piece)
+    assert uploads.get(upload.id, ANNA).offset == len(data)
     assert list_runs(tmp_path / "runs") == []
     seconds = taxis.summary["seconds"]
-    verifying = uploads.complete(upload.upload_id, ANNA, completion(data, seconds=seconds, name="taxis"))
+    verifying = uploads.complete(
+        upload.id, ANNA, completion(data, summary={"seconds": seconds}, name="taxis")
+    )
     assert verifying.state == "verifying"
     assert over(uploads, verifying).run_id == taxis.run_id
     run = find_run(taxis.run_id, tmp_path / "runs")
     assert {key: value for key, value in taxis.facts.items() if key != "owner"} == run.facts
     assert run.recording.read_bytes() == data
     assert sorted(path.name for path in run.folder.iterdir()) == ["recording.mcap", "run.json"]
-    assert not (tmp_path / "runs" / FOLDER / upload.upload_id / "body").exists()
+    assert not (tmp_path / "runs" / FOLDER / upload.id / "body").exists()
 
 
 def test_an_exported_recording_is_stored_with_its_labels(uploads, lake, tmp_path):
@@ -106,8 +100,8 @@ def test_the_same_bytes_are_the_same_upload_and_the_same_run(uploads, lake, tmp_
     assert uploads.begin(BEN, announced(data))[1], "another's upload is not handed out"
     done = send(uploads, data)
     known, new = uploads.begin(ANNA, announced(data))
-    assert (known.upload_id, known.already, new) == (done.upload_id, True, False)
-    again = uploads.complete(done.upload_id, ANNA, completion(data))
+    assert (known.id, known.already, new) == (done.id, True, False)
+    again = uploads.complete(done.id, ANNA, completion(data))
     assert again == done
     others = send(uploads, data, BEN)
     assert (others.state, others.already) == ("stored", True)
@@ -124,17 +118,16 @@ def test_received_bytes_outlive_the_server(lake, tmp_path):
     data = lake.recording.read_bytes()
     first = Uploads(tmp_path / "runs")
     upload, _ = first.begin(ANNA, announced(data))
-    first.append(upload.upload_id, ANNA, 0, data[:5_000], len(data) - 5_000)
+    first.append(upload.id, ANNA, 0, data[:5_000], len(data) - 5_000)
     with pytest.raises(RunnerError, match="is served by another process already"):
         Uploads(tmp_path / "runs")
     first.close()
     second = Uploads(tmp_path / "runs")
     known, new = second.begin(ANNA, announced(data))
-    assert (known, new, second.offset(known)) == (upload, False, 5_000)
-    second.append(upload.upload_id, ANNA, 5_000, data[5_000:])
-    second._verifier.stop()  # killed while it verifies
-    second.complete(upload.upload_id, ANNA, completion(data))
-    second.close()
+    assert (known.id, new, known.offset) == (upload.id, False, 5_000)
+    second.append(upload.id, ANNA, 5_000, data[5_000:])
+    second.complete(upload.id, ANNA, completion(data))
+    second.close()  # while it verifies
     third = Uploads(tmp_path / "runs")
     assert over(third, upload).run_id == lake.run_id
     third.close()
@@ -143,7 +136,7 @@ def test_received_bytes_outlive_the_server(lake, tmp_path):
 def test_a_repeated_verification_has_the_same_result(uploads, lake, tmp_path):
     data = lake.recording.read_bytes()
     stored = send(uploads, data)
-    folder = tmp_path / "runs" / FOLDER / stored.upload_id
+    folder = tmp_path / "runs" / FOLDER / stored.id
     state = json.loads((folder / "upload.json").read_text())
     uploads.close()
     (folder / "upload.json").write_text(json.dumps(state | {"state": "verifying", "run_id": ""}))
@@ -176,17 +169,17 @@ def test_an_unsound_recording_is_refused_and_leaves_nothing(uploads, lake, tmp_p
     assert refused.problem.startswith("the upload: ")
     assert str(tmp_path) not in refused.problem
     assert visible(tmp_path / "runs") == []
-    assert not (tmp_path / "runs" / FOLDER / refused.upload_id / "body").exists()
-    again, new = uploads.begin(ANNA, refused.announced)
+    assert not (tmp_path / "runs" / FOLDER / refused.id / "body").exists()
+    again, new = uploads.begin(ANNA, announced(change(lake.recording.read_bytes())))
     assert new, "it can be sent again"
-    assert again.upload_id != refused.upload_id
+    assert again.id != refused.id
 
 
 def test_bytes_changed_in_transit_are_refused(uploads, lake):
     data = lake.recording.read_bytes()
     upload, _ = uploads.begin(ANNA, announced(data))
-    uploads.append(upload.upload_id, ANNA, 0, altered(data))
-    refused = over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data)))
+    uploads.append(upload.id, ANNA, 0, altered(data))
+    refused = over(uploads, uploads.complete(upload.id, ANNA, completion(data)))
     assert "another digest" in refused.problem
 
 
@@ -224,7 +217,7 @@ def test_a_resumed_run_replaces_its_beginning(uploads, stopped, tmp_path):
     change_labels(there, lambda _: Labels("mine", ("here",), "seen"))
     data = whole.recording.read_bytes()
     more = completion(data, status="finished").model_copy(
-        update={"labels": RunLabels(name="yours", tags=["there"], note="other")}
+        update={"labels": {"name": "yours", "tags": ["there"], "note": "other"}}
     )
     stored = send(uploads, data, whole=more)
     assert (stored.state, stored.problem, stored.already) == ("stored", "", False)
@@ -271,40 +264,40 @@ def test_wrong_requests_of_a_client_are_refused(uploads, lake):
     data = lake.recording.read_bytes()
     upload, _ = uploads.begin(ANNA, announced(data))
     with pytest.raises(RunNotFound):
-        uploads.get(upload.upload_id, BEN)
+        uploads.get(upload.id, BEN)
     with pytest.raises(RunNotFound):
-        uploads.append("../" + upload.upload_id, ANNA, 0, b"1")
+        uploads.append("../" + upload.id, ANNA, 0, b"1")
     with pytest.raises(UploadConflict, match="expected 0"):
-        uploads.append(upload.upload_id, ANNA, 7, b"1")
+        uploads.append(upload.id, ANNA, 7, b"1")
     with pytest.raises(UploadTooLarge):
-        uploads.append(upload.upload_id, ANNA, 0, b"", len(data) + 1)
+        uploads.append(upload.id, ANNA, 0, b"", len(data) + 1)
     with pytest.raises(UploadTooLarge):
-        uploads.append(upload.upload_id, ANNA, 0, data + b"more")
-    assert uploads.offset(upload) == 0
+        uploads.append(upload.id, ANNA, 0, data + b"more")
+    assert uploads.get(upload.id, ANNA).offset == 0
     with pytest.raises(UploadConflict, match="found 0 bytes"):
-        uploads.complete(upload.upload_id, ANNA, completion(data))
-    assert uploads.append(upload.upload_id, ANNA, 0, data) == len(data)
+        uploads.complete(upload.id, ANNA, completion(data))
+    assert uploads.append(upload.id, ANNA, 0, data).offset == len(data)
     with pytest.raises(UploadConflict, match=f"expected {len(data):,}"):
-        uploads.append(upload.upload_id, ANNA, 0, data)
+        uploads.append(upload.id, ANNA, 0, data)
     other = completion(data).model_copy(update={"digest": "0" * 64})
     with pytest.raises(UploadConflict, match="another digest"):
-        uploads.complete(upload.upload_id, ANNA, other)
+        uploads.complete(upload.id, ANNA, other)
 
 
 def test_uploads_beyond_the_limits_are_refused(lake, tmp_path):
-    uploads = Uploads(tmp_path / "runs", UploadLimits(max_bytes=1_000, max_open=2))
+    uploads = Uploads(tmp_path / "runs", Limits(upload_bytes=1_000, uploads=2))
     with pytest.raises(UploadTooLarge, match="1,000"):
         uploads.begin(ANNA, Announcement(size=1_001))
     first, _ = uploads.begin(ANNA, Announcement())
     with pytest.raises(UploadTooLarge):
-        uploads.append(first.upload_id, ANNA, 0, bytes(1_001))
+        uploads.append(first.id, ANNA, 0, bytes(1_001))
     uploads.begin(ANNA, Announcement())
     with pytest.raises(TooManyUploads):
         uploads.begin(BEN, Announcement())
-    uploads.delete(first.upload_id, ANNA)
+    uploads.delete(first.id, ANNA)
     uploads.begin(BEN, Announcement())
     uploads.close()
-    full = Uploads(tmp_path / "full", UploadLimits(spare_bytes=1 << 60))
+    full = Uploads(tmp_path / "full", Limits(spare_bytes=1 << 60))
     with pytest.raises(StorageError, match="room for 0 bytes"):
         full.begin(ANNA, Announcement(size=10))
     full.close()
@@ -324,35 +317,35 @@ def test_a_full_disk_keeps_what_is_there(uploads, lake, monkeypatch):
 
     monkeypatch.setattr("runner.service.uploads.os.write", full)
     with pytest.raises(StorageError, match="No space left"):
-        uploads.append(upload.upload_id, ANNA, 0, data)
+        uploads.append(upload.id, ANNA, 0, data)
     monkeypatch.undo()
-    assert uploads.offset(upload) == 6_000
-    uploads.append(upload.upload_id, ANNA, 6_000, data[6_000:])
-    assert over(uploads, uploads.complete(upload.upload_id, ANNA, completion(data))).state == "stored"
+    assert uploads.get(upload.id, ANNA).offset == 6_000
+    uploads.append(upload.id, ANNA, 6_000, data[6_000:])
+    assert over(uploads, uploads.complete(upload.id, ANNA, completion(data))).state == "stored"
 
 
 def test_the_disk_reserve_holds_for_uploads_of_unknown_size(tmp_path, monkeypatch):
-    uploads = Uploads(tmp_path / "runs", UploadLimits(spare_bytes=5_000))
+    uploads = Uploads(tmp_path / "runs", Limits(spare_bytes=5_000))
     upload, _ = uploads.begin(ANNA, Announcement())
     free = iter((7_000, 6_000))
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr("runner.service.uploads.shutil.disk_usage", lambda _: usage._replace(free=next(free)))
-    uploads.append(upload.upload_id, ANNA, 0, bytes(2_000))
+    uploads.append(upload.id, ANNA, 0, bytes(2_000))
     with pytest.raises(StorageError, match="room for 1,000 bytes"):
-        uploads.append(upload.upload_id, ANNA, 2_000, bytes(2_000))
-    assert uploads.offset(upload) == 2_000
+        uploads.append(upload.id, ANNA, 2_000, bytes(2_000))
+    assert uploads.get(upload.id, ANNA).offset == 2_000
     uploads.close()
 
 
 def test_a_limited_number_of_results_is_remembered(lake, tmp_path):
     shutil.copytree(lake.folder, tmp_path / "runs" / lake.run_id)
-    uploads = Uploads(tmp_path / "runs", UploadLimits(max_open=3))
+    uploads = Uploads(tmp_path / "runs", Limits(uploads=3))
     for number in range(9):
         known = {"run_id": lake.run_id, "content_digest": lake.summary["content_digest"]}
         upload, _ = uploads.begin(ANNA, Announcement(digest=f"{number:064}", **known))
         assert upload.state == "stored"
     assert len(uploads.all()) == len(list((tmp_path / "runs" / FOLDER).glob("*/upload.json"))) == 4
-    assert uploads.get(upload.upload_id, ANNA).already
+    assert uploads.get(upload.id, ANNA).already
     uploads.close()
 
 
@@ -363,17 +356,15 @@ def test_old_results_and_abandoned_uploads_are_forgotten(lake, tmp_path):
     fresh, _ = uploads.begin(ANNA, Announcement(name="fresh"))
     uploads.close()
     for upload, days in ((stored, 2), (idle, 8)):
-        folder = tmp_path / "runs" / FOLDER / upload.upload_id
+        folder = tmp_path / "runs" / FOLDER / upload.id
         state = json.loads((folder / "upload.json").read_text())
         (folder / "upload.json").write_text(json.dumps(state | {"created": "2020-01-01T00:00:00.000+00:00"}))
         for path in folder.iterdir():
             os.utime(path, (time.time() - days * 86400,) * 2)
     (tmp_path / "runs" / FOLDER / ("0" * 32)).mkdir()
     again = Uploads(tmp_path / "runs")
-    assert [upload.upload_id for upload in again.all()] == [fresh.upload_id]
-    assert [path.name for path in (tmp_path / "runs" / FOLDER).iterdir() if path.is_dir()] == [
-        fresh.upload_id
-    ]
+    assert [upload.id for upload in again.all()] == [fresh.id]
+    assert [path.name for path in (tmp_path / "runs" / FOLDER).iterdir() if path.is_dir()] == [fresh.id]
     assert visible(tmp_path / "runs") == [lake.run_id]
     again.close()
 
@@ -385,10 +376,10 @@ def test_removing_an_upload_does_not_block_others(uploads, lake, monkeypatch):
     upload, _ = uploads.begin(ANNA, announced(data))
     monkeypatch.setattr("runner.service.uploads.shutil.rmtree", lambda *_, **__: go_on.wait(60))
     with ThreadPoolExecutor(2) as threads:
-        removal = threads.submit(uploads.delete, given_up.upload_id, ANNA)
+        removal = threads.submit(uploads.delete, given_up.id, ANNA)
         try:
             until(lambda known: len(known) == 1, uploads.all)
-            assert threads.submit(uploads.get, upload.upload_id, ANNA).result(20) == upload
+            assert threads.submit(uploads.get, upload.id, ANNA).result(20) == upload
             assert not removal.done()
         finally:
             go_on.set()
@@ -397,16 +388,16 @@ def test_removing_an_upload_does_not_block_others(uploads, lake, monkeypatch):
 def test_an_upload_whose_verification_fails_unexpectedly_can_be_completed_again(uploads, lake, monkeypatch):
     data = lake.recording.read_bytes()
     with monkeypatch.context() as broken:
-        broken.setattr("runner.service.verification.ChildProcess", lambda *_: json.loads("no process"))
+        broken.setattr("runner.service.processes.ChildProcess", lambda *_: json.loads("no process"))
         failed = send(uploads, data)
     assert failed.state == "receiving"
     assert failed.problem == "something unexpected went wrong while it was verified; complete it again."
-    again = uploads.complete(failed.upload_id, ANNA, completion(data))
+    again = uploads.complete(failed.id, ANNA, completion(data))
     assert over(uploads, again).state == "stored"
 
 
 def test_one_client_cannot_hold_all_uploads(tmp_path):
-    uploads = Uploads(tmp_path / "runs", UploadLimits(max_open=3, max_open_each=2))
+    uploads = Uploads(tmp_path / "runs", Limits(uploads=3, uploads_each=2))
     for _ in range(2):
         uploads.begin(ANNA, Announcement())
     with pytest.raises(TooManyUploads, match="2 of your uploads are open"):
