@@ -6,6 +6,7 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import urlsplit
@@ -20,6 +21,9 @@ API: Final = "/api/v1"
 READ_BYTES: Final = 1 << 20
 TOKEN_VARIABLE: Final = "DUALTAXI_TOKEN"
 TOKEN_FILE_VARIABLE: Final = "DUALTAXI_TOKEN_FILE"
+_HOW_TO_GIVE_A_TOKEN: Final = (
+    f"a token is given by --token, --token-file, ${TOKEN_VARIABLE} or a file named by ${TOKEN_FILE_VARIABLE}."
+)
 _MAX_TOKEN_FILE: Final = 4096
 FIRST_PAUSE: Final = 0.2
 LONGEST_PAUSE: Final = 5.0
@@ -109,7 +113,7 @@ class Connection:
         log: Callable[[str], object] = lambda _: None,
     ) -> None:
         self.url = checked_url(url)
-        self._retry_timeout, self._log = retry_timeout, log
+        self._retry_timeout, self._log, self._has_token = retry_timeout, log, bool(token)
         require("httpx2", extra="service", purpose="speaking to a server")
         import httpx2
 
@@ -205,6 +209,8 @@ class Connection:
         message = f"answers {response.status_code} {response.reason_phrase}; is it a dualtaxi server?"
         with contextlib.suppress(ValueError, KeyError, TypeError):
             message = str(response.json()["error"]["message"])
+        if response.status_code == HTTPStatus.UNAUTHORIZED and not self._has_token:
+            message = f"needs a token, and none was given; {_HOW_TO_GIVE_A_TOKEN}"
         kind = ServerUnavailable if response.status_code in _TEMPORARY else ServerError
         retry = response.headers.get("retry-after", "")
         seconds = float(retry) if retry.isdecimal() else 0.0
@@ -222,8 +228,8 @@ def checked_url(url: str) -> str:
         raise RunnerError(f"server: found {url!r}, expected an address such as http://localhost:8000.")
     if parts.username is not None or parts.password is not None:
         raise RunnerError(
-            f"server: found a name or password in the address of {parts.hostname}, expected none: a token "
-            f"is given by --token, ${TOKEN_VARIABLE} or a file named by ${TOKEN_FILE_VARIABLE}."
+            f"server: found a name or password in the address of {parts.hostname}, expected none; "
+            f"{_HOW_TO_GIVE_A_TOKEN}"
         )
     return url.rstrip("/")
 

@@ -151,7 +151,7 @@ class Tokens:
         """Return a new token and its secret, which is not stored.
 
         Raises:
-            RunnerError: the name or a scope is invalid, or there are too many tokens.
+            RunnerError: the name is invalid or in use, or there are too many tokens.
             StorageError: the file cannot be written.
         """
         if not _NAME.fullmatch(name):
@@ -163,6 +163,12 @@ class Tokens:
         def add(tokens: tuple[Token, ...]) -> tuple[Token, ...]:
             if len(tokens) >= MAX_TOKENS:
                 raise RunnerError(f"token: there are {MAX_TOKENS} tokens; revoke some.")
+            for other in tokens:
+                if other.name == name:
+                    raise RunnerError(
+                        f"token: the name {name!r} is in use; choose another, or revoke that token by "
+                        f"`dualtaxi token revoke {other.id}`."
+                    )
             return (*tokens, token)
 
         self._file.change(add)

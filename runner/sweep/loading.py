@@ -41,7 +41,7 @@ def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
     """
     file = config_path(path)
     document = read_yaml(read_text(file), str(file))
-    return _sweep(document, name, file.stem, file.parent)
+    return _with_checked_parameters(_sweep(document, name, file.stem, file.parent), document)
 
 
 def from_text(text: str, source: str) -> Sweep:
@@ -54,11 +54,14 @@ def from_text(text: str, source: str) -> Sweep:
     Raises:
         ConfigError: as for `load_sweep`.
     """
-    return _sweep(read_yaml(text, source), None, Path(source).stem, None)
+    document = read_yaml(text, source)
+    return _with_checked_parameters(_sweep(document, None, Path(source).stem, None), document)
 
 
 def from_values(values: Mapping[str, Any]) -> Sweep:
     """Return the sweep that plain values describe, as `Sweep.to_mapping` returns them.
+
+    Its parameters were checked when it was loaded; no environment is made to check them again.
 
     Raises:
         ConfigError: they do not describe a sweep.
@@ -112,9 +115,7 @@ def _sweep(document: Document, name: str | None, stem: str, folder: Path | None)
         )
     base, values = _base(file, document, sweep_name, folder)
     resolved = file.model_copy(update={"name": sweep_name, "base": values})
-    sweep = Sweep(sweep_name, resolved, base)
-    _check_parameters(sweep, document)
-    return sweep
+    return Sweep(sweep_name, resolved, base)
 
 
 def _combined(errors: Sequence[ConfigError]) -> ConfigError:
@@ -173,8 +174,8 @@ def _part(document: Document, key: str) -> Document:
     return Document(document.value.get(key), places)
 
 
-def _check_parameters(sweep: Sweep, document: Document) -> None:
-    """Try every bound and choice of each parameter, with values of the others that are valid with it."""
+def _with_checked_parameters(sweep: Sweep, document: Document) -> Sweep:
+    """Return the sweep; try every bound and choice of each parameter, with values of the others that fit."""
     errors = []
     for path, parameter in sweep.file.parameters.items():
         for number, sample in enumerate(_samples(parameter)):
@@ -186,6 +187,7 @@ def _check_parameters(sweep: Sweep, document: Document) -> None:
                 errors.append(error)
     if errors:
         raise _combined(errors)
+    return sweep
 
 
 def _valid_experiment(sweep: Sweep, path: str, sample: object, document: Document) -> ExperimentConfig:

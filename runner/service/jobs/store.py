@@ -196,7 +196,7 @@ class JobStore:
         """
         with self._lock:
             if number not in self._jobs:
-                raise JobNotFound(f"no job {number}; `GET /jobs` lists those there are.")
+                raise JobNotFound(f"no job {number}; `dualtaxi remote jobs` and the page /queue list them.")
             return self._jobs[number]
 
     def add(

@@ -214,7 +214,7 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
     log: list[LogLine] = []
     try:
         with open_recording(run.recording) as recording:
-            facts |= {"Job": recording.job, "Size": humanize.size(recording.size)}
+            facts |= {"Job hash": recording.job, "Size": humanize.size(recording.size)}
             provenance, log = recording.provenance, _log(recording)
     except RecordingError as error:
         facts["Recording"] = settings.without_folders(str(error))

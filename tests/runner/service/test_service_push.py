@@ -151,6 +151,13 @@ def test_a_token_is_found_and_never_printed(own_server, run, recordings, tmp_pat
     push = ("remote", "push", run.run_id, "--recordings", recordings, "--server", own_server.url)
     refused = dualtaxi(*push, "--token", "dualtaxi_wrong")
     assert (refused.exit_code, "token" in refused.stderr) == (2, True)
+    without = dualtaxi(*push)
+    assert (without.exit_code, "--token" in without.stderr, "$DUALTAXI_TOKEN" in without.stderr) == (
+        2,
+        True,
+        True,
+    )
+    assert "Bearer" not in without.stderr
     (tmp_path / "token").write_text(token + "\n")
     taken = dualtaxi(*push, "--token-file", tmp_path / "token")
     assert taken.exit_code == 0, taken.stderr

@@ -64,6 +64,14 @@ def test_on_another_host_reading_and_writing_need_a_token(connect, open_to_other
     assert client.get("/healthz").status_code == 200
 
 
+def test_a_second_token_of_a_name_is_refused(tokens):
+    token, _ = tokens.create("laptop", (READ,))
+    with pytest.raises(RunnerError, match=f"'laptop' is in use; .*revoke {token.id}"):
+        tokens.create("laptop", (WRITE,))
+    tokens.revoke(token.id)
+    tokens.create("laptop", (READ,))
+
+
 def test_a_token_is_stored_as_a_hash_for_its_owner_only(tokens):
     token, secret = tokens.create("laptop", (READ,))
     text = tokens.path.read_text()
@@ -214,6 +222,7 @@ def test_pages_offer_a_read_token_no_writes(connect, open_to_others, tokens):
         assert refused.status_code == 403
         assert refused.headers["content-type"].startswith("text/html")
         assert "found one for reading, expected one for writing" in refused.text
+        assert 'href="/login"' not in refused.text
     client.post("/login", data={"token": writes})
     page = client.get("/runs/first").text
     assert "writer" in page

@@ -64,7 +64,7 @@ def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
         assert client.resume(first.number).state == "queued"
         with pytest.raises(ServerError, match=r"bad\.yaml:1:1: episodes: found 'many'"):
             client.submit("episodes: many", "bad.yaml")
-        with pytest.raises(ServerError, match="no job 99"):
+        with pytest.raises(ServerError, match="no job 99; `dualtaxi remote jobs`"):
             list(client.watch(99))
 
 

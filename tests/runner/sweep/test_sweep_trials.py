@@ -221,6 +221,16 @@ def test_a_changed_sweep_is_refused_with_its_changes(sweep, tmp_path):
     assert state.read_sweep("small", tmp_path) == changed
 
 
+def test_a_sweep_is_read_without_its_environment(sweep, tmp_path):
+    state.begin(sweep, tmp_path, resume=False, accept_changes=False)
+    path = state.folder_of("small", tmp_path) / "sweep.yaml"
+    text = path.read_text()
+    changed = text.replace(sweep.base.env.id, "gone:Gone-v0")
+    assert changed != text
+    path.write_text(changed)
+    assert state.read_sweep("small", tmp_path).base.env.id == "gone:Gone-v0"
+
+
 def test_a_second_sweep_of_a_name_and_a_second_process_are_refused(sweep, tmp_path):
     state.begin(sweep, tmp_path, resume=False, accept_changes=False)
     with pytest.raises(RunnerError, match="--resume continues it"):
