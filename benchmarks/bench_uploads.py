@@ -23,9 +23,10 @@ from blake3 import blake3
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
 from benchmarks.serving import Service, serving
-from runner.client.client import Client, UploadSource
+from runner.client.client import Client
 from runner.execution.verify import verify
 from runner.runs.resolve import find_run
+from runner.runs.run import Run
 
 LOOP = """
 import sys, gymnasium, runner
@@ -52,25 +53,25 @@ def measure(quick: bool) -> list[Figure]:
             return [*figures, *_memory(recording, folder, service, steps)]
 
 
-def _large_recording(folder: Path, megabytes: int) -> UploadSource:
+def _large_recording(folder: Path, megabytes: int) -> Run:
     """Return a run of this size: uncompressed, with random steps."""
     sets = ["recording.compression=none", f"episodes={megabytes * 13}", "epsilon=1"]
     sets += ["evaluation.every=1000000", "snapshots.every=1000000"]
     run(run_command("quick", str(folder), *sets))
-    return UploadSource.of_run(find_run("@latest", folder))
+    return find_run("@latest", folder)
 
 
-def _speed(source: UploadSource, folder: Path, url: str, repetitions: int) -> list[Figure]:
-    size, uploaded, copied = source.path.stat().st_size, [], []
-    digest, begin = _digest(source.path), 0.0
+def _speed(source: Run, folder: Path, url: str, repetitions: int) -> list[Figure]:
+    size, uploaded, copied = source.recording.stat().st_size, [], []
+    digest, begin = _digest(source.recording), 0.0
     with Client(url) as client:
         for number in range(repetitions):
-            copied.append(size / seconds(lambda: _copy(source.path, folder / "copy")) / 1e6)
+            copied.append(size / seconds(lambda: _copy(source.recording, folder / "copy")) / 1e6)
             (folder / "copy").unlink()
             begin = time.perf_counter()
             sent = client.begin_upload(size=size)
             while sent.offset < size:
-                sent = client.append_upload(sent, source.path, size)
+                sent = client.append_upload(sent, source.recording, size)
             last = number == repetitions - 1
             sent = client.complete_upload(sent, source, size, digest if last else "0" * 64)
             uploaded.append(size / (time.perf_counter() - begin) / 1e6)
@@ -103,7 +104,7 @@ def _digest(path: Path) -> str:
     return blake3().update_mmap(path).hexdigest()
 
 
-def _memory(source: UploadSource, folder: Path, service: Service, steps: int) -> list[Figure]:
+def _memory(source: Run, folder: Path, service: Service, steps: int) -> list[Figure]:
     """Return the server's memory under load, and check that nothing was lost."""
     shutil.rmtree(folder / "theirs" / source.run_id)
     own, children, over = [], [], threading.Event()
@@ -133,7 +134,7 @@ def _memory(source: UploadSource, folder: Path, service: Service, steps: int) ->
             "MB",
             (400, 250),
             higher_is_better=False,
-            detail=f"with {source.path.stat().st_size / 1e6:,.0f} MB uploaded and downloaded; {took:.0f} s; "
+            detail=f"with {(source.summary.bytes or 0) / 1e6:,.0f} MB uploaded and downloaded; {took:.0f} s; "
             f"at most {early:.0f} MB in the first half and {late:.0f} MB in the second; "
             f"its child processes at most {max(children):.0f} MB",
         ),
@@ -141,7 +142,7 @@ def _memory(source: UploadSource, folder: Path, service: Service, steps: int) ->
     ]
 
 
-def _load(source: UploadSource, folder: Path, url: str, steps: int) -> list[tuple[str, str]]:
+def _load(source: Run, folder: Path, url: str, steps: int) -> list[tuple[str, str]]:
     """Record and push in many processes, upload and download a large recording; return the digests."""
     with contextlib.ExitStack() as stack:
         environment = os.environ | {"XDG_STATE_HOME": str(folder / "state")}
@@ -156,10 +157,10 @@ def _load(source: UploadSource, folder: Path, url: str, steps: int) -> list[tupl
             )
             for seed in range(PROCESSES)
         ]
-        with Client(url, patience=600) as client:
+        with Client(url, retry_timeout=600) as client:
             client.push(source)
             pulled = client.pull(source.run_id, folder / "back")
-        assert pulled.content_digest == source.content_digest
+        assert pulled.content_digest == source.summary.content_digest
         outputs = [loop.communicate()[0].split() for loop in loops]
     assert not list((folder / "state").rglob("recording.mcap")), "a run was left in the outbox"
     return [(run_id, digest) for run_id, digest in outputs]

@@ -10,11 +10,11 @@ Bytes that were sent before a connection broke are not sent again; the same run 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from http import HTTPStatus
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from runner.client.connection import READ_BYTES, Connection, Report, ServerError, ServerUnavailable
 from runner.client.jobs import JobEvent, RemoteJob, watch
@@ -30,49 +30,28 @@ if TYPE_CHECKING:
 PIECE: Final = 32 << 20
 """Maximum number of bytes of a request; a proxy in front of the server must accept them."""
 _WAIT_SECONDS: Final = 20
-
-
-@dataclass(frozen=True)
-class UploadSource:
-    """A file to upload, and what its sender knows of the run in it."""
-
-    path: Path
-    name: str = ""
-    run_id: str = ""
-    content_digest: str | None = None
-    run: Mapping[str, Any] = field(default_factory=dict)
-    """What `run.json` has of the run and its recording does not."""
-    labels: Mapping[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def of_run(cls, run: Run) -> UploadSource:
-        """Return a run that is over, to be uploaded.
-
-        Raises:
-            RunnerError: it is running, or in an archive only.
-        """
-        if run.status not in ("finished", "interrupted", "failed"):
-            raise RunnerError(
-                f"run {run.run_id} is {run.status}; only one that is over and here can be pushed."
-            )
-        source = cls(run.recording, run.name, run.run_id, run.summary.content_digest)
-        if run.stands_alone:  # an exported recording carries its own record of the run
-            return source
-        summary = {"seconds": run.summary.seconds, "error": run.summary.error}
-        facts = {"name": run.file.name, "status": run.status, "proof": run.file.proof, "summary": summary}
-        return replace(source, run=facts, labels=as_json(run.labels))
+UploadState = Literal["receiving", "verifying", "stored", "refused"]
 
 
 @dataclass(frozen=True)
 class UploadStatus:
-    """The state of an upload on the server."""
+    """An upload and its state, as clients see them."""
 
     id: str
-    state: str
-    offset: int
+    state: UploadState = "receiving"
+    offset: int = 0
+    """Number of bytes received: the next ones begin here."""
+    size: int | None = None
+    """Number of bytes when it is complete, if that is known."""
+    name: str = ""
     run_id: str = ""
+    """The announced run; when it is stored, the run that it is."""
     already: bool = False
+    """Whether that run was there before."""
     problem: str = ""
+    """Why it was refused; of one that is being received again, why it could not be stored."""
+    created: str = ""
+    """In UTC, as ISO 8601."""
 
 
 class Client(Connection):
@@ -118,45 +97,44 @@ class Client(Connection):
         return pull(self, name, recordings, report)
 
     def push(
-        self,
-        source: UploadSource | Run,
-        report: Report = lambda *_: None,
-        begun: UploadStatus | None = None,
+        self, run: Run, report: Report = lambda *_: None, begun: UploadStatus | None = None
     ) -> UploadStatus:
         """Upload a run, and return the result when the server has verified and stored it.
 
         Args:
-            source: a run that is over, or a file and what is known of its run.
+            run: a run that is over.
             report: called with the progress.
             begun: an upload that has its first bytes already.
 
         Raises:
             ServerError: it was refused, with the reason.
             ServerUnavailable: the server did not respond in time; it keeps what it has received.
-            RunnerError: the run cannot be sent.
+            RunnerError: the run is running, or in an archive only, or cannot be read.
         """
-        if isinstance(source, Run):
-            source = UploadSource.of_run(source)
+        if run.status not in ("finished", "interrupted", "failed"):
+            raise RunnerError(
+                f"run {run.run_id} is {run.status}; only one that is over and here can be pushed."
+            )
         try:
-            size, digest = hash_of(source.path)
+            size, digest = hash_of(run.recording)
         except OSError as error:
-            raise RunnerError(f"{source.path}: cannot be read ({error.strerror}).") from error
-        upload = self._deliver(source, size, digest, report, begun)
+            raise RunnerError(f"{run.recording}: cannot be read ({error.strerror}).") from error
+        upload = self._deliver(run, size, digest, report, begun)
         if upload.state == "refused" and begun is not None:  # the file has changed since it began
-            upload = self._deliver(source, size, digest, report, None)
+            upload = self._deliver(run, size, digest, report, None)
         if upload.state == "refused":
-            raise ServerError(f"{self.url}: refused the run {source.run_id}: {upload.problem}")
+            raise ServerError(f"{self.url}: refused the run {run.run_id}: {upload.problem}")
         return upload
 
     def _deliver(
-        self, source: UploadSource, size: int, digest: str, report: Report, begun: UploadStatus | None
+        self, run: Run, size: int, digest: str, report: Report, begun: UploadStatus | None
     ) -> UploadStatus:
         """Take the next step of an upload until it is stored or refused, and return it.
 
         After a step that failed for now, the upload is taken up again as the server has it.
         """
-        announced = {"digest": digest, "size": size, "name": source.name, "run_id": source.run_id}
-        announced["content_digest"] = source.content_digest
+        announced = {"digest": digest, "size": size, "name": run.name, "run_id": run.run_id}
+        announced["content_digest"] = run.summary.content_digest
         upload, furthest, backoff = None, -1, self.backoff()
         while upload is None or upload.state not in ("stored", "refused"):
             try:
@@ -167,9 +145,9 @@ class Client(Connection):
                     if upload.state == "receiving" and upload.problem:
                         raise ServerUnavailable(f"{self.url}: {upload.problem}")
                 elif upload.offset < size:
-                    upload = self.append_upload(upload, source.path, size)
+                    upload = self.append_upload(upload, run.recording, size)
                 elif upload.offset == size:
-                    upload = self.complete_upload(upload, source, size, digest)
+                    upload = self.complete_upload(upload, run, size, digest)
                 else:  # the file became shorter, as one does whose disk was full
                     self.delete_upload(upload)
                     upload = begun = None
@@ -206,11 +184,13 @@ class Client(Connection):
         """Return the state of an upload; wait up to some seconds for its verification."""
         return self._upload("GET", f"/uploads/{upload.id}", params={"wait": wait})
 
-    def complete_upload(
-        self, upload: UploadStatus, source: UploadSource, size: int, digest: str
-    ) -> UploadStatus:
-        """Complete an upload, so that it is verified; errors as for `request`."""
-        completion = {"digest": digest, "size": size, "run": dict(source.run), "labels": dict(source.labels)}
+    def complete_upload(self, upload: UploadStatus, run: Run, size: int, digest: str) -> UploadStatus:
+        """Complete the upload of a run, so that it is verified; errors as for `request`."""
+        completion: dict[str, Any] = {"digest": digest, "size": size}
+        if not run.stands_alone:  # an exported recording carries its own record of the run
+            summary = {"seconds": run.summary.seconds, "error": run.summary.error}
+            facts = {"name": run.file.name, "status": run.status, "proof": run.file.proof, "summary": summary}
+            completion |= {"run": facts, "labels": as_json(run.labels)}
         return self._upload("POST", f"/uploads/{upload.id}/complete", json=completion)
 
     def delete_upload(self, upload: UploadStatus) -> None:
@@ -220,8 +200,7 @@ class Client(Connection):
     def _upload(self, method: str, path: str, **options: Any) -> UploadStatus:
         response = self.request_object(method, path, **options)
         try:
-            keys = ("id", "state", "offset", "run_id", "already", "problem")
-            return UploadStatus(*(response[key] for key in keys))
+            return UploadStatus(**{field.name: response[field.name] for field in fields(UploadStatus)})
         except KeyError as error:
             raise self.unexpected_response() from error
 

@@ -75,7 +75,7 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Uploa
     with locked(run) as own:
         push, begun = _read_push_file(own), None
         if push.upload and push.server == client.url:
-            begun = UploadStatus(push.upload, "receiving", offset=0)
+            begun = UploadStatus(push.upload)
         upload = client.push(own, report, begun)
         sent = own.folder.with_name(f"{_SENT}{own.folder.name}")
         own.folder.rename(sent)

@@ -128,7 +128,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
             JobPool(settings.recordings[0], settings.workers, max_unfinished=limits.jobs, ray=settings.ray)
         )
         app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
-        app.state.uploads = stack.enter_context(Uploads(settings.recordings[0], limits, log_upload))
+        app.state.uploads = Uploads(settings.recordings[0], limits, log_upload)
+        stack.callback(app.state.uploads.close)
         app.state.processes = stack.enter_context(
             ProcessPool(PROCESSES, limits.work_seconds, limits.work_bytes)
         )

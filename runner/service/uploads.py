@@ -18,13 +18,15 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final
 
 from filelock import FileLock
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
+from runner.client.client import UploadStatus
 from runner.errors import RunnerError, RunNotFound, StorageError
 from runner.recording.labels import labels_from
 from runner.runs.importing import import_recording
@@ -52,7 +54,6 @@ NICENESS: Final = 5
 _DISK: Final = "the server's disk"
 """How clients see the place of an error."""
 
-State = Literal["receiving", "verifying", "stored", "refused"]
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Size = Annotated[int, Field(ge=0, lt=1 << 62)]
 Text = Annotated[str, Field(max_length=100)]
@@ -84,36 +85,15 @@ class Completion(BaseModel):
     """Its name, tags and note; likewise."""
 
 
-class UploadStatus(BaseModel):
-    """An upload and its state, as clients see them."""
-
-    id: str
-    state: State = "receiving"
-    """`receiving`, `verifying`, `stored` as a run, or `refused`."""
-    offset: int = 0
-    """Number of bytes received: the next ones begin here."""
-    size: int | None
-    """Number of bytes when it is complete, if that is known."""
-    name: str
-    run_id: str
-    """The announced run; when it is stored, the run that it is."""
-    already: bool = False
-    """Whether that run was there before."""
-    problem: str = ""
-    """Why it was refused; of one that is being received again, why it could not be stored."""
-    created: str
-    """In UTC, as ISO 8601."""
-
-
+@dataclass(frozen=True, kw_only=True)
 class Upload(UploadStatus):
-    """An upload as the server stores it; replaced, never changed."""
+    """An upload as the server stores it."""
 
-    model_config = ConfigDict(frozen=True)
     owner: str
     """Who may continue it."""
     digest: str | None
     completion: Completion | None = None
-    changed: float = Field(default_factory=time.time)
+    changed: float = field(default_factory=time.time)
     """When it last changed, in seconds since 1970."""
 
     @property
@@ -121,9 +101,10 @@ class Upload(UploadStatus):
         """Whether its result is final."""
         return self.state in ("stored", "refused")
 
-    def replace(self, **changes: object) -> Upload:
+    def replace(self, **changes: Any) -> Upload:
         """Return the upload with other values of some fields, and without its problem."""
-        return self.model_copy(update={"problem": "", "changed": time.time()} | changes)
+        new: dict[str, Any] = {"problem": "", "changed": time.time()} | changes
+        return replace(self, **new)
 
     def refused(self, problem: str) -> Upload:
         """Return the upload when it can never be a run."""
@@ -132,6 +113,9 @@ class Upload(UploadStatus):
     def returned(self, problem: str) -> Upload:
         """Return the upload when it is to be completed again: the problem is the server's."""
         return self.replace(state="receiving", problem=problem)
+
+
+_STORED: Final = TypeAdapter(Upload)
 
 
 class Uploads:
@@ -163,24 +147,18 @@ class Uploads:
         self._processes = ProcessPool(1, VERIFY_SECONDS, VERIFY_MEMORY, max_waiting=limits.uploads)
         for folder in [entry for entry in self._folder.iterdir() if entry.is_dir()]:
             try:
-                upload = Upload.model_validate_json((folder / STATE_FILE).read_bytes())
+                upload = _STORED.validate_json((folder / STATE_FILE).read_bytes())
                 facts = {path.name: path.stat() for path in folder.iterdir()}
             except (OSError, ValueError):
                 shutil.rmtree(folder, ignore_errors=True)
                 continue
             offset = facts[BODY_FILE].st_size if BODY_FILE in facts else upload.offset
             changed = max(stat.st_mtime for stat in facts.values())
-            self._uploads[upload.id] = upload.model_copy(update={"offset": offset, "changed": changed})
+            self._uploads[upload.id] = replace(upload, offset=offset, changed=changed)
         self._forget()
         for upload in self.all():
             if upload.state == "verifying":
                 self._verify(upload)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Stop; an unfinished verification is repeated by the next server."""
@@ -246,6 +224,7 @@ class Uploads:
                 self._body(upload).parent.mkdir()
                 self._body(upload).touch()
             self._save(upload)
+            self._uploads[upload.id] = upload
         return upload, True
 
     def append(
@@ -253,12 +232,7 @@ class Uploads:
     ) -> Upload:
         """Append bytes, and return the upload after them. Of bytes that are too many, none is written.
 
-        Args:
-            upload_id: the upload.
-            owner: its owner.
-            offset: where the bytes begin, which must be where the received ones end.
-            data: the bytes.
-            more: how many are announced to follow; if there is no room for them, the sender learns it now.
+        `more` bytes are announced to follow; if there is no room for them, the sender learns it now.
 
         Raises:
             UploadConflict: the bytes do not follow those that were received.
@@ -305,6 +279,7 @@ class Uploads:
                 raise UploadConflict("found another digest than the one announced; begin another upload.")
             upload = upload.replace(state="verifying", completion=completion, size=completion.size)
             self._save(upload)
+            self._uploads[upload.id] = upload
         self._verify(upload)
         return upload
 
@@ -326,8 +301,7 @@ class Uploads:
 
     def _save(self, upload: Upload) -> None:
         with storage_errors(_DISK):
-            write_object(self._body(upload).with_name(STATE_FILE), upload.model_dump(mode="json"))
-        self._uploads[upload.id] = upload
+            write_object(self._body(upload).with_name(STATE_FILE), _STORED.dump_python(upload, mode="json"))
 
     def _require_room(self, upload: Upload, more: int) -> None:
         """Refuse an upload if there is no room for more of its bytes."""
@@ -370,15 +344,15 @@ class Uploads:
             upload = upload.returned(
                 "something unexpected went wrong while it was verified; complete it again."
             )
+        with contextlib.suppress(StorageError):  # after a restart it is verified again, with the same result
+            self._save(upload)
+        if upload.is_over:
+            with contextlib.suppress(OSError):  # removed with the rest of it, when it is forgotten
+                self._body(upload).unlink(missing_ok=True)
         try:
             self._on_verified(upload)
         finally:
-            with contextlib.suppress(StorageError):  # after a restart it is verified again, equally
-                self._save(upload)
             self._uploads[upload.id] = upload
-            if upload.is_over:
-                with contextlib.suppress(OSError):  # removed with the rest of it, when it is forgotten
-                    self._body(upload).unlink(missing_ok=True)
 
 
 def verify(upload: Upload, body: Path, recordings: Path) -> Upload:

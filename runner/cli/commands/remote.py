@@ -148,11 +148,10 @@ def push(
 
 def _named(names: tuple[str, ...], server: Server, recordings: Path | None) -> Iterator[tuple[str, Upload]]:
     """Yield the names of runs, and the function that uploads each."""
-    from runner.client.client import UploadSource
 
     def upload(name: str, report: Report) -> dict[str, Any]:
-        source = UploadSource.of_run(find_recorded(name, recordings))
-        return _stored(client.push(source, report), source.name, source.path.stat().st_size)
+        run = find_recorded(name, recordings)
+        return _stored(client.push(run, report), run.name, run.recording.stat().st_size)
 
     with server.client() as client:
         for name in names:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import time
+from dataclasses import replace
 from http import HTTPStatus
 from typing import Annotated, Final
 
@@ -13,11 +13,12 @@ from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from pydantic import BaseModel
 from starlette.requests import ClientDisconnect
 
+from runner.client.client import UploadState, UploadStatus
 from runner.service.dependencies import UploadsOf
 from runner.service.errors import Refused
 from runner.service.problems import error_docs
 from runner.service.tokens import Token
-from runner.service.uploads import Announcement, Completion, State, UploadStatus
+from runner.service.uploads import Announcement, Completion
 
 router = APIRouter(tags=["uploads"])
 
@@ -36,9 +37,9 @@ class UploadsResponse(BaseModel):
 
 
 def owner_of(request: Request) -> str:
-    """Return the owner of a request's uploads: the hash of its token, hashed once more, or nothing."""
+    """Return the owner of a request's uploads: the id of its token, or nothing."""
     token: Token | None = request.state.token
-    return hashlib.sha256(b"owner of uploads " + token.sha256.encode()).hexdigest() if token else ""
+    return token.id if token else ""
 
 
 OwnerOf = Annotated[str, Depends(owner_of)]
@@ -49,13 +50,12 @@ _BYTES: Final = {"application/octet-stream": {"schema": {"type": "string", "form
 
 @router.get("/uploads", summary="List uploads in progress and the results of others.")
 def list_uploads(
-    uploads: UploadsOf, owner: OwnerOf, state: Annotated[State | None, Query()] = None
+    uploads: UploadsOf, owner: OwnerOf, state: Annotated[UploadState | None, Query()] = None
 ) -> UploadsResponse:
     """List uploads, the newest first; ids and problems only of one's own."""
-    hidden = {"id": "", "problem": ""}
     chosen = [upload for upload in uploads.all() if state in (None, upload.state)]
     return UploadsResponse(
-        uploads=[each if each.owner == owner else each.model_copy(update=hidden) for each in chosen]
+        uploads=[each if each.owner == owner else replace(each, id="", problem="") for each in chosen]
     )
 
 

@@ -26,13 +26,13 @@ from served import Served
 import runner
 from runner.cli import cli
 from runner.client import client as client_module
-from runner.client.client import Client, UploadSource, UploadStatus
+from runner.client.client import Client, UploadStatus
 from runner.client.connection import Backoff, ServerError, ServerUnavailable, checked_url, find_token
 from runner.client.outbox import outbox_folder
 from runner.export.mcap import export_mcap
 from runner.recording.labels import change_labels
 from runner.runs.resolve import find_run
-from runner.runs.run import list_runs
+from runner.runs.run import Run, list_runs
 from tests.runner.recording.making import TAXIS, make_run, with_id
 from tests.waiting import until
 
@@ -86,7 +86,7 @@ def copies(run, folder, count):
     """Return runs of the same content, each with an id of its own."""
     paths = {f"copy{number}": folder / f"{number}.mcap" for number in range(count)}
     return [
-        UploadSource(with_id(run_id, run.recording, path), "copy", run_id, run={"status": "finished"})
+        Run(folder, run.facts | {"run_id": run_id}, with_id(run_id, run.recording, path))
         for run_id, path in paths.items()
     ]
 
@@ -140,7 +140,7 @@ def test_a_refused_run_is_reported(server, run, tmp_path):
     data[len(data) // 2] ^= 1
     (tmp_path / "bad.mcap").write_bytes(data)
     with Client(server.url) as client, pytest.raises(ServerError, match="refused the run"):
-        client.push(UploadSource(tmp_path / "bad.mcap"))
+        client.push(Run(run.folder, run.facts | {"summary": {}}, tmp_path / "bad.mcap"))
 
 
 def test_a_token_is_found_and_never_printed(own_server, run, recordings, tmp_path, monkeypatch):
@@ -242,7 +242,7 @@ def test_a_server_killed_during_twenty_uploads_loses_none(own_server, run, tmp_p
     assert len(list_runs(own_server.recordings)) == 20, time.monotonic() - begun
     for source in sources:
         stored = find_run(source.run_id, own_server.recordings)
-        assert stored.recording.read_bytes() == source.path.read_bytes()
+        assert stored.recording.read_bytes() == source.recording.read_bytes()
     assert not list(own_server.recordings.glob(".uploads/*/body"))
 
 
@@ -268,7 +268,7 @@ def test_a_broken_connection_leaves_what_was_received(server, run):
             client.append_upload(now, run.recording, len(data))
         assert refused.value.status == 409
         with pytest.raises(ServerError, match="expected the"):
-            client.complete_upload(now, UploadSource(run.recording), len(data) + 5, "0" * 64)
+            client.complete_upload(now, run, len(data) + 5, "0" * 64)
         client.delete_upload(now)
         with pytest.raises(ServerError, match="no such upload"):
             client.upload_status(now)
@@ -301,7 +301,7 @@ def test_a_recording_made_to_exhaust_memory_is_refused(server, tmp_path, run):
     bomb = zstandard.compress(bytes(1 << 28), 19)
     (tmp_path / "bomb.mcap").write_bytes(data[:at] + bomb + data[at + len(bomb) :])
     with Client(server.url) as client, pytest.raises(ServerError, match="refused"):
-        client.push(UploadSource(tmp_path / "bomb.mcap"))
+        client.push(Run(run.folder, run.facts | {"summary": {}}, tmp_path / "bomb.mcap"))
 
 
 # --- loops ------------------------------------------------------------------------------------------------
@@ -422,5 +422,5 @@ def test_an_upload_begun_with_other_bytes_is_sent_again(server, run):
         wrong = client.append_upload(begun, run.recording, 5_000)
         assert wrong.offset == 5_000
         other = list_runs(run.folder.parent)[0 if list_runs(run.folder.parent)[0].name == "second" else 1]
-        sent = client.push(other, begun=UploadStatus(begun.id, "receiving", 0))
+        sent = client.push(other, begun=UploadStatus(begun.id))
     assert (sent.state, sent.run_id) == ("stored", other.run_id)
