@@ -97,10 +97,10 @@ def _states(mdp: Mdp, shape: Shape) -> pa.Table:
 def _actions(mdp: Mdp, shape: Shape) -> pa.Table:
     """Return a row for each joint action: description, and each agent's own action."""
     action = np.arange(mdp.joint_actions, dtype=np.int32)
-    own = np.unravel_index(action, mdp.action_counts)
     columns: dict[str, Any] = {"action": action, "words": actions_in_words(mdp).tolist()}
     if shape.own_actions:
-        columns |= {name: digit.astype(np.int32) for name, digit in zip(shape.own_actions, own, strict=True)}
+        own = mdp.own_actions.T.astype(np.int32)
+        columns |= dict(zip(shape.own_actions, own, strict=True))
     return _table(columns, shape)
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -73,6 +74,12 @@ class Mdp:
     def joint_actions(self) -> int:
         """Number of joint actions."""
         return int(self.next_state.shape[1])
+
+    @cached_property
+    def own_actions(self) -> NDArray[np.int64]:
+        """[J, agents]: each agent's part of every joint action."""
+        joint = np.arange(self.joint_actions)
+        return np.stack(np.unravel_index(joint, self.action_counts), axis=1).astype(np.int64)
 
     @property
     def success_mask(self) -> int:

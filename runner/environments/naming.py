@@ -69,7 +69,7 @@ def numbered_actions(mdp: Mdp) -> list[list[str]]:
 
 def agent_actions(mdp: Mdp, action: int) -> tuple[int, ...]:
     """Return the action of each agent in a joint action."""
-    return tuple(int(own) for own in np.unravel_index(action, mdp.action_counts))
+    return tuple(mdp.own_actions[action].tolist())
 
 
 def exploration_in_words(mask: int, learners: Sequence[str]) -> str:

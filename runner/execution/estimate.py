@@ -50,9 +50,9 @@ def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
     learns = config.algorithm != "random"
     clumsy = min(config.episodes, CLUMSY_EPISODES) if learns else config.episodes
     typical = round(step_limit * (CLUMSY * (clumsy + trials) + SKILLED * (config.episodes - clumsy)))
-    most = step_limit * (config.episodes + trials)
+    longest = step_limit * (config.episodes + trials)
     rate = bytes_a_step(config)
-    return Estimate(evaluations, snapshots, typical, typical * rate, most, most * rate)
+    return Estimate(evaluations, snapshots, typical, typical * rate, longest, longest * rate)
 
 
 def _occasions(episodes: int, every: int) -> int:

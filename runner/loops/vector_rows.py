@@ -270,7 +270,7 @@ class VectorRows:
         # What `taken` was when the episode began; its steps before the block count as taken before it.
         began = np.where(np.vstack([np.zeros(n, np.bool_), over]), taken, -self._length)
         np.maximum.accumulate(began, axis=0, out=began)
-        t = np.where(only_reset, schema.NEVER, taken[:-1] - began[:-1])
+        t = np.where(only_reset, schema.RESET_ONLY, taken[:-1] - began[:-1])
         returns = self._returns(over, only_reset)
         return _Counts(over, only_reset, ended_before, t, taken[1:] - began[:-1], returns)
 

@@ -17,7 +17,7 @@ from runner.environments.mdp import step_counts
 from runner.recording import schema
 from runner.recording.loop_blocks import Block, Blocks, Bools, Inconsistent, Ints, OnBlock
 from runner.recording.reader import Recording
-from runner.recording.schema import NEVER
+from runner.recording.schema import RESET_ONLY
 
 Expected = dict[str, NDArray[Any]]
 
@@ -120,14 +120,14 @@ class _Phase:
 
     def _check_block(self, b: Block) -> None:
         """Check some steps of all environments, and the resets before each of them."""
-        state, never, opening = self._state, b.never, b.opening
-        if (wrong := np.flatnonzero(never & ~b.was_reset)).size:
+        state, reset_only, opening = self._state, b.reset_only, b.opening
+        if (wrong := np.flatnonzero(reset_only & ~b.was_reset)).size:
             raise self._wrong(b.number[wrong[0]], "t", "that of a reset alone", "a reset before it")
         # A step's `t` is the number of steps before it in its episode, of which a reset alone is none.
-        counted = np.cumsum(~never)
-        before = counted[b.heads] - ~never[b.heads]
+        counted = np.cumsum(~reset_only)
+        before = counted[b.heads] - ~reset_only[b.heads]
         carried = np.where(b.continues, state.length[b.owner], 0)
-        t = np.where(never, NEVER, counted - ~never - before[b.segment] + carried[b.segment])
+        t = np.where(reset_only, RESET_ONLY, counted - ~reset_only - before[b.segment] + carried[b.segment])
         self._compare(b.number, "t", b.rows["t"], t)
 
         lengths = counted[b.tails] - before + carried
@@ -148,6 +148,19 @@ class _Phase:
 
         returns, counts = self._returns(b), self._counts(b)
         self._check_episodes(b, lengths, returns, counts, ended, interrupted)
+        self._carry_over(b, episodes, lengths, returns, counts, ended)
+
+    def _carry_over(
+        self,
+        b: Block,
+        episodes: Ints,
+        lengths: Ints,
+        returns: NDArray[np.float64],
+        counts: Ints | None,
+        ended: Bools,
+    ) -> None:
+        """Keep the state of each environment after its last step of the block."""
+        state = self._state
         final = np.flatnonzero((b.tails + 1) % b.times == 0)  # the last segment of each environment
         closed = ended[final]
         state.episode = episodes[final] + closed
@@ -169,7 +182,7 @@ class _Phase:
 
     def _check_observations(self, b: Block) -> None:
         """Compare the states before steps with those after the steps, or resets, before them."""
-        rows, number, never, names = b.rows, b.number, b.never, b.rows.dtype.names or ()
+        rows, number, reset_only, names = b.rows, b.number, b.reset_only, b.rows.dtype.names or ()
         observed: NDArray[Any] | None = None
         if b.resets is not None and "observation" in (b.resets.dtype.names or ()):
             observed = np.zeros(len(rows), b.resets.dtype["observation"])
@@ -179,14 +192,16 @@ class _Phase:
             if observed is not None:
                 given = observed.astype(np.int64).reshape(-1) - self._start
             before = np.where(b.opens, self._state.observed[b.environment], np.roll(after, 1))
-            expected = np.where(b.was_reset & ~never, given, before)
-            known = expected >= 0 if never.any() else np.ones(len(rows), np.bool_)
+            expected = np.where(b.was_reset & ~reset_only, given, before)
+            known = expected >= 0 if reset_only.any() else np.ones(len(rows), np.bool_)
             self._compare(number, "state", np.where(known, rows["state"], expected), expected)
-            self._compare(number, "next_state", np.where(never, after, 0), np.where(never, given, 0))
-        elif observed is not None and never.any() and "next_observation" in names:
-            same = _equal(rows["next_observation"][never], observed[never])
+            self._compare(
+                number, "next_state", np.where(reset_only, after, 0), np.where(reset_only, given, 0)
+            )
+        elif observed is not None and reset_only.any() and "next_observation" in names:
+            same = _equal(rows["next_observation"][reset_only], observed[reset_only])
             if not same.all():
-                at = np.flatnonzero(never)[np.flatnonzero(~same)[0]]
+                at = np.flatnonzero(reset_only)[np.flatnonzero(~same)[0]]
                 expected_value = "that of the reset before it"
                 raise self._wrong(number[at], "next_observation", "another value", expected_value)
         if self._learners == 1 and "agents_terminated" in names:
@@ -201,7 +216,7 @@ class _Phase:
         if (missing := np.flatnonzero((b.number < self._n) & ~explained)).size:
             raise self._wrong(b.number[missing[0]], "reset", "none", "one before the first step")
         after_end = np.where(b.opens, self._state.over[b.environment], np.roll(b.over, 1))
-        began = b.starts & ~b.never & after_end
+        began = b.starts & ~b.reset_only & after_end
         without = np.flatnonzero(began & ~explained)
         if without.size and not self._findings.begun_without:
             self._findings.first_without = int(b.number[without].min())
@@ -211,8 +226,8 @@ class _Phase:
     def _returns(self, b: Block) -> NDArray[np.float64]:
         """Return the summed rewards of each segment, added in their order as the recorder adds them."""
         rewards, carried = b.rows["rewards"], self._state.returns[b.owner]
-        if b.never.any():
-            rewards = np.where(b.never[:, np.newaxis], 0.0, rewards)
+        if b.reset_only.any():
+            rewards = np.where(b.reset_only[:, np.newaxis], 0.0, rewards)
         sums: NDArray[np.float64] = np.add.reduceat(rewards, b.heads, axis=0)
         with np.errstate(invalid="ignore", over="ignore"):
             if (np.abs(rewards) < 2**31).all() and (rewards == np.rint(rewards)).all():

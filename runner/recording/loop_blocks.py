@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.recording.schema import NEVER, Topic
+from runner.recording.schema import RESET_ONLY, Topic
 
 _ROWS: Final = 4096
 """Messages of varying size that are compared together."""
@@ -53,7 +53,7 @@ class Block:
     """Whether an episode ended after a step."""
 
     def __post_init__(self) -> None:
-        self.never = self.rows["t"] == NEVER
+        self.reset_only = self.rows["t"] == RESET_ONLY
         """Whether a step is a reset alone."""
         self.was_reset = np.zeros(len(self.rows), np.bool_)
         """Whether a reset came before a step."""

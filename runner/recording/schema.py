@@ -341,5 +341,5 @@ PHASE_NAMES: Final = {"train": "training", "eval": "evaluation"}
 
 NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", TRANSITION: "step", RESET: "reset"}
 """The field that numbers the messages of a fixed-width topic, from 0."""
-NEVER: Final = 2**32 - 1
+RESET_ONLY: Final = 2**32 - 1
 """The `t` of a step at which a vector environment only reset one of its environments."""

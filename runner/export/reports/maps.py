@@ -159,7 +159,7 @@ def _policy_row(mdp: Mdp, learners: Sequence[str], stages: Sequence[Stage], stat
         greedy: list[int | None] = [None] * cells
         for cell, best in zip(places.tolist(), rows.argmax(axis=1).tolist(), strict=True):
             if not np.isnan(values[cell]):
-                greedy[cell] = int(np.unravel_index(best, mdp.action_counts)[agent]) if is_joint else best
+                greedy[cell] = int(mdp.own_actions[best, agent]) if is_joint else best
         grids.append(values)
         policies.append(greedy)
     return _row(

@@ -210,7 +210,9 @@ class LoopExporter:
             for block in recording.blocks(topic, span.start, span.stop):
                 for start in range(0, len(block), MAX_ROWS):
                     steps = block[start : start + MAX_ROWS]
-                    is_shown = (steps["step"] % recording.environments == 0) & (steps["t"] != schema.NEVER)
+                    is_shown = (steps["step"] % recording.environments == 0) & (
+                        steps["t"] != schema.RESET_ONLY
+                    )
                     steps = steps[is_shown]
                     if not len(steps):
                         continue

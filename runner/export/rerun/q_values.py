@@ -43,7 +43,7 @@ from runner.export.rerun.layout import (
     bar_rows,
 )
 from runner.export.rerun.metrics import series_lines
-from runner.export.rerun.scene import Placements, Scene, own_actions
+from runner.export.rerun.scene import Placements, Scene
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.replay.tables import StateProbe, TableReplay, known_steps
@@ -69,7 +69,6 @@ class StepValueReader:
         self._recording = recording
         self._mdp: Mdp = recording.mdp
         self._learners = len(recording.agents)
-        self._own_actions = own_actions(self._mdp)
         self._context = np.zeros(self._mdp.states, np.int64)
         self._states = np.empty((1, 0), np.int32)
         if placements is not None:
@@ -140,7 +139,7 @@ class StepValueReader:
             values = np.empty((len(rows), sum(counts)))
             greedy = np.empty((len(rows), len(counts)), np.int64)
             first = np.cumsum((0, *counts[:-1]))
-            _split_joint(rows[:, 0], self._own_actions, first, values, greedy)
+            _split_joint(rows[:, 0], self._mdp.own_actions, first, values, greedy)
         return StepValues(values, greedy, probe.before, probe.value, probe.greedy)
 
 
@@ -152,7 +151,7 @@ class TableWriter(Sender):
     ) -> None:
         super().__init__(stream, path)
         self._labels = labels
-        self._own = own_actions(mdp)
+        self._own = mdp.own_actions
         self._y = np.concatenate(bar_rows(mdp))
         agents, counts = len(mdp.agents), mdp.action_counts
         self._bounds = np.cumsum((0, *counts))
@@ -286,7 +285,7 @@ def _arrows_and_letters(
     scene: Scene, labels: Labels, agents: list[int], movers: list[int], is_joint: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Return the arrow, [agents, actions, 2], and the letter, [agents, actions], of each action."""
-    own = own_actions(scene.mdp)
+    own = scene.mdp.own_actions
     arrows, letters = [], []
     for agent, mover in zip(agents, movers, strict=True):
         count = scene.mdp.action_counts[agent]

@@ -126,14 +126,15 @@ class Scene:
     @cached_property
     def moves(self) -> NDArray[np.float32]:
         """[J, movers, 2]: a short arrow for each mover's own action; zero for an action that is no move."""
-        own = own_actions(self.mdp)
         arrows = np.zeros((self.mdp.joint_actions, len(self.movers), 2), np.float32)
         if action_names(self.mdp) is not None:
             moves = [action.get("move") or (0, 0) for action in self.description["actions"]]
             steps = np.array([(column, row) for row, column in moves], np.float32)
             for i, agent in enumerate(self.mover_agents):
                 if agent in self.mdp.agents:
-                    arrows[:, i] = steps[own[:, self.mdp.agents.index(agent)]] * _BLOCKED_ARROW
+                    arrows[:, i] = (
+                        steps[self.mdp.own_actions[:, self.mdp.agents.index(agent)]] * _BLOCKED_ARROW
+                    )
         return arrows
 
     @property
@@ -213,12 +214,6 @@ def scene_of(mdp: Mdp) -> Scene | None:
     goals = tuple(i for i, kind in enumerate(kinds) if kind == "goal")
     passengers = tuple(i for i in range(len(kinds)) if i not in movers + goals)
     return Scene(mdp, mdp.scene, movers, passengers, goals)
-
-
-def own_actions(mdp: Mdp) -> NDArray[np.int64]:
-    """Return each agent's part of every joint action, [J, agents]."""
-    joint = np.arange(mdp.joint_actions)
-    return np.stack(np.unravel_index(joint, mdp.action_counts), axis=1).astype(np.int64)
 
 
 def _placements(scene: Scene) -> Placements:

@@ -76,7 +76,7 @@ def plan(run: Run, root: Path, force: bool = False) -> Removal:
         force: also remove strange files in its folder.
     """
     row = row_of(run, None) | {"root": root, "entry": run.folder.name}
-    return _removal(row, run.folder, _misplaced(run, root) or _protected(run), force)
+    return _removal(row, run.folder, _why_not_in(run, root) or _protected(run), force)
 
 
 def plan_row(row: dict[str, Any], force: bool = False) -> Removal:
@@ -208,7 +208,7 @@ def unwanted(index: Index, criteria: Criteria, now: float) -> tuple[Rows, Counte
     return going, kept
 
 
-def _misplaced(run: Run, root: Path) -> str:
+def _why_not_in(run: Run, root: Path) -> str:
     """Return why a run cannot be removed from a recordings folder, or an empty text."""
     if run.stands_alone:
         return f"{run.recording} stands alone; remove the file yourself"

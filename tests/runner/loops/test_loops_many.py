@@ -52,7 +52,7 @@ def test_recording_changes_nothing_for_a_vector_loop(tmp_path, name, mode):
             check_episode(recording, number, episode)
     assert steps["step"].tolist() == list(range(len(steps)))
     assert resets["seed"][:N].tolist() == [7, 8, 9]
-    only_resets = int((steps["t"] == schema.NEVER).sum())
+    only_resets = int((steps["t"] == schema.RESET_ONLY).sum())
     assert (only_resets > 0) == (mode == AutoresetMode.NEXT_STEP)
     over = int((steps["terminated"] | steps["truncated"]).sum())
     assert len(ended) == over
@@ -77,7 +77,7 @@ def check_follows(steps: Any, resets: Any) -> None:
     first = {(int(r["environment"]), int(r["episode"])): int(r["observation"]) for r in resets}
     for i in range(N):
         own = steps[i::N]
-        own = own[own["t"] != schema.NEVER]
+        own = own[own["t"] != schema.RESET_ONLY]
         begins = own["t"] == 0
         assert [first[i, int(e)] for e in own["episode"][begins]] == own["state"][begins].tolist()
         inside = ~begins[1:]
