@@ -11,14 +11,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
@@ -34,7 +32,7 @@ from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.consistency import Findings, check_phase
 from runner.recording.digest import ContentHash
-from runner.recording.integrity import check_integrity, may_be_cut, survey
+from runner.recording.integrity import check_integrity, may_be_cut, refuse_foreign, survey
 from runner.recording.loop_blocks import Inconsistent
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Report as BytesReport
@@ -159,37 +157,6 @@ def _first_unreadable(recording: Recording) -> str:
         except RecordingError:
             return f" {topic.name}: {name} {number} is the first that cannot be read."
     return ""
-
-
-def refuse_foreign(path: Path) -> None:
-    """Refuse a file of another program, or one that is not an MCAP file.
-
-    Raises:
-        RecordingError: it is such a file, or cannot be read.
-    """
-    try:
-        with open_regular(path) as stream:
-            start = stream.read(4096)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
-    if not start:
-        raise RecordingError(
-            f"{path}: found an empty file, expected a recording; `dualtaxi resume` starts it."
-        )
-    if not start.startswith(MCAP0_MAGIC[: len(start)]):
-        raise RecordingError(
-            f"{path}: found {start[:8]!r} at its start, expected an MCAP file: not a dualtaxi recording."
-        )
-    head = start[len(MCAP0_MAGIC) :]
-    if len(head) < 13 or head[0] != Opcode.HEADER:
-        return
-    (length,) = struct.unpack_from("<I", head, 9)
-    profile = head[13 : 13 + length]
-    if length < len(head) and profile != schema.PROFILE.encode():
-        raise RecordingError(
-            f"{path}: found an MCAP file of profile {profile.decode(errors='replace')!r}, expected "
-            f"{schema.PROFILE!r}: not a dualtaxi recording."
-        )
 
 
 def _verify_content(recording: Recording, rerun: bool, report: Report) -> Verification:

@@ -44,6 +44,37 @@ from runner.util.files import open_regular
 N = TypeVar("N", AttachmentIndex, MetadataIndex)
 
 
+def refuse_foreign(path: Path) -> None:
+    """Refuse a file of another program, or one that is not an MCAP file.
+
+    Raises:
+        RecordingError: it is such a file, or cannot be read.
+    """
+    try:
+        with open_regular(path) as stream:
+            start = stream.read(4096)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+    if not start:
+        raise RecordingError(
+            f"{path}: found an empty file, expected a recording; `dualtaxi resume` starts it."
+        )
+    if not start.startswith(MCAP0_MAGIC[: len(start)]):
+        raise RecordingError(
+            f"{path}: found {start[:8]!r} at its start, expected an MCAP file: not a dualtaxi recording."
+        )
+    head = start[len(MCAP0_MAGIC) :]
+    if len(head) < 13 or head[0] != Opcode.HEADER:
+        return
+    (length,) = struct.unpack_from("<I", head, 9)
+    profile = head[13 : 13 + length]
+    if length < len(head) and profile != schema.PROFILE.encode():
+        raise RecordingError(
+            f"{path}: found an MCAP file of profile {profile.decode(errors='replace')!r}, expected "
+            f"{schema.PROFILE!r}: not a dualtaxi recording."
+        )
+
+
 def check_integrity(path: Path, report: Report = lambda *_: None) -> None:
     """Check every byte of a finished recording.
 

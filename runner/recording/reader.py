@@ -146,11 +146,7 @@ class Recording(RunDescription):
         Raises:
             RecordingError: there is none of that name, or it cannot be read.
         """
-        if name not in self._index.metadata:
-            raise RecordingError(
-                f"{self.path}: has no metadata {name!r}; it was cut off, or not written by dualtaxi."
-            )
-        return self._store.metadata(name, *self._index.metadata[name])
+        return self._store.metadata(name, *self._place("metadata", self._index.metadata, name))
 
     @property
     def metadata_names(self) -> list[str]:
@@ -168,11 +164,15 @@ class Recording(RunDescription):
         Raises:
             RecordingError: there is none of that name, or it is damaged.
         """
-        if name not in self._index.attachments:
+        return self._store.attachment(name, *self._place("attachment", self._index.attachments, name))[1]
+
+    def _place(self, kind: str, places: Mapping[str, tuple[int, int]], name: str) -> tuple[int, int]:
+        """Return where a named record is in the file."""
+        if name not in places:
             raise RecordingError(
-                f"{self.path}: has no attachment {name!r}; it was cut off, or not written by dualtaxi."
+                f"{self.path}: has no {kind} {name!r}; it was cut off, or not written by dualtaxi."
             )
-        return self._store.attachment(name, *self._index.attachments[name])[1]
+        return places[name]
 
     # --- blocks ---------------------------------------------------------------------------------------
 

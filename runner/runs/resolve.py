@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from runner.errors import RunNotFound, nearest
 from runner.recording.run_file import RUN_ID, run_title
-from runner.runs.run import Run, listed_run, recordings_folder, run_at, run_in
+from runner.runs.run import Run, recordings_folder, run_at, run_in
 from runner.util.values import RUN_NAME_PATTERN
 
 if TYPE_CHECKING:
@@ -24,6 +24,18 @@ _MAX_SUGGESTED: Final = 1000
 """The newest runs, whose names are compared with one that was not found."""
 
 Report = Callable[[str], None]
+
+
+def listed_run(folder: Path, run_id: str) -> Run:
+    """Return the run in a folder, which had this id when the folder was listed.
+
+    Raises:
+        RunNotFound: it was removed in the meantime.
+    """
+    run = run_in(folder)
+    if run is None:
+        raise RunNotFound(f"run {run_id} was removed just now.")
+    return run
 
 
 class Candidate(NamedTuple):

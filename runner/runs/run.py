@@ -223,14 +223,12 @@ def new_run(
     check_folder_name(recordings)
     with storage_errors(recordings, f"choose another folder by --recordings or {RECORDINGS_VARIABLE}"):
         recordings.mkdir(parents=True, exist_ok=True)
+        run_id = run_id or new_run_id(recordings)
         while True:
-            run_id = run_id or new_run_id(recordings)
-            folder = recordings / run_id
-            try:
-                folder.mkdir()
+            with contextlib.suppress(FileExistsError):
+                (folder := recordings / run_id).mkdir()
                 break
-            except FileExistsError:
-                run_id = None
+            run_id = new_run_id(recordings)
         facts = {
             "run_id": run_id,
             "name": name,
@@ -345,18 +343,6 @@ def run_in(folder: Path) -> Run | None:
     return None
 
 
-def listed_run(folder: Path, run_id: str) -> Run:
-    """Return the run in a folder, which had this id when the folder was listed.
-
-    Raises:
-        RunNotFound: it was removed in the meantime.
-    """
-    run = run_in(folder)
-    if run is None:
-        raise RunNotFound(f"run {run_id} was removed just now.")
-    return run
-
-
 def label(
     run: Run,
     name: str | None = None,
@@ -379,9 +365,7 @@ def label(
         StorageError: the run's folder cannot be written.
     """
     if run.stands_alone:
-        raise RunnerError(
-            f"{run.recording}: found a recording that stands alone, expected a run in a folder of its own."
-        )
+        raise RunnerError(f"{run.recording}: stands alone; expected a run in a folder of its own.")
     if name:
         checked_run_name(name)
 

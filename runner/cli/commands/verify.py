@@ -160,7 +160,7 @@ def repair_command(ctx: click.Context, run_name: str, recordings: Path | None, a
       dualtaxi repair @latest
       dualtaxi repair backup/recording.mcap
     """
-    from runner.execution.verify import refuse_foreign
+    from runner.recording.integrity import refuse_foreign
     from runner.recording.repair import repair
 
     path, run = find_recording(run_name, recordings)

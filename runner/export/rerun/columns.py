@@ -13,6 +13,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from runner.drawing import palette
+from runner.export.rerun.step_values import StepValues
 
 APPLICATION: Final = "dualtaxi"
 MAX_ROWS: Final = 8_192
@@ -20,35 +21,6 @@ MAX_ROWS: Final = 8_192
 _POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
 _STRIP: Final = pa.list_(pa.field("item", _POINT, nullable=False))
 _BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
-
-
-@dataclass(frozen=True, eq=False)
-class StepValues:
-    """The learners' Q-values at n steps, and maps of them at some of these steps."""
-
-    values: NDArray[np.float64]
-    """[n, sum of the agents' action counts]: the value of each agent's own actions; with a joint table the
-    best over the actions of the others."""
-    greedy: NDArray[np.int64]
-    """[n, agents]: each agent's greedy action."""
-    map_rows: NDArray[np.int64]
-    """[k]: the steps that have maps."""
-    value_maps: NDArray[np.float32]
-    """[k, learners, pixels]: the greatest value in the state of each pixel; nan for no state."""
-    greedy_maps: NDArray[np.int32]
-    """[k, learners, pixels]: the learner's greedy action there; -1 for no state."""
-
-    @classmethod
-    def concatenated(cls, parts: Sequence[StepValues]) -> StepValues:
-        """Return the values of successive steps as one."""
-        starts = np.cumsum([0, *(len(part.values) for part in parts[:-1])])
-        return cls(
-            np.concatenate([part.values for part in parts]),
-            np.concatenate([part.greedy for part in parts]),
-            np.concatenate([part.map_rows + start for part, start in zip(parts, starts, strict=True)]),
-            np.concatenate([part.value_maps for part in parts]),
-            np.concatenate([part.greedy_maps for part in parts]),
-        )
 
 
 @dataclass(frozen=True, eq=False)

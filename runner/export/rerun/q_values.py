@@ -1,13 +1,8 @@
-"""Q-values at a step: read by replaying the tables, and sent as a table of values and as maps.
-
-The tables are replayed from the recorded steps, so everything shown is exact for its step. Where a repair
-lost steps, the values after them are unknown up to the next snapshot, and are left out.
-"""
+"""Q-values at a step, sent as a table of values and as maps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
 import numba
 import numpy as np
@@ -20,7 +15,6 @@ from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.columns import (
     Batch,
     Sender,
-    StepValues,
     images,
     instances,
     pixel_centres,
@@ -44,9 +38,7 @@ from runner.export.rerun.layout import (
 )
 from runner.export.rerun.metrics import series_lines
 from runner.export.rerun.scene import Placements, Scene
-from runner.recording.reader import Recording
-from runner.recording.schema import STEP_NANOSECONDS
-from runner.replay.tables import StateProbe, TableReplay, known_steps
+from runner.export.rerun.step_values import StepValues
 
 _BAR_FRACTION: Final = 64
 """The length of a bar is rounded to this fraction of a row's height: invisible, and smaller in the file."""
@@ -55,92 +47,6 @@ _LETTER_RISE: Final = 0.6
 _AGENT_OFFSET: Final = 0.21
 """From the centre of a pixel to the arrow of either of two agents."""
 _ARROW_SCALE: Final = 1.2
-
-
-class StepValueReader:
-    """Reads the Q-values at the steps of a recorded run.
-
-    Args:
-        recording: the run.
-        placements: the states of each map; None for no maps.
-    """
-
-    def __init__(self, recording: Recording, placements: Placements | None) -> None:
-        self._recording = recording
-        self._mdp: Mdp = recording.mdp
-        self._learners = len(recording.agents)
-        self._context = np.zeros(self._mdp.states, np.int64)
-        self._states = np.empty((1, 0), np.int32)
-        if placements is not None:
-            self._context, self._states = placements.context, placements.states
-        self._known_ranges = known_steps(recording)
-        self._replay: TableReplay | None = None
-        self._last = (0, -1)
-        """Time and context of the step before."""
-
-    def split(self, block: NDArray[np.void]) -> Iterator[NDArray[np.void]]:
-        """Yield a block of training steps in parts whose values are either all known or all unknown."""
-        first = int(block["step"][0])
-        edges = [edge for start, last in self._known_ranges for edge in (start, last + 1)]
-        yield from np.split(block, [edge - first for edge in edges if 0 < edge - first < len(block)])
-
-    def training(self, block: NDArray[np.void]) -> StepValues | None:
-        """Return the values before the update of each step of a part; None if they are unknown.
-
-        Raises:
-            RecordingError: the environment cannot have such steps.
-        """
-        replay = self._replay_at(int(block["step"][0]))
-        if replay is None:
-            return None
-        rows, probe = replay.empty_rows(len(block)), self._probe(block)
-        replay.apply(block, rows, probe)
-        return self._step_values(rows, probe)
-
-    def evaluation(self, block: NDArray[np.void], train_step: int) -> StepValues | None:
-        """Return the values at a block of evaluation steps, made after `train_step` training steps."""
-        replay = self._replay_at(train_step)
-        if replay is None:
-            return None
-        probe = self._probe(block)
-        replay.read(probe)
-        return self._step_values(replay.values_in(block["state"]), probe)
-
-    def _replay_at(self, step: int) -> TableReplay | None:
-        """Return the replay at a training step; None if the tables there are unknown."""
-        if not any(first <= step <= last for first, last in self._known_ranges):
-            return None
-        if self._replay is None:
-            self._replay = TableReplay(self._recording, step)
-        elif self._replay.step != step:
-            self._replay.seek(step)
-        return self._replay
-
-    def _probe(self, block: NDArray[np.void]) -> StateProbe:
-        """Return a probe of the map before each step at which an episode begins or the context changes."""
-        context = self._context[block["state"]]
-        changes = block["t"] == 0
-        changes[1:] |= context[1:] != context[:-1]
-        before = (int(block["log_time"][0]) - STEP_NANOSECONDS, int(context[0]))
-        changes[0] |= before != self._last
-        self._last = (int(block["log_time"][-1]), int(context[-1]))
-        rows = np.flatnonzero(changes)
-        shape = len(rows), self._learners, self._states.shape[1]
-        states = self._states[context[rows]]
-        return StateProbe(rows, states, np.empty(shape, np.float32), np.empty(shape, np.int32))
-
-    def _step_values(self, rows: NDArray[np.float64], probe: StateProbe) -> StepValues:
-        """Return the values by agent of rows by learner."""
-        counts = self._mdp.action_counts
-        if rows.shape[1] == len(counts):
-            own = [rows[:, i, :count] for i, count in enumerate(counts)]
-            values, greedy = np.concatenate(own, axis=1), np.stack([q.argmax(axis=1) for q in own], axis=1)
-        else:
-            values = np.empty((len(rows), sum(counts)))
-            greedy = np.empty((len(rows), len(counts)), np.int64)
-            first = np.cumsum((0, *counts[:-1]))
-            _split_joint(rows[:, 0], self._mdp.own_actions, first, values, greedy)
-        return StepValues(values, greedy, probe.before, probe.value, probe.greedy)
 
 
 class TableWriter(Sender):
@@ -297,42 +203,16 @@ def _arrows_and_letters(
 
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
-def _split_joint(rows: Any, own: Any, first: Any, best: Any, greedy: Any) -> None:
-    """Split the values of joint actions by agent: its best over the actions of the others, its greedy action.
-
-    Args:
-        rows: [n, J], values of the joint actions.
-        own: [J, agents], each agent's part of a joint action.
-        first: [agents], where the values of each agent begin in `best`.
-        best: [n, sum of the action counts], filled.
-        greedy: [n, agents], filled; ties go to the lowest joint action.
-    """
-    for k in range(len(rows)):
-        for i in range(best.shape[1]):
-            best[k, i] = -np.inf
-        highest = 0
-        for joint in range(rows.shape[1]):
-            value = rows[k, joint]
-            if value > rows[k, highest]:
-                highest = joint
-            for agent in range(own.shape[1]):
-                i = first[agent] + own[joint, agent]
-                best[k, i] = max(best[k, i], value)
-        for agent in range(own.shape[1]):
-            greedy[k, agent] = own[highest, agent]
-
-
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
 def _fill_table(
-    values: Any,
-    greedy: Any,
-    own: Any,
-    explored: Any,
-    bounds: Any,
+    values: NDArray[np.float64],
+    greedy: NDArray[np.int64],
+    own: NDArray[np.int64],
+    explored: NDArray[np.int64],
+    bounds: NDArray[np.int64],
     unit: float,
-    marks: Any,
-    classes: Any,
-    ends: Any,
+    marks: tuple[int, ...],
+    classes: NDArray[np.uint16],
+    ends: NDArray[np.float32],
 ) -> None:
     """Fill in the label of each value, the marks of greedy and chosen actions, and where the bars end.
 
@@ -370,7 +250,14 @@ def _fill_table(
 
 @numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator,unused-ignore]
 def _fill_moves(
-    greedy: Any, arrows: Any, letters: Any, points: Any, vectors: Any, counts: Any, places: Any, classes: Any
+    greedy: NDArray[np.int32],
+    arrows: NDArray[np.float32],
+    letters: NDArray[np.int64],
+    points: NDArray[np.float32],
+    vectors: NDArray[np.float32],
+    counts: NDArray[np.int64],
+    places: NDArray[np.float32],
+    classes: NDArray[np.uint16],
 ) -> int:
     """Fill in the arrows of greedy actions, and the letters of those that do not move.
 

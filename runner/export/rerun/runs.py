@@ -16,7 +16,6 @@ from runner.export.rerun.columns import (
     MAX_ROWS,
     Batch,
     Sender,
-    StepValues,
     instances,
     repeated_point,
     rgba,
@@ -25,9 +24,10 @@ from runner.export.rerun.columns import (
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.layout import RunView
 from runner.export.rerun.metrics import MetricWriter
-from runner.export.rerun.q_values import MapWriter, StepValueReader, TableWriter
+from runner.export.rerun.q_values import MapWriter, TableWriter
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import Selection, Span
+from runner.export.rerun.step_values import StepValueReader, StepValues
 from runner.export.rerun.steps import StepWriter
 from runner.recording import schema
 from runner.recording.reader import Recording

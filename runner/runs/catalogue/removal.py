@@ -25,7 +25,8 @@ from runner.runs.catalogue.index import Index, Rows
 from runner.runs.catalogue.rows import Row, row_of
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
 from runner.runs.locking import locked
-from runner.runs.run import Run, listed_run
+from runner.runs.resolve import listed_run
+from runner.runs.run import Run
 from runner.util.humanize import listed
 
 _STRAY_SECONDS: Final = 60
