@@ -6,7 +6,7 @@ import contextlib
 import os
 import sys
 import weakref
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Generic, Literal, Self
 
 import gymnasium
@@ -15,6 +15,7 @@ from gymnasium.vector import VectorEnv
 from runner.errors import ConfigError
 from runner.loops.description import describe
 from runner.loops.loop import Loop, R, check_phase
+from runner.loops.makers import checked_make, maker_of
 from runner.loops.messages import Messages
 from runner.loops.options import Options, options_of
 from runner.loops.rows import Rows
@@ -218,6 +219,7 @@ def record(
     frame_format: str = "png",
     into: RecordedEnv | None = None,
     phase: str = "train",
+    make: str | Callable[[], Any] | None = None,
     **packing: Any,
 ) -> RecordedEnv:
     """Return the environment, with everything that a loop does with it recorded.
@@ -244,6 +246,9 @@ def record(
         frame_format: `png`, exact, or `jpeg`.
         into: another recorded environment of the same spaces, to record into the same run.
         phase: `train` or `eval`; an environment recorded `into` another needs the other phase.
+        make: a function without arguments that makes this environment, at the top of a module, or its name
+            ("train:make_env"). It is recorded, and called to repeat the run where wrappers or arguments
+            cannot be recorded; `environment_maker` in the recording says where that is.
         packing: `compression`, `level`, `index`, `chunk_steps`, as in the section `recording` of a file.
 
     Raises:
@@ -262,16 +267,17 @@ def record(
             raise ConfigError(
                 "into: found more arguments than phase, expected none: the run has them already"
             )
-        return _record_into_run(env, into, phase)
+        return _record_into_run(env, into, phase, checked_make(make))
     described = describe(env, env.observation_space, env.action_space)
     options = options_of(recordings, name, seed, config, info, packing, frames_every, frame_format)
     if frames_every:
         _require_pictures(env)
-    loop: Loop[Rows] = Loop(described, options, ROWS[described.kind])
+    maker = maker_of(env, checked_make(make))
+    loop: Loop[Rows] = Loop(described, options, maker, ROWS[described.kind])
     return RecordedEnv(env, loop, phase)
 
 
-def _record_into_run(env: gymnasium.Env[Any, Any], into: RecordedEnv, phase: str) -> RecordedEnv:
+def _record_into_run(env: gymnasium.Env[Any, Any], into: RecordedEnv, phase: str, make: str) -> RecordedEnv:
     """Return an environment recorded into the run of another one."""
     if not isinstance(into, RecordedEnv):
         raise ConfigError(f"into: found {type(into).__name__}, expected what runner.record returned")
@@ -283,6 +289,7 @@ def _record_into_run(env: gymnasium.Env[Any, Any], into: RecordedEnv, phase: str
         raise ConfigError(f"phase: found {phase!r} for both environments of a run, expected one each")
     if loop.options.frames_every:
         _require_pictures(env)
+    loop.add_maker(phase, maker_of(env, make))
     return RecordedEnv(env, loop, phase, into)
 
 

@@ -25,6 +25,7 @@ from runner.loops.rows import PhaseRows
 from runner.loops.values import warn_user
 from runner.recording import schema
 from runner.recording.gym_spaces import can_widen, widened
+from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import run_metadata, sizes_of, write_description, write_result
 from runner.recording.recorder import FLUSH_SECONDS, Recorder
 from runner.recording.writer import create_recording
@@ -56,6 +57,7 @@ class Loop(Generic[R]):
     Args:
         described: the environment and its spaces.
         options: how to record it.
+        maker: how it was made.
         make_rows: returns the rows of a phase for recorder, description, phase and what to call with the
             first action.
 
@@ -67,12 +69,16 @@ class Loop(Generic[R]):
         self,
         described: Described,
         options: Options,
+        maker: EnvironmentMaker,
         make_rows: Callable[[Recorder, Described, str, Callable[[Any], None]], R],
     ) -> None:
         client = connect(str(options.recordings)) if is_server(options.recordings) else None
         folder = outbox_folder() if client else recordings_folder(options.recordings)
         self._started = time.monotonic()
         self._config = options.config(described)
+        self._maker = maker
+        self._own_makers: dict[str, EnvironmentMaker] = {}
+        """How the environments of phases were made, where another one is recorded into the run."""
         self._make_rows = make_rows
         self._rows: dict[str, R] = {}
         self.active: R | None = None
@@ -143,7 +149,7 @@ class Loop(Generic[R]):
         if not self._is_described:
             self._is_described = self._is_settled = True
             attachments = self.described.attachments()
-            write_description(self._file, self._facts, self._config, self._made_by, attachments)
+            write_description(self._file, self._facts, self._config, self._made_by, attachments, self._maker)
 
     def _first_action(self, action: Any) -> None:
         """Record all actions in the dtype of the first one, if the space's own cannot hold it exactly."""
@@ -171,6 +177,12 @@ class Loop(Generic[R]):
             if phase not in self._rows:
                 self._rows[phase] = self._make_rows(self._recorder, self.described, phase, self._first_action)
             return self._rows[phase]
+
+    def add_maker(self, phase: str, maker: EnvironmentMaker) -> None:
+        """Note how the environment of a phase was made, if it is another one than the first."""
+        with self.lock:
+            if maker != self._maker and not self.closed:
+                self._own_makers[phase] = maker
 
     def activate(self, rows: R) -> None:
         """Record the next steps in these rows. The caller holds the lock."""
@@ -259,7 +271,7 @@ class Loop(Generic[R]):
             result["rewards_off_table"] = sum(rows.off_table for rows in self._rows.values())
         if error:
             result["error"] = truncated_message(error)
-        write_result(self._file, status, result)
+        write_result(self._file, status, result, self._own_makers)
         seconds = round(time.monotonic() - self._started, 3)
         return result | {"seconds": seconds, "bytes": self._file.size}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import random
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from numbers import Integral
@@ -20,6 +20,7 @@ from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe, kind_of
 from runner.loops.env import Recorded, given
 from runner.loops.loop import Loop
+from runner.loops.makers import checked_make, game_maker_of, vector_maker_of
 from runner.loops.options import options_of
 from runner.loops.single_rows import AgentRows
 from runner.loops.vector_rows import VectorRows
@@ -80,6 +81,7 @@ def record_vector(
     config: object = None,
     info: Sequence[str] = (),
     autoreset_mode: AutoresetMode | str | None = None,
+    make: str | Callable[[], Any] | None = None,
     **packing: Any,
 ) -> RecordedVector:
     """Return a vector environment, with everything that a loop does with it recorded.
@@ -99,6 +101,7 @@ def record_vector(
         info: names of fields of the vector's infos to record.
         autoreset_mode: how the environments reset themselves, if their metadata does not state it:
             "NextStep", "SameStep" or "Disabled"; "SameStep" for SuperSuit.
+        make: as for `record`; the function makes the vector environment.
         packing: as for `record`.
 
     Raises:
@@ -111,11 +114,13 @@ def record_vector(
             f"found {type(envs).__name__}, expected a vector environment, such as gymnasium.make_vec gives"
         )
     mode = _autoreset_mode(envs, autoreset_mode)
-    described = _described_vector(envs)
-    _require_fixed(described)
+    with _one_of(envs) as first:
+        described = _described_vector(envs, first)
+        _require_fixed(described)
+        maker = vector_maker_of(envs, first, mode, checked_make(make))
     options = options_of(recordings, name, seed, config, info, packing)
     rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
-    return RecordedVector(envs, Loop(described, options, rows), mode)
+    return RecordedVector(envs, Loop(described, options, maker, rows), mode)
 
 
 def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str | None) -> AutoresetMode:
@@ -141,29 +146,27 @@ def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str 
     return stated
 
 
-def _described_vector(envs: VectorEnv[Any, Any, Any]) -> Described:
-    """Return the description of a vector environment.
+def _described_vector(envs: VectorEnv[Any, Any, Any], first: Any) -> Described:
+    """Return the description of a vector environment; `first` is its first environment.
 
     Older ones have no `single_` spaces: their spaces are those of one environment.
     """
     observation = getattr(envs, "single_observation_space", None) or envs.observation_space
     action = getattr(envs, "single_action_space", None) or envs.action_space
-    with _one_of(envs) as first:
-        described = describe(first, observation, action)
+    registered = first if getattr(envs, "spec", None) is None else envs
+    described = describe(registered, observation, action)
     return replace(described, environments=envs.num_envs, mdp=None, agents=("agent",))
 
 
 @contextlib.contextmanager
 def _one_of(envs: VectorEnv[Any, Any, Any]) -> Iterator[Any]:
-    """Yield what has the registration of the environments: the vector, or one of its environments.
+    """Yield the first environment of a vector, or the vector if it has none of its own.
 
     Those of an AsyncVectorEnv are in other processes, which end if a registration cannot be sent; so one is
     made here, as AsyncVectorEnv itself does, without changing the state of the global random generators.
     """
     unwrapped = envs.unwrapped
-    if getattr(envs, "spec", None) is not None:
-        yield envs
-    elif inside := getattr(unwrapped, "envs", None):
+    if inside := getattr(unwrapped, "envs", None):
         yield inside[0]
     elif isinstance(unwrapped, AsyncVectorEnv):
         states = random.getstate(), np.random.get_state()
@@ -243,6 +246,7 @@ def record_parallel(
     seed: int | None = None,
     config: object = None,
     info: Sequence[str] = (),
+    make: str | Callable[[], Any] | None = None,
     **packing: Any,
 ) -> RecordedParallel:
     """Return a PettingZoo parallel environment, with everything that a loop does with it recorded.
@@ -257,6 +261,7 @@ def record_parallel(
         seed: as for `record`.
         config: as for `record`.
         info: names of fields of the agents' infos to record, where they occur.
+        make: as for `record`.
         packing: as for `record`.
 
     Raises:
@@ -276,7 +281,8 @@ def record_parallel(
     described = _game(env)
     _require_fixed(described)
     options = options_of(recordings, name, seed, config, info, packing)
-    return RecordedParallel(env, Loop(described, options, AgentRows))
+    maker = game_maker_of(env, checked_make(make))
+    return RecordedParallel(env, Loop(described, options, maker, AgentRows))
 
 
 def _require_fixed(described: Described) -> None:

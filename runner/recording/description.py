@@ -179,9 +179,20 @@ class RunDescription(ABC):
         Raises:
             RecordingError: it is damaged.
         """
-        if MAKER_RECORD not in self.metadata_names:
+        return self._maker(MAKER_RECORD)
+
+    def maker_of(self, phase: str) -> EnvironmentMaker | None:
+        """Return how the environment of a phase was made; `maker` unless it is another environment.
+
+        Raises:
+            RecordingError: it is damaged.
+        """
+        return self._maker(f"{MAKER_RECORD}/{phase}") or self.maker
+
+    def _maker(self, name: str) -> EnvironmentMaker | None:
+        if name not in self.metadata_names:
             return None
-        return parse_maker(self._json(MAKER_RECORD), str(self.path))
+        return parse_maker(self._json(name), str(self.path))
 
     @property
     def event_names(self) -> tuple[str, ...]:

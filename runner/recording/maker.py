@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from runner.errors import RecordingError
-from runner.util.values import MAX_TEXT, is_whole
+from runner.util.values import MAX_TEXT, is_too_deep, is_whole
 
 MAKER_RECORD: Final = "environment_maker"
 """The metadata record with the maker, as JSON."""
@@ -40,6 +40,9 @@ class VectorMaker:
     """The value of its `AutoresetMode`: `NextStep`, `SameStep` or `Disabled`."""
     wrappers: tuple[str, ...] = ()
     """The wrappers of the vector, `module:class`, from the outermost in."""
+    wrapper_specs: str = "[]"
+    """JSON: a list of the same as Gymnasium's `WrapperSpec` (`name`, `entry_point`, `kwargs`), from the
+    innermost out."""
 
 
 @dataclass(frozen=True)
@@ -61,11 +64,14 @@ class EnvironmentMaker:
     registered_by: str = ""
     """The module whose import registers the environment, such as `ale_py`; empty if none is needed."""
     make: str = ""
-    """The function that the user named, `module:function`, which returns the environment; empty if none."""
+    """The function that the user named, `module:function`: it returns the environment, or the vector or game,
+    without arguments, and is used instead of `spec`; empty if none."""
     reason: str = ""
     """Why `spec` does not suffice to make the environment; empty if it does."""
     wrappers: tuple[str, ...] = ()
     """The wrappers of an environment, `module:class`, from the outermost in."""
+    assumed: tuple[str, ...] = ()
+    """The wrappers, `module:class`, whose arguments are unknown: `spec` has their default values."""
     vector: VectorMaker | None = None
     packages: Mapping[str, str] = field(default_factory=dict)
     """The versions of the distributions that determine what the environment does, by name."""
@@ -91,14 +97,13 @@ def parse_maker(values: Mapping[str, Any], where: str) -> EnvironmentMaker:
     vector = values.get("vector")
     return EnvironmentMaker(
         kind=check.choice("kind", KINDS),
-        spec=check.text("spec", MAX_SPEC),
+        spec=check.json("spec", dict),
         registered_by=check.text("registered_by", MAX_TEXT, MODULE_NAME),
         make=check.text("make", MAX_TEXT, FUNCTION_NAME),
         reason=check.text("reason", _MAX_REASON),
         wrappers=check.names("wrappers"),
-        vector=None
-        if vector is None
-        else _parse_vector(vector, f"{where}: the vector in its {MAKER_RECORD}"),
+        assumed=check.names("assumed"),
+        vector=None if vector is None else _parse_vector(vector, f"{where}: the vector's {MAKER_RECORD}"),
         packages=check.versions("packages"),
         platform=check.text("platform", MAX_TEXT),
         machine=check.text("machine", MAX_TEXT),
@@ -114,6 +119,7 @@ def _parse_vector(values: Any, where: str) -> VectorMaker:
         mode=check.choice("mode", MODES),
         autoreset=check.choice("autoreset", AUTORESET_MODES),
         wrappers=check.names("wrappers"),
+        wrapper_specs=check.json("wrapper_specs", list),
     )
 
 
@@ -136,6 +142,16 @@ class _Check:
         is_valid = isinstance(value, str) and len(value) <= limit
         self.require(key, is_valid and (not value or pattern is None or bool(pattern.fullmatch(str(value)))))
         return str(value)
+
+    def json(self, key: str, kind: type) -> str:
+        """Return a text that is empty, or holds JSON of this kind that is not nested too deeply."""
+        text = self.text(key, MAX_SPEC)
+        try:
+            value = json.loads(text) if text else kind()
+        except (ValueError, RecursionError):
+            value = None
+        self.require(key, isinstance(value, kind) and not is_too_deep(value))
+        return text
 
     def choice(self, key: str, choices: tuple[str, ...]) -> str:
         self.require(key, self.values.get(key) in choices)

@@ -18,6 +18,7 @@ from runner.recording import schema
 from runner.recording.arrays import pack_array, unpack_array
 from runner.recording.blocks import Sizes, topic_sizes
 from runner.recording.index import Index
+from runner.recording.maker import MAKER_RECORD, EnvironmentMaker
 from runner.recording.records import MAX_METADATA_BYTES
 from runner.recording.schema import Topic
 from runner.recording.spaces import dtype_of, leaves_of
@@ -266,8 +267,9 @@ def write_description(
     config: Mapping[str, Any],
     provenance: Mapping[str, str],
     environment: Attachments,
+    maker: EnvironmentMaker | None = None,
 ) -> None:
-    """Write what makes a recording self-contained.
+    """Write what makes a recording self-contained; `maker` is how a loop's environment was made.
 
     Raises:
         StorageError: the disk is full or failing.
@@ -276,6 +278,8 @@ def write_description(
         file.add_metadata("run", run)
         file.add_metadata("config", _json_entry(config))
         file.add_metadata("provenance", provenance)
+        if maker is not None:
+            file.add_metadata(MAKER_RECORD, maker.to_metadata())
         for name, (media_type, data) in environment.items():
             file.add_attachment(name, media_type, data)
     except OSError as error:
@@ -283,13 +287,26 @@ def write_description(
         raise storage_error(file, error) from error
 
 
-def write_result(file: RecordingFile, status: str, result: Mapping[str, Any]) -> None:
-    """Write how the run ended, the index and the summary; all of it, or nothing.
+def write_result(
+    file: RecordingFile,
+    status: str,
+    result: Mapping[str, Any],
+    makers: Mapping[str, EnvironmentMaker] | None = None,
+) -> None:
+    """Write how the run ended, the index and the summary.
+
+    Args:
+        file: the recording.
+        status: the status.
+        result: the totals.
+        makers: by phase, how environments of their own were made.
 
     Raises:
-        StorageError: the disk is full or failing.
+        StorageError: the disk is full or failing; nothing of the result is written then.
     """
     try:
+        for phase, maker in (makers or {}).items():
+            file.add_metadata(f"{MAKER_RECORD}/{phase}", maker.to_metadata())
         file.finish("result", _json_entry({"status": status, **result}))
     except OSError as error:
         raise storage_error(file, error) from error

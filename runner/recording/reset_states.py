@@ -1,8 +1,8 @@
 """What resets without a seed depend on: the state of the environment's random generators before them.
 
-A state is recorded at the first reset without a seed, and from then on at the first reset after
-`STEPS_BETWEEN` steps at the earliest: any episode can be repeated from the last recorded state, or the last
-reset with a seed, at or before it.
+A state is recorded at the first reset without a seed, and then at the first one after `STEPS_BETWEEN` more
+steps, so that it costs a step nearly nothing. Any episode can be repeated from the last recorded state, or
+the last reset with a seed, at or before its own reset.
 """
 
 from __future__ import annotations
@@ -15,9 +15,13 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import decode, encode
 
+STEPS_BETWEEN: Final = 500
+"""The least steps of an environment from one recorded state to the next."""
+ALE_STEPS_BETWEEN: Final = 1_000
+"""The same for an Atari environment: the state of its emulator has some 14 kB."""
 SEED_BYTES: Final = 16
 MAX_ALE_STATE: Final = 1 << 20
-"""The most bytes of a state of the Arcade Learning Environment; one has some 14 kB."""
+"""The most bytes of an emulator's state."""
 _PCG64: Final = struct.Struct("<16s16sII")
 """State, increment, `uinteger`, `has_uint32`."""
 
@@ -38,11 +42,9 @@ class ResetState:
     """The seed that the reset drew for the environment's generator; None if it drew none."""
     bit_generator: dict[str, Any] | None = None
     """The state of `unwrapped.np_random` before the reset, as `numpy.random.PCG64.state` takes it."""
-    ale_seed: int | None = None
-    """The `random_seed` of an Atari environment's emulator, which it was loaded with."""
     ale_state: bytes = b""
-    """The emulator's state before the reset, as `ale_py.ALEState` takes it, with its generator; empty if not
-    recorded."""
+    """The state of an Atari environment's emulator before the reset, as `ale_py.ALEState` takes it, with its
+    generator; empty for other environments."""
 
     def to_payload(self) -> bytes:
         """Return the message."""
@@ -55,8 +57,6 @@ class ResetState:
                 "environment": self.environment,
                 "np_random_seed": b"" if seed is None else seed.to_bytes(SEED_BYTES, "little"),
                 "bit_generator": b"" if generator is None else packed_generator(generator),
-                "has_ale_seed": self.ale_seed is not None,
-                "ale_seed": self.ale_seed or 0,
                 "ale_state": self.ale_state,
             },
         )
@@ -103,6 +103,5 @@ def decode_reset_state(payload: bytes) -> ResetState:
         environment=fields["environment"],
         np_random_seed=int.from_bytes(seed, "little") if seed else None,
         bit_generator=generator,
-        ale_seed=fields["ale_seed"] if fields["has_ale_seed"] else None,
         ale_state=ale,
     )

@@ -205,9 +205,7 @@ RESET_STATE = MessageType(
         Field(2, "environment", _FIXED32),
         Field(3, "np_random_seed", _BYTES),
         Field(4, "bit_generator", _BYTES),
-        Field(5, "has_ale_seed", _BOOL),
-        Field(6, "ale_seed", _SFIXED64),
-        Field(7, "ale_state", _BYTES),
+        Field(5, "ale_state", _BYTES),
     ),
 )
 """What a reset without a seed depends on; `reset_states` describes its fields."""
