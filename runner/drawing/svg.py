@@ -11,7 +11,7 @@ letters, movers have numbers.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 from typing import Any, Final
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
+from runner.environments.scene import Landmark, SceneDescription
 
 CELL: Final = 100
 MARGIN: Final = 14
@@ -86,9 +87,9 @@ _GOAL: Final = (
 class Drawing:
     """Draws the grid of one scene."""
 
-    def __init__(self, scene: Mapping[str, Any]) -> None:
+    def __init__(self, scene: SceneDescription) -> None:
         self._scene = scene
-        self._things: Sequence[Mapping[str, Any]] = scene["things"]
+        self._things = scene["things"]
         self.movers = [i for i, thing in enumerate(self._things) if thing["kind"] == "mover"]
         """Indices of the things that move by themselves."""
         self.width = scene["columns"] * CELL + 2 * MARGIN
@@ -206,7 +207,7 @@ class Drawing:
         """Return the colour of a mover."""
         return palette.agent(self.movers.index(mover))
 
-    def _landmark(self, mark: Mapping[str, Any]) -> str:
+    def _landmark(self, mark: Landmark) -> str:
         """Return a tinted cell with a letter: hazards have a strong tint, goals a flag."""
         row, column = mark["cell"]
         x, y = corner(self._scene, row * self._scene["columns"] + column)
@@ -240,7 +241,7 @@ def picture(width: float, height: float, title: str, content: str) -> str:
     )
 
 
-def corner(scene: Mapping[str, Any], cell: int) -> tuple[int, int]:
+def corner(scene: SceneDescription, cell: int) -> tuple[int, int]:
     """Return the upper left corner of a cell, counted row by row."""
     row, column = divmod(cell, scene["columns"])
     return MARGIN + column * CELL, MARGIN + row * CELL

@@ -6,9 +6,9 @@ each cell (the place of the first) contains the whole grid once more (the place 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from runner.drawing import palette
 from runner.drawing.palette import LEVELS, NO_VALUE, ink_on, ramp_colour
 from runner.drawing.svg import CELL, Drawing, corner, picture
+from runner.environments.scene import SceneAction, SceneDescription
 
 _FONT: Final = "font-family:'DejaVu Sans',sans-serif"
 STYLE: Final = (
@@ -38,7 +39,7 @@ def levels_of(values: NDArray[np.float64], low: float, high: float) -> NDArray[n
 
 
 def policy_map(
-    scene: Mapping[str, Any],
+    scene: SceneDescription,
     values: NDArray[np.float64],
     greedy: Sequence[int | None],
     bounds: tuple[float, float],
@@ -77,7 +78,7 @@ def policy_map(
 
 
 def pair_map(
-    scene: Mapping[str, Any], values: NDArray[np.float64], bounds: tuple[float, float], title: str
+    scene: SceneDescription, values: NDArray[np.float64], bounds: tuple[float, float], title: str
 ) -> str:
     """Return the map of two movers, `values` [cells of the first, cells of the second]; see the module."""
     columns, rows = scene["columns"], scene["rows"]
@@ -93,7 +94,7 @@ def pair_map(
     return _map(scene, "".join(squares), title)
 
 
-def _map(scene: Mapping[str, Any], body: str, title: str, letters: str = "") -> str:
+def _map(scene: SceneDescription, body: str, title: str, letters: str = "") -> str:
     drawing = Drawing(scene)
     walls = drawing.walls()
     paper = f'<rect class="m-paper" width="{drawing.width}" height="{drawing.height}" rx="12"/>'
@@ -109,11 +110,12 @@ def _text(x: int, y: int, text: str, ink: str) -> str:
     return f'<text class="m-text" x="{x}" y="{y}" fill="{ink}">{escape(text)}</text>'
 
 
-def _action(action: Mapping[str, Any], x: int, y: int, ink: str) -> str:
+def _action(action: SceneAction, x: int, y: int, ink: str) -> str:
     """Return an arrow for a move, the name of any other action."""
-    if action["move"] is None:
+    move = action.get("move")
+    if move is None:
         return _text(x, y + 52, action["name"].replace("_", "-"), ink)
-    angle = _ANGLES.get(tuple(action["move"]), 0)
+    angle = _ANGLES.get((move[0], move[1]), 0)
     return (
         f'<path class="m-arrow" stroke="{ink}" d="M0 20V-18M-12 -6L0 -18L12 -6" '
         f'transform="translate({x} {y + 45}) rotate({angle})"/>'

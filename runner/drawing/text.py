@@ -10,11 +10,12 @@ Letters are enough to read it; colours, where there are any, only repeat them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from runner.drawing import palette
 from runner.environments.naming import spoken
+from runner.environments.scene import SceneDescription, Thing
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -29,11 +30,11 @@ class Drawing:
         scene: rows, columns, walls, landmarks and things, as an environment describes them.
     """
 
-    def __init__(self, scene: Mapping[str, Any]) -> None:
-        self._rows, self._columns = int(scene["rows"]), int(scene["columns"])
+    def __init__(self, scene: SceneDescription) -> None:
+        self._rows, self._columns = scene["rows"], scene["columns"]
         self._walls = {frozenset((tuple(one), tuple(other))) for one, other in scene["walls"]}
         self._landmarks = {tuple(mark["cell"]): mark for mark in scene["landmarks"]}
-        self._things: Sequence[Mapping[str, Any]] = scene["things"]
+        self._things = scene["things"]
         self._signs = signs(self._things)
         self._styles = _styles(self._things)
 
@@ -82,7 +83,7 @@ class Drawing:
         return frozenset((one, other)) in self._walls
 
 
-def signs(things: Sequence[Mapping[str, Any]]) -> list[str]:
+def signs(things: Sequence[Thing]) -> list[str]:
     """Return a letter for each thing: `*` for a goal, a mover's number, else a lower-case initial."""
     found = []
     for thing in things:
@@ -96,7 +97,7 @@ def signs(things: Sequence[Mapping[str, Any]]) -> list[str]:
     return found
 
 
-def _styles(things: Sequence[Mapping[str, Any]]) -> list[str]:
+def _styles(things: Sequence[Thing]) -> list[str]:
     """Return the style of each thing, as Rich writes it."""
     movers = [thing["name"] for thing in things if thing["kind"] == "mover"]
     others = {"goal": f"bold {palette.GOAL}"}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.scene import scene_mistake
+from runner.environments.scene import SceneDescription, scene_mistake
 from runner.errors import EnvironmentNotUsable
 from runner.util.values import is_text, is_whole
 
@@ -59,7 +59,7 @@ class Mdp:
     success_events: tuple[str, ...] = ()
     penalty_below: float = -np.inf
     """A step whose summed reward is lower counts as a penalty."""
-    scene: Mapping[str, Any] | None = None
+    scene: SceneDescription | None = None
     scene_cells: NDArray[np.int16] | None = None
     """[S, things]: the cell of each thing, row * columns + column."""
     scene_carriers: NDArray[np.int8] | None = None

@@ -11,13 +11,13 @@ Without a scene the names are `state 17` and `action 3`.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
+from runner.environments.scene import SceneDescription, Thing
 
 
 def states_in_words(mdp: Mdp) -> NDArray[np.object_]:
@@ -43,7 +43,7 @@ def actions_in_words(mdp: Mdp) -> NDArray[np.object_]:
 
 def action_names(mdp: Mdp) -> list[list[str]] | None:
     """Return the names of each agent's actions; None where the scene does not name them."""
-    actions = [] if mdp.scene is None else mdp.scene.get("actions", [])
+    actions = [] if mdp.scene is None else mdp.scene["actions"]
     if any(count != len(actions) for count in mdp.action_counts):
         return None
     names = [spoken(action["name"]) for action in actions]
@@ -107,7 +107,7 @@ def trial_in_words(after: int, number: int) -> str:
 
 
 def _thing_in_words(
-    scene: Mapping[str, Any], thing: Mapping[str, Any], cells: NDArray[Any], carriers: NDArray[Any]
+    scene: SceneDescription, thing: Thing, cells: NDArray[np.int16], carriers: NDArray[np.int8]
 ) -> list[str]:
     """Return the place of one thing in every state.
 

@@ -7,8 +7,8 @@ neither can be trusted.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,17 +18,63 @@ from runner.util.values import is_text, is_whole
 MAX_CELLS: Final = 2**15 - 1
 """Cells are numbered in int16."""
 _COLOUR: Final = re.compile(r"#[0-9A-Fa-f]{6}")
-_KEYS: Final = {"rows", "columns", "walls", "landmarks", "things", "actions"}
+
+
+class Landmark(TypedDict):
+    """A cell that is marked."""
+
+    name: str
+    cell: Sequence[int]
+    """Row and column."""
+    colour: str
+    """Such as `#009E73`."""
+    label: NotRequired[str | None]
+    kind: NotRequired[str | None]
+    """`hazard` or `goal`, or any other word."""
+
+
+class Thing(TypedDict):
+    """What is somewhere in every state."""
+
+    name: str
+    label: str
+    kind: str
+    """`mover`, `goal`, or any other word."""
+    agent: NotRequired[str | None]
+    """The agent that moves it."""
+    colour: NotRequired[str | None]
+
+
+class SceneAction(TypedDict):
+    """An action of each agent."""
+
+    name: str
+    move: NotRequired[Sequence[int] | None]
+    """Rows and columns; None for an action that is no move."""
+
+
+class SceneDescription(TypedDict):
+    """How the states of an environment are drawn, as it describes them and as recordings store it."""
+
+    rows: int
+    columns: int
+    walls: Sequence[Sequence[Sequence[int]]]
+    """Pairs of cells with a wall between them."""
+    landmarks: Sequence[Landmark]
+    things: Sequence[Thing]
+    actions: Sequence[SceneAction]
+
+
+_KEYS: Final = SceneDescription.__required_keys__
 
 
 def scene_mistake(
-    scene: Any, cells: NDArray[Any] | None, carriers: NDArray[Any] | None, states: int
+    scene: Any, cells: NDArray[np.int16] | None, carriers: NDArray[np.int8] | None, states: int
 ) -> str | None:
     """Return the first mistake of a scene and its arrays; None if there is none.
 
     Args:
-        scene: `rows` and `columns`; `walls` (pairs of [row, column]); `landmarks` (`name`, `cell`, `colour`);
-            `things` (`name`, `label`, `kind`); `actions` (`name`, and `move` in [rows, columns] or None).
+        scene: what should be a `SceneDescription`.
         cells: the cell of each thing in each state, [S, things].
         carriers: which thing carries it, or -1, [S, things].
         states: S.
@@ -67,7 +113,11 @@ def scene_mistake(
 
 
 def _array_mistake(
-    name: str, array: NDArray[Any] | None, kind: Any, shape: tuple[int, int], bounds: tuple[int, int]
+    name: str,
+    array: NDArray[np.int16 | np.int8] | None,
+    kind: type[np.int16 | np.int8],
+    shape: tuple[int, int],
+    bounds: tuple[int, int],
 ) -> str | None:
     if array is None:
         return None

@@ -5,7 +5,7 @@ Coordinates are cells: x to the right, y down, the first cell from (0, 0) to (1,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names
+from runner.environments.scene import SceneDescription
 
 _SPACING: Final = 0.34
 """Between movers in one cell, so that both are visible."""
@@ -52,7 +53,7 @@ class Scene:
     """Arrays over S states. Movers come first among the things drawn, then passengers."""
 
     mdp: Mdp
-    description: Mapping[str, Any]
+    description: SceneDescription
     movers: tuple[int, ...]
     """Indices of the things that agents move."""
     passengers: tuple[int, ...]
@@ -61,12 +62,12 @@ class Scene:
     @property
     def rows(self) -> int:
         """Rows of cells."""
-        return int(self.description["rows"])
+        return self.description["rows"]
 
     @property
     def columns(self) -> int:
         """Columns of cells."""
-        return int(self.description["columns"])
+        return self.description["columns"]
 
     @cached_property
     def points(self) -> NDArray[np.float32]:

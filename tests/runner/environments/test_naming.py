@@ -57,6 +57,8 @@ def test_a_scene_of_another_kind(dualtaxi):
     scene = {
         "rows": 1,
         "columns": 2,
+        "walls": [],
+        "actions": [],
         "landmarks": [{"name": "Home", "cell": [0, 1]}],
         "things": [
             {"name": "cat", "label": "cat", "kind": "mover"},

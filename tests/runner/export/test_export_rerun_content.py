@@ -14,7 +14,7 @@ from runner.environments.mdp import events_of
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.layout import PLOTS
 from runner.export.rerun.runs import Source
-from runner.export.rerun.scene import own_actions, scene_of
+from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import viewer_program
 from runner.export.rerun.writing import export
@@ -162,7 +162,7 @@ class TestSteps:
                 states = pictures.states[pictures.context[step["state"]]][order]
                 assert np.array_equal(shown[states >= 0], q[states[states >= 0]].astype(np.float32))
                 greedy = seen[states[states >= 0]].argmax(axis=1)
-                own = greedy if len(recording.agents) > 1 else own_actions(recording.mdp)[greedy]
+                own = greedy if len(recording.agents) > 1 else recording.mdp.own_actions[greedy]
                 assert len(letters[k]) == still[own].sum()
 
     def test_events_are_in_the_log(self, exported, phase):
@@ -248,7 +248,7 @@ def test_rerun_verifies_the_file(exported, tmp_path):
 def test_own_actions_combine_to_the_joint_action(exported):
     mdp = exported.recording.mdp
     assert np.array_equal(
-        np.ravel_multi_index(tuple(own_actions(mdp).T), mdp.action_counts), np.arange(mdp.joint_actions)
+        np.ravel_multi_index(tuple(mdp.own_actions.T), mdp.action_counts), np.arange(mdp.joint_actions)
     )
 
 
