@@ -29,6 +29,7 @@ ORDER = """
     sweep
     client
     loops
+    golden
     service
     api
     cli

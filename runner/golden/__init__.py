@@ -1,0 +1,1 @@
+"""Golden runs: learning under test, compared with what was recorded when it was right."""

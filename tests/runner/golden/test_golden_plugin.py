@@ -1,0 +1,104 @@
+"""Golden runs as a user has them: a test file of theirs, run by pytest, changed, and run again."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+TESTS = """
+import gymnasium
+import runner
+
+LEARNING_RATE, EPSILON, LOSS = 0.5, 0.2, 0.0
+
+def test_loop(golden):
+    with runner.record(gymnasium.make("CartPole-v1"), golden.recordings, config={"lr": LEARNING_RATE}) as env:
+        action = 0
+        for episode in range(5):
+            env.reset(seed=episode)
+            over = False
+            while not over:
+                _, _, terminated, truncated, _ = env.step(action)
+                action = 1 - action if LEARNING_RATE < 1 else 1
+                over = terminated or truncated
+    golden.same_bytes(env.run)
+
+def test_job(golden):
+    changes = ["episodes=10", f"epsilon={EPSILON}"]
+    golden.same_bytes(runner.run("quick", recordings=golden.recordings, overrides=changes))
+
+def test_scores(golden):
+    scores = [20.0, 21.0, 19.5, 22.0, 20.5, 21.5, 20.2, 20.9]
+    golden.no_worse([score - LOSS for score in scores], margin=2.0)
+"""
+CHANGED = TESTS.replace("0.5, 0.2, 0.0", "1.5, 0.3, 3.0")
+FILES = {"test_loop.mcap", "test_job.mcap", "test_scores.json"}
+
+
+def pytest_over(folder: Path, text: str, *options: str) -> tuple[int, str]:
+    """Return the exit code and output of pytest over a test file."""
+    (folder / "test_mine.py").write_text(text)
+    (folder / "pytest.ini").touch()
+    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "COLUMNS": "200"}
+    environment.pop("PYTEST_ADDOPTS", None)
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Return a folder of tests whose golden runs are recorded."""
+    folder = tmp_path_factory.mktemp("golden")
+    code, output = pytest_over(folder, TESTS)
+    assert code == 1
+    assert "3 failed" in output
+    assert "record it by `pytest --golden-update`" in output
+    assert pytest_over(folder, TESTS, "--golden-update")[0] == 0
+    return folder
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in (folder / "golden" / "test_mine").iterdir()}
+
+
+def test_golden_runs_are_kept_next_to_the_test_and_not_written_again_while_they_are_the_same(folder):
+    before = contents(folder)
+    assert set(before) == FILES
+    assert pytest_over(folder, TESTS)[0] == 0
+    assert pytest_over(folder, TESTS, "--golden-update")[0] == 0
+    assert contents(folder) == before
+
+
+def test_what_changed_fails_with_the_first_difference_its_cause_and_a_page(folder):
+    before = contents(folder)
+    code, output = pytest_over(folder, CHANGED, "--golden-pages", "pages")
+    assert code == 1
+    assert "config.lr (0.5 in A, 1.5 in B) differs" in output
+    assert "They diverge at training step 2, of episode 0 at time 2: action is 0 in A, 1 in B" in output
+    assert "epsilon" in output
+    assert "They diverge in training episode" in output
+    assert "IQM 17.7" in output
+    assert "error rate 0.05" in output
+    for name in ("test_loop", "test_job"):
+        page = folder / "pages" / f"test_mine--{name}.html"
+        assert "<html" in page.read_text()
+        assert str(page) in output
+    assert contents(folder) == before
+
+
+def test_a_damaged_golden_run_is_reported_and_replaced_on_request(folder):
+    kept = folder / "golden" / "test_mine" / "test_loop.mcap"
+    whole = kept.read_bytes()
+    kept.write_bytes(b"no recording")
+    code, output = pytest_over(folder, TESTS, "-k", "loop")
+    assert code == 1
+    assert "test_loop.mcap" in output
+    assert "RecordingError" not in output
+    assert pytest_over(folder, TESTS, "-k", "loop", "--golden-update")[0] == 0
+    assert pytest_over(folder, TESTS, "-k", "loop")[0] == 0
+    assert len(kept.read_bytes()) == pytest.approx(len(whole), abs=500)
