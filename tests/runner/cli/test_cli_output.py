@@ -4,6 +4,7 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
+from runner.analysis.evaluations import EvaluationRecord, TrainingRecord
 from runner.cli import cli, output
 from runner.cli.evaluations import evaluation_table, spread
 from runner.config import from_mapping
@@ -74,15 +75,16 @@ NAMES = [
 ]
 
 
-def _record(events, episode=50_000):
-    return {
-        "episode": episode,
-        "success_percent": 98.5,
-        "mean_length": 1500.0,
-        "mean_penalties": 1499.9,
-        "events": events,
-        "training": {"percent_filled": {"taxi_1": 77.8, "taxi_2": 78.1}},
+def _record(events, episode=50_000, success=98.5, filled=(77.8, 78.1)):
+    filled = {f"taxi_{i}": percent for i, percent in enumerate(filled, 1)}
+    training = TrainingRecord(episode, 10**6, 16.0, (), dict.fromkeys(filled, 0), filled, 0.1, 0.5, 0.9)
+    values = {
+        "success_percent": {"": success},
+        "mean_length": {"": 1500.0},
+        "mean_penalties": {"": 1499.9},
+        "mean_return": dict.fromkeys(filled, -800.0),
     }
+    return EvaluationRecord(0, episode, 200, None, values, 0, events, training)
 
 
 def _lines(records, success, width):
@@ -124,14 +126,14 @@ def test_successes_are_per_agent_and_other_events_summed():
 
 
 def test_an_environment_without_events():
-    record = _record({}) | {"success_percent": None, "training": {"percent_filled": {"agent": 12.34}}}
+    record = _record({}, success=None, filled=(12.34,))
     *_, line = _lines([record], [], 80)
     assert line.split() == ["50,000", "–", "1,500.0", "1,499.9", "12.3"]
 
 
 def test_many_evaluations_are_thinned_evenly():
     records = [_record({}, episode) for episode in range(0, 51_000, 1000)]
-    shown = [record["episode"] for record in spread(records)]
+    shown = [record.episode for record in spread(records)]
     assert (len(shown), shown[0], shown[-1]) == (20, 0, 50_000)
     assert shown == sorted(set(shown))
     assert spread(records[:20]) == records[:20]
