@@ -25,6 +25,7 @@ from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.errors import RecordingError
+from runner.recording.extras import filled
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
@@ -100,8 +101,9 @@ def steps(
 
     Columns: step, episode, t, state, action (joint), next_state, `reward.AGENT`, terminated, truncated,
     explored (bit i: agent i); in spaces that are not `Discrete` action and next_observation, a column for
-    each part of a `Dict`, with an array in a cell where a value is several numbers. All steps of a long run
-    take some 70 bytes of memory each.
+    each part of a `Dict`, with an array in a cell where a value is several numbers; `extra.NAME` for each
+    value that a loop recorded with its steps, NaN where a step has none. All steps of a long run take some
+    70 bytes of memory each.
 
     Raises:
         MissingExtra: pandas is not installed.
@@ -190,7 +192,9 @@ def step_columns(
     names = records.dtype.names or ()
     columns = _spread(_plain_columns(records, [name for name in _BEFORE if name in names]))
     columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in recording.agents])
-    return columns | _plain_columns(records, [name for name in _AFTER if name in names])
+    columns |= _plain_columns(records, [name for name in _AFTER if name in names])
+    extras = recording.extras(phase).at(records["step"])
+    return columns | {f"extra.{name}": filled(values) for name, values in extras.items()}
 
 
 # --- inside -------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from runner.analysis.evaluations import (
     training_records,
 )
 from runner.errors import RecordingError
+from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import Summary
 from runner.runs.run import Run
@@ -32,6 +33,21 @@ class TableFill:
     def as_json(self) -> dict[str, Any]:
         """Return what is known, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class RecordedExtras:
+    """The values that a loop recorded with the steps of a phase."""
+
+    steps: int
+    """The number of steps with such values."""
+    names: Mapping[str, tuple[str, tuple[int, ...]]]
+    """Name to dtype and shape."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON can hold it."""
+        names = {name: {"dtype": dtype, "shape": list(shape)} for name, (dtype, shape) in self.names.items()}
+        return {"steps": self.steps, "names": names}
 
 
 @dataclass(frozen=True)
@@ -54,6 +70,8 @@ class RunDetails:
     training: tuple[TrainingRecord, ...] = ()
     loop: Summary | None = None
     """The last results of a loop; None for a job."""
+    extras: Mapping[str, RecordedExtras] = field(default_factory=dict)
+    """The values that a loop recorded with the steps of each phase, where there are some."""
 
     def facts(self) -> dict[str, Any]:
         """Return everything but the series, as JSON can hold it."""
@@ -76,6 +94,7 @@ class RunDetails:
             "success_events": list(self.success_events),
             "tables": [table.as_json() for table in self.tables],
             "loop": None if self.loop is None else _loop_as_json(self.loop),
+            "extras": {phase: own.as_json() for phase, own in self.extras.items()},
         }
 
     def as_json(self) -> dict[str, Any]:
@@ -114,10 +133,20 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
                     ),
                     training=tuple(training_records(recording)),
                     loop=None if recording.is_job else loop_summary(recording),
+                    extras=_extras(recording),
                 )
         except RecordingError as error:
             report(f"Only what run.json says: {error}")
     return RunDetails(run, config, summary.episodes, summary.train_steps, summary.eval_steps)
+
+
+def _extras(recording: Recording) -> dict[str, RecordedExtras]:
+    extras = {phase: recording.extras(phase) for phase in schema.PHASES}
+    return {
+        phase: RecordedExtras(own.count, {name: (kind.base.name, kind.shape) for name, kind in own.items()})
+        for phase, own in extras.items()
+        if own
+    }
 
 
 def random_policy_sentence(recording: Recording) -> str:

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from runner.archive import layout
@@ -20,6 +21,7 @@ from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import Sizes, blank_records, record_dtype
+from runner.recording.extras import ExtraLayout
 from runner.recording.metadata import kind_of, sizes_of, spaces_of
 from runner.recording.reader import Recording
 from runner.recording.recorder import BLOCK_BYTES
@@ -44,7 +46,9 @@ class Shape:
     sizes: Mapping[Topic, Sizes]
     """The sizes of each fixed-width topic, for `record_dtype`."""
     spaces: Mapping[str, SpaceColumns] = field(default_factory=dict)
-    """Of a loop, by the field with the values: `action`, `next_observation`, `observation`."""
+    """Of a loop, by the field with the values: `action`, `next_observation`, `observation`, `extra`."""
+    extras: tuple[ExtraLayout, ...] = ()
+    """The names of extras, from when on."""
 
     @cached_property
     def tables(self) -> tuple[Table, ...]:
@@ -68,6 +72,8 @@ class Shape:
             *(steps, episodes, table(layout.RESETS, "/train/reset", "/eval/reset")),
             *(table(layout.INFOS, "/train/info", "/eval/info"), table(layout.SCALARS, "/scalar")),
             *(table(layout.ARRAYS, "/array"), table(layout.FRAMES, "/train/frame", "/eval/frame"), log),
+            table(layout.EXTRA_COLUMNS, "/extra"),
+            *((table(layout.EXTRAS, "/train/extra", "/eval/extra"),) if self.extras else ()),
         )
 
     def schema_of(self, message: MessageType) -> pa.Schema:
@@ -81,6 +87,8 @@ class Shape:
             return self._steps
         if message is schema.TRANSITION:
             return self._transitions
+        if message is schema.EXTRA:
+            return self._extras
         return self._resets if message is schema.RESET else self._episodes
 
     @property
@@ -138,6 +146,16 @@ class Shape:
             *(_plain("environment", _INT32), Column("seed", pa.uint64(), read_seed, write_seed)),
             *self.spaces["observation"].columns,
         ]
+
+    @cached_property
+    def _extras(self) -> list[Column]:
+        """Return the columns of the last layout, which has all names."""
+        nullable = (
+            _nullable(column, leaf.path[0])
+            for leaf, columns in self.spaces["extra"].columns_by_leaf
+            for column in columns
+        )
+        return [_plain("step", _INT64), *nullable]
 
     @cached_property
     def _episodes(self) -> list[Column]:
@@ -205,6 +223,25 @@ def _element(name: str, kind: pa.DataType, source: str, i: int) -> Column:
     return Column(name, kind, read, write)
 
 
+def _nullable(column: Column, name: str) -> Column:
+    """Return the column of an extra, or of a part of it, which is null where it was not given."""
+    write_values = column.write
+    assert write_values is not None
+    is_bytes = pa.types.is_fixed_size_binary(column.type)
+    zero = pa.scalar(bytes(column.type.byte_width) if is_bytes else 0).cast(column.type)
+
+    def read(records: Records) -> pa.Array:
+        values, given = column.read(records), np.ascontiguousarray(records["given"][name])
+        values = values if isinstance(values, pa.Array) else pa.array(values, column.type)
+        return values if given.all() else pc.if_else(pa.array(given), values, pa.scalar(None, column.type))
+
+    def write(records: Records, values: pa.Array) -> None:
+        records["given"][name] = numbers(values.is_valid())
+        write_values(records, values.fill_null(zero))
+
+    return Column(column.name, column.type, read, write)
+
+
 def _names(prefix: str, names: tuple[str, ...]) -> list[str]:
     """Return a column for each name, numbered if the names would not be unique."""
     made = [prefix + name.replace(".", "_") for name in names]
@@ -213,13 +250,16 @@ def _names(prefix: str, names: tuple[str, ...]) -> list[str]:
     return made
 
 
-def shape_of(run: Mapping[str, str], mdp: Mdp | None, where: str) -> Shape:
+def shape_of(
+    run: Mapping[str, str], mdp: Mdp | None, where: str, extras: tuple[ExtraLayout, ...] = ()
+) -> Shape:
     """Return the shape of a run.
 
     Args:
         run: the recording's metadata record `run`.
         mdp: its environment, if that is tabular.
         where: the archive or recording, for errors.
+        extras: the names of its extras, from when on.
 
     Raises:
         RecordingError: they contradict each other.
@@ -235,7 +275,10 @@ def shape_of(run: Mapping[str, str], mdp: Mdp | None, where: str) -> Shape:
             f"{where}: found learners {learners!r} and {len(events)} events, "
             f"expected {run['learners']} and {run['events']}."
         )
-    spaces = {}
+    spaces, sizes = {}, sizes_of(run, where)
+    if extras:
+        spaces["extra"] = SpaceColumns(extras[-1].description, "values", where, "extra")
+        sizes |= dict.fromkeys((schema.TRAIN_EXTRA, schema.EVAL_EXTRA), extras[-1].sizes)
     if kind_of(run) != "job":
         described = spaces_of(run, where)
         for name in ("action", "next_observation", "observation"):
@@ -247,8 +290,9 @@ def shape_of(run: Mapping[str, str], mdp: Mdp | None, where: str) -> Shape:
         agents=mdp.agents if mdp else (),
         action_counts=mdp.action_counts if mdp else (),
         events=events,
-        sizes=sizes_of(run, where),
+        sizes=sizes,
         spaces=spaces,
+        extras=extras,
     )
 
 
@@ -259,7 +303,15 @@ def merged(recording: Recording, topics: tuple[Topic, Topic]) -> Iterator[tuple[
         recording: the recording.
         topics: two fixed-width topics.
     """
-    waiting = [(topic, iter(recording.blocks(topic))) for topic in topics]
+    waiting = [
+        (
+            topic,
+            recording.extras(topic.phase).blocks()
+            if topic.message is schema.EXTRA
+            else recording.blocks(topic),
+        )
+        for topic in topics
+    ]
     heads = [(topic, block, blocks) for topic, blocks in waiting if (block := next(blocks, None)) is not None]
     while len(heads) == 2:
         heads.sort(key=lambda head: int(head[1]["log_time"][0]))
@@ -276,6 +328,8 @@ def merged(recording: Recording, topics: tuple[Topic, Topic]) -> Iterator[tuple[
 def batch_of(topic: Topic, records: Records, shape: Shape) -> pa.RecordBatch:
     """Return the columns of message records of one fixed-width topic, [n] rows."""
     n = len(records)
+    if topic.message is schema.EXTRA:
+        records = _in_layout(topic, records, shape.extras[-1])
     arrays = [
         _constant(0, n, (shape.run_id,)),
         _constant(PHASES.index(topic.phase), n, PHASES),
@@ -306,15 +360,36 @@ def checked_batch(topic: Topic, records: Records, shape: Shape, where: str) -> p
     """
     batch = batch_of(topic, records, shape)
     restored = records_of(topic, batch, shape)
+    if topic.message is schema.EXTRA:
+        parts = list(in_layouts(topic, restored, shape))
+        restored = parts[0] if len(parts) == 1 and parts[0].dtype == records.dtype else np.zeros_like(records)
     found, expected = (rows.view(np.uint8).reshape(len(records), -1) for rows in (records, restored))
     if not np.array_equal(found, expected):
         differs = (found != expected).any(axis=1)
-        number = int(records[int(differs.argmax())][schema.NUMBERED_BY[topic.message]])
+        number = int(records[int(differs.argmax())][schema.NUMBERED_BY.get(topic.message, "step")])
         raise RecordingError(
             f"{where}: message {number} of {topic.name} has what no recorder writes, so that it cannot be "
             "archived; `dualtaxi verify` names the damage."
         )
     return batch
+
+
+def in_layouts(topic: Topic, records: Records, shape: Shape) -> Iterator[Records]:
+    """Yield extras, which have all names, in parts with the names that there were at their time."""
+    starts = np.array([layout.start_time for layout in shape.extras], np.uint64)
+    chosen = np.searchsorted(starts, records["log_time"], "right") - 1
+    for k in np.unique(chosen).tolist():
+        yield _in_layout(topic, records[chosen == k], shape.extras[k])
+
+
+def _in_layout(topic: Topic, records: Records, target: ExtraLayout) -> Records:
+    """Return extras with more names, which they do not have, or with fewer."""
+    moved = _blanks(topic, target.sizes, len(records))
+    for number in ("log_time", "publish_time", "step"):
+        moved[number] = records[number]
+    for name in set(target.names) & set(records["values"].dtype.names or ()):
+        moved["values"][name], moved["given"][name] = records["values"][name], records["given"][name]
+    return moved
 
 
 def record_bytes(records: Records) -> memoryview:

@@ -10,7 +10,9 @@
     <run id>/infos.parquet           the chosen fields of infos,
     <run id>/scalars.parquet         the logged numbers,
     <run id>/arrays.parquet          the recorded arrays,
-    <run id>/frames.parquet          the pictures
+    <run id>/frames.parquet          the pictures,
+    <run id>/extra_columns.parquet   the names of the values that the loop recorded with its steps,
+    <run id>/extras.parquet          and these values
     <run id>/log.parquet             lines of text
     <run id>/run.parquet             one row: what the run is, its configuration and provenance
     <run id>/transitions.parquet     the environment's possible outcomes, with their events
@@ -54,6 +56,8 @@ INFOS: Final = "infos.parquet"
 SCALARS: Final = "scalars.parquet"
 ARRAYS: Final = "arrays.parquet"
 FRAMES: Final = "frames.parquet"
+EXTRA_COLUMNS: Final = "extra_columns.parquet"
+EXTRAS: Final = "extras.parquet"
 LOG: Final = "log.parquet"
 RUN: Final = "run.parquet"
 TRANSITIONS: Final = "transitions.parquet"
@@ -101,12 +105,25 @@ SCHEMAS: Final = {
             *(("shape", pa.list_(pa.int64())), ("dtype", pa.string()), ("data", pa.binary())),
         ]
     ),
+    EXTRA_COLUMNS: pa.schema([*_PLACED, ("json", pa.string())]),
     FRAMES: pa.schema([*PLACED_IN_PHASE, ("format", pa.string()), ("data", pa.binary())]),
 }
 """The columns of the tables that are the same in every archive."""
 
-MAY_BE_NULL: Final = frozenset({"data", "seed"})
-"""The nullable columns: the data of a snapshot that a replay computes, the seed of a reset without one."""
+LEFT_OUT_IF_EMPTY: Final = frozenset({EXTRA_COLUMNS, EXTRAS})
+"""The tables that an archive need not have."""
+EXTRA_PREFIX: Final = "extra_"
+_MAY_BE_NULL: Final = frozenset({"data", "seed"})
+
+
+def may_be_null(column: str) -> bool:
+    """Return whether a column is nullable.
+
+    That is the data of a snapshot that a replay computes, the seed of a reset without one, and the extras of
+    a step without them.
+    """
+    return column in _MAY_BE_NULL or column.startswith(EXTRA_PREFIX)
+
 
 ENCODINGS: Final = {
     **dict.fromkeys(("position", "step", "episode", "last_step"), "DELTA_BINARY_PACKED"),
@@ -115,7 +132,7 @@ ENCODINGS: Final = {
     "truncated": "RLE",
 }
 """The encodings of columns of steps and episodes; all others have a dictionary."""
-VALUES: Final = ("action_", "observation", "next_observation")
+VALUES: Final = ("action_", "observation", "next_observation", EXTRA_PREFIX)
 """The prefixes of columns with values of spaces; floats are split by byte."""
 
 

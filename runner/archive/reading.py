@@ -18,10 +18,12 @@ from runner.archive import layout
 from runner.archive.columns import Shape, shape_of
 from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
 from runner.errors import RecordingError
+from runner.recording import schema
 from runner.recording.description import RunDescription
+from runner.recording.extras import MAX_NAMES, ExtraLayout, read_layouts
 from runner.recording.metadata import check_run, json_object
 from runner.recording.records import MAX_UNPACKED_RATIO
-from runner.recording.schema import Topic
+from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.util.files import open_regular
 
 MAX_DESCRIPTION_BYTES: Final = 64 << 20
@@ -123,7 +125,21 @@ class Archive(RunDescription):
     @cached_property
     def shape(self) -> Shape:
         """The shape of the run, which determines its tables."""
-        return shape_of(self.run, self.mdp if self.tabular else None, str(self.folder))
+        mdp = self.mdp if self.tabular else None
+        return shape_of(self.run, mdp, str(self.folder), tuple(self._extra_layouts()))
+
+    def _extra_layouts(self) -> list[ExtraLayout]:
+        count = self.count(schema.EXTRA_COLUMNS_TOPIC)
+        if not count or self.is_job:
+            return []
+        name = layout.EXTRA_COLUMNS
+        rows = [
+            row
+            for batch in self.batches(name, layout.SCHEMAS[name], count, MAX_NAMES)
+            for row in batch.to_pylist()
+        ]
+        columns = [(row["position"] * STEP_NANOSECONDS, row["json"]) for row in rows]
+        return read_layouts(columns, str(self.folder / name))
 
     def attachment(self, name: str) -> bytes:
         """Return the data of an attachment.
@@ -192,5 +208,5 @@ class Archive(RunDescription):
 
 def _refuse_nulls(batch: pa.RecordBatch, path: Path) -> None:
     for name, column in zip(batch.schema.names, batch.columns, strict=True):
-        if column.null_count and name not in layout.MAY_BE_NULL:
+        if column.null_count and not layout.may_be_null(name):
             raise RecordingError(f"{path}: found {column.null_count} rows without {name}, expected none.")

@@ -14,7 +14,7 @@ import numpy as np
 from blake3 import blake3
 
 from runner.archive import layout
-from runner.archive.columns import of_phase, record_bytes, records_of
+from runner.archive.columns import in_layouts, of_phase, record_bytes, records_of
 from runner.archive.layout import Records, Table
 from runner.archive.manifest import Entry, Manifest
 from runner.archive.reading import Archive
@@ -128,6 +128,8 @@ class _Restorer:
             self._file.add_attachment(name, media_type, self._archive.attachment(name))
 
     def _restore_table(self, table: Table) -> None:
+        if table.name in layout.LEFT_OUT_IF_EMPTY and not self._archive.count(*table.topics):
+            return
         if table.topics[0] not in self._shape.sizes:
             self._restore_messages(table)
         elif self._archive.is_job and table.name == layout.STEPS:
@@ -155,7 +157,10 @@ class _Restorer:
             for topic in table.topics:
                 mine = of_phase(batch, topic.phase, f"{self._where}: {table.name}")
                 if mine.num_rows:
-                    yield topic, records_of(topic, mine, self._shape)
+                    records = records_of(topic, mine, self._shape)
+                    is_extra = topic.message is schema.EXTRA
+                    parts = in_layouts(topic, records, self._shape) if is_extra else [records]
+                    yield from ((topic, part) for part in parts)
 
     def _restore_messages(self, table: Table) -> None:
         """Restore a table of messages that vary in size, a row each."""

@@ -95,16 +95,22 @@ class SpaceColumns:
 
     Args:
         description: the space's description in the recording.
-        field: the field of records with the values, and the prefix of the columns' names.
+        field: the field of records with the values.
         where: the archive or recording, for errors.
+        prefix: the beginning of the columns' names; the field unless given.
 
     Raises:
         RecordingError: the description is not of a space.
     """
 
-    def __init__(self, description: Mapping[str, Any], field: str, where: str) -> None:
-        self._leaves = _named(leaves_of(description, where), field)
-        self.columns: list[Column] = [column for leaf in self._leaves for column in leaf.columns(field)]
+    def __init__(
+        self, description: Mapping[str, Any], field: str, where: str, prefix: str | None = None
+    ) -> None:
+        self._leaves = _named(leaves_of(description, where), prefix or field)
+        self.columns_by_leaf: list[tuple[Leaf, list[Column]]] = [
+            (part.leaf, list(part.columns(field))) for part in self._leaves
+        ]
+        self.columns: list[Column] = [column for _, own in self.columns_by_leaf for column in own]
 
     def row(self, value: bytes) -> dict[str, Any]:
         """Return the columns of one encoded value.

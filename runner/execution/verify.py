@@ -30,7 +30,7 @@ from runner.execution.session import Report, Session, recorder_for
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.blocks import message_record
-from runner.recording.consistency import Findings, check_phase
+from runner.recording.consistency import Findings, check_extras, check_phase
 from runner.recording.digest import ContentHash
 from runner.recording.integrity import check_integrity, may_be_cut, refuse_foreign, survey
 from runner.recording.loop_blocks import Inconsistent
@@ -282,6 +282,8 @@ def _verify_loop(recording: Recording) -> Verification:
         _compare_names(recording)
         content = _Content(recording)
         phases = {phase: check_phase(recording, phase, finished, content.add) for phase in ("train", "eval")}
+        for phase in phases:
+            check_extras(recording, phase, finished, content.add)
         content.add_other_topics()
         if content.off_table:
             strange = f"{content.off_table:,} steps"
@@ -333,7 +335,7 @@ class _Content:
     def add_other_topics(self) -> None:
         """Add all messages of the topics of varying size."""
         for topic in self._recording.topics:
-            if topic in self._recording.dtypes:
+            if topic in self._recording.dtypes or topic.message is schema.EXTRA:
                 continue
             for time, payload in self._recording.messages(topic):
                 if topic.digested:

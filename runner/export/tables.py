@@ -1,6 +1,6 @@
 """Steps, episodes and metrics as tables, for spreadsheets and data frames: CSV or Parquet, a file each.
 
-A loop has resets and infos too. A column holds a number or a text; an array of more numbers than
+A loop has resets, infos and extras too. A column holds a number or a text; an array of more numbers than
 `runner.archive.values` spreads over columns is a column of bytes, which CSV cannot hold.
 """
 
@@ -28,6 +28,7 @@ _TABLES: Final = {
     "episodes": layout.EPISODES,
     "resets": layout.RESETS,
     "infos": layout.INFOS,
+    "extras": layout.EXTRAS,
 }
 """The name of each file, without its ending, to the table of an archive that it holds."""
 PATTERNS: Final = tuple(

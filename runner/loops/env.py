@@ -68,6 +68,24 @@ class Recorded(Generic[R]):
         """
         self._messages.snapshot(self._phase, name, array)
 
+    def note_step(self, values: Mapping[str, Any] | None = None, /, **more: Any) -> None:
+        """Record values with the last step, as `step(action, extras={...})` does.
+
+            rec.note_step(td_error=error)
+            rec.note_step({"td error": error})
+
+        A name keeps the dtype and the shape of its first value. Of a vector environment a value is an array
+        [N, ...]; of several agents it is a mapping of names for each agent.
+
+        Raises:
+            ConfigError: a name or a value cannot be recorded.
+            RunnerError: no step of this phase was taken since the last step of the other phase.
+        """
+        self._loop.note(self._phase, self._rows, self._extras_by_name({**(values or {}), **more}))
+
+    def _extras_by_name(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        return values
+
     @contextlib.contextmanager
     def phase(self, name: str) -> Iterator[Self]:
         """Record what happens in the block in this phase, `train` or `eval`: `with rec.phase("eval"):`.
@@ -158,26 +176,33 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
         gymnasium.Wrapper.__init__(self, env)
         self._owner = owner
         self._env_step = env.step
-        self._has_extras = bool(loop.options.info or loop.options.frames_every)
+        self._has_messages = bool(loop.options.info or loop.options.frames_every)
         self._until_frame = 0
         self._record_into(loop, is_owner=owner is None)
         self._enter(phase)
 
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
-        self._take = self._rows.take
+        self._take, self._take_extras = self._rows.take, self._loop.extras.take
         self._lock = self._loop.lock
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Take a step, and record it."""
+    def step(
+        self, action: Any, extras: Mapping[str, Any] | None = None
+    ) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step, and record it, with values of your own: `extras={"value": v, "logits": logits}`.
+
+        A name keeps the dtype and the shape of its first value; a step need not have all names.
+        """
         result = self._env_step(action)
         observation, reward, terminated, truncated, info = result
         with self._lock:
             if self._loop.active is not self._rows:
                 self._loop.activate(self._rows)
             self._take(action, observation, reward, terminated, truncated)
-        if self._has_extras:
-            self._record_extras(info, terminated or truncated)
+            if extras is not None:
+                self._take_extras(self._phase, self._rows, extras)
+        if self._has_messages:
+            self._record_messages(info, terminated or truncated)
         return result
 
     def reset(
@@ -196,7 +221,7 @@ class RecordedEnv(Recorded[Rows], gymnasium.Wrapper[Any, Any, Any, Any]):
             self._messages.frame(self._phase, self.env.render())
         return result
 
-    def _record_extras(self, info: Mapping[str, Any], over: bool) -> None:
+    def _record_messages(self, info: Mapping[str, Any], over: bool) -> None:
         """Record info and frame of the step that was just put down, where the options include them."""
         if self._options.info:
             self._messages.info(self._phase, info)

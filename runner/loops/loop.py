@@ -8,7 +8,7 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Final, Generic, TypeVar
 
@@ -18,6 +18,7 @@ from runner.client.outbox import Follower, connect, is_server, outbox_folder
 from runner.config.job import NOT_CONTENT
 from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Described
+from runner.loops.extras import Extras
 from runner.loops.messages import Messages
 from runner.loops.options import Options
 from runner.loops.outcomes import Outcomes
@@ -40,7 +41,7 @@ R = TypeVar("R", bound=PhaseRows)
 
 
 class _IgnoredRows:
-    """Ignores the steps of a forked process."""
+    """Ignores the steps of a forked process, and their extras."""
 
     filled = 0
     place = (0, 0)
@@ -48,7 +49,7 @@ class _IgnoredRows:
     def ignore(self, *_: object) -> None:
         """Do nothing."""
 
-    open = commit = reshape = take = take_game = reset = ignore
+    open = commit = finish = extend = reshape = take = take_game = reset = ignore
 
 
 class Loop(Generic[R]):
@@ -60,6 +61,7 @@ class Loop(Generic[R]):
         maker: how it was made.
         make_rows: returns the rows of a phase for recorder, description, phase and what to call with the
             first action.
+        batch: (N,) for N environments that step at once, else ().
 
     Raises:
         StorageError: the recordings folder cannot be written.
@@ -71,6 +73,7 @@ class Loop(Generic[R]):
         options: Options,
         maker: EnvironmentMaker,
         make_rows: Callable[[Recorder, Described, str, Callable[[Any], None]], R],
+        batch: tuple[int, ...] = (),
     ) -> None:
         client = connect(str(options.recordings)) if is_server(options.recordings) else None
         folder = outbox_folder() if client else recordings_folder(options.recordings)
@@ -113,6 +116,7 @@ class Loop(Generic[R]):
             watch=self._outcomes.take_records,
             before=self._describe,
         )
+        self.extras = Extras(self._recorder, batch)
         self.messages = Messages(
             self, self._recorder, self._outcomes, options, {topic.name: topic for topic in topics}
         )
@@ -195,8 +199,23 @@ class Loop(Generic[R]):
             )
         if self.active is not None and self.active is not rows:
             self.active.commit()
+            self.extras.finish()
             self.active.open()
         self.active = rows
+
+    def note(self, phase: str, rows: R, values: Mapping[str, Any]) -> None:
+        """Record values with the last step of a phase.
+
+        Raises:
+            ConfigError: a name or a value cannot be recorded.
+            RunnerError: there is no such step any more, or the loop is closed.
+        """
+        with self.lock:
+            if self.records() and self.position and self.active is not rows:
+                raise RunnerError(
+                    "note_step: found that the last step was one of another phase, expected one of this phase"
+                )
+            self.extras.extend(phase, rows, values)
 
     @property
     def position(self) -> int:
@@ -264,6 +283,7 @@ class Loop(Generic[R]):
 
     def _finish(self, status: str, error: str) -> dict[str, Any]:
         self._commit()
+        self.extras.finish()
         result = self._recorder.totals(self._recorder.drain())
         result |= {"episodes": self._recorder.counts["/train/episode"], "steps_recorded": True}
         result |= self._outcomes.summary()
@@ -279,6 +299,7 @@ class Loop(Generic[R]):
         """Hand everything to the recorder."""
         for rows in self._rows.values():
             rows.commit()
+        self.extras.commit()
         self.messages.commit()
 
     def flush(self) -> bool:
@@ -313,7 +334,7 @@ class Loop(Generic[R]):
         self.is_foreign, self.active = True, None
         self.lock = threading.RLock()  # a thread that does not exist here may have held the other one
         ignored: Any = _IgnoredRows()
-        self._rows = dict.fromkeys(schema.PHASES, ignored)
+        self._rows, self.extras = dict.fromkeys(schema.PHASES, ignored), ignored
         for view in list(self.views):
             view._detach()
 

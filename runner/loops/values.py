@@ -86,7 +86,7 @@ def arrays_of(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
             yield from arrays_of(f"{name}/{key}", part)
         return
     try:
-        values = _as_array(value)
+        values = as_array(value)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ConfigError(f"snapshot: found no array of numbers for {name!r} ({error})") from error
     if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
@@ -101,14 +101,14 @@ def arrays_of(name: str, value: Any) -> Iterator[tuple[str, NDArray[Any]]]:
     yield name, values.astype(values.dtype.newbyteorder("<"), copy=False)
 
 
-def _as_array(value: Any) -> NDArray[Any]:
+def as_array(value: Any) -> NDArray[Any]:
     """Return an array or tensor as NumPy's; the short floats that NumPy lacks become float32, exactly."""
     if callable(detach := getattr(value, "detach", None)):
         value = detach().cpu()
         if "bfloat16" in str(value.dtype) or "float8" in str(value.dtype):
             value = value.float()
     values = np.asarray(value, order="C")
-    if values.dtype.name.startswith(("bfloat16", "float8")):
+    if values.dtype.kind == "V" and values.dtype.name.startswith(("bfloat16", "float8")):
         return values.astype(np.float32)
     return values
 

@@ -43,8 +43,10 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
             super()._enter(phase)
             self._rows.over = over  # the environments are the same ones
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Take a step in every environment, and record it."""
+    def step(
+        self, actions: Any, extras: Mapping[str, Any] | None = None
+    ) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Take a step in every environment, and record it, with arrays [N, ...] of your own by name."""
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
         final = _final_observations(infos) if self._has_finals else None
@@ -52,6 +54,8 @@ class RecordedVector(Recorded[VectorRows], VectorWrapper[Any, Any, Any, Any, Any
             if self._loop.active is not self._rows:
                 self._loop.activate(self._rows)
             self._rows.take(actions, observations, rewards, terminated, truncated, final)
+            if extras is not None:
+                self._loop.extras.take(self._phase, self._rows, extras)
         if self._options.info:
             self._messages.info(self._phase, _by_environment(infos))
         return result
@@ -120,7 +124,7 @@ def record_vector(
         maker = vector_maker_of(envs, first, mode, checked_make(make))
     options = options_of(recordings, name, seed, config, info, packing)
     rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
-    return RecordedVector(envs, Loop(described, options, maker, rows), mode)
+    return RecordedVector(envs, Loop(described, options, maker, rows, (described.environments,)), mode)
 
 
 def _autoreset_mode(envs: VectorEnv[Any, Any, Any], chosen: AutoresetMode | str | None) -> AutoresetMode:
@@ -216,17 +220,32 @@ class RecordedParallel(Recorded[AgentRows]):
         """The environment inside of all wrappers."""
         return self.env.unwrapped
 
-    def step(self, actions: Mapping[str, Any]) -> tuple[Any, Any, Any, Any, Any]:
-        """Take a step of all agents, and record it."""
+    def step(
+        self, actions: Mapping[str, Any], extras: Mapping[str, Mapping[str, Any]] | None = None
+    ) -> tuple[Any, Any, Any, Any, Any]:
+        """Take a step of all agents, and record it, with values of your own by agent and name."""
         result = self.env.step(actions)
         observations, rewards, terminated, truncated, infos = result
         with self._loop.lock:
             self._loop.activate(self._rows)
             over = not self.env.agents
             self._rows.take_game(actions, observations, rewards, terminated, truncated, over)
+            if extras is not None:
+                self._loop.extras.take(self._phase, self._rows, self._extras_by_name(extras))
         if self._options.info:
             self._messages.info(self._phase, _by_field(infos))
         return result  # type: ignore[no-any-return]
+
+    def _extras_by_name(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the values of agents as `agent/name`."""
+        agents = self._loop.described.agents
+        for agent, own in values.items():
+            if agent not in agents or not isinstance(own, Mapping):
+                raise ConfigError(
+                    f"extras: found {agent!r}: {type(own).__name__}, expected the values of each agent by "
+                    f"name, such as {{{agents[0]!r}: {{'value': 0.5}}}}"
+                )
+        return {f"{agent}/{name}": value for agent, own in values.items() for name, value in own.items()}
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
         """Reset the environment, and record it."""

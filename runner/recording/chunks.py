@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.schema import ALL_BLOCK_TOPICS, TOPIC_OF, Topic
+from runner.recording.schema import TOPIC_OF, UNIFORM_TOPICS, Topic
 from runner.util.packing import MAX_CHUNK_STEPS, Packing
 
 MAX_CHUNK_BYTES: Final = 64 << 20
@@ -174,7 +174,7 @@ def _check_message_count(body: memoryview, head: ChunkHead, where: str) -> None:
     """
     length, channel = _first_message(body, head, where)
     messages = head.uncompressed_size // (RECORD_HEAD.size + length)
-    if TOPIC_OF.get(channel) in ALL_BLOCK_TOPICS and messages > MAX_CHUNK_STEPS:
+    if TOPIC_OF.get(channel) in UNIFORM_TOPICS and messages > MAX_CHUNK_STEPS:
         raise RecordingError(f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_STEPS:,} at most")
 
 

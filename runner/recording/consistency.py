@@ -75,6 +75,42 @@ def check_phase(recording: Recording, phase: str, complete: bool, on_block: OnBl
     return _Phase(recording, phase, complete, on_block).check()
 
 
+def check_extras(recording: Recording, phase: str, complete: bool, on_block: OnBlock) -> None:
+    """Compare the extras of a phase with its steps: each belongs to a step, at its time, in their order.
+
+    Args:
+        recording: of a loop.
+        phase: `train` or `eval`.
+        complete: whether the recording was completed; else the steps of the last extras may be missing.
+        on_block: called with each block of extras.
+
+    Raises:
+        Inconsistent: one does not.
+        RecordingError: the recording cannot be read.
+    """
+    extras, last = recording.extras(phase), -1
+    steps, topic = recording.topic(f"/{phase}/step"), recording.topic(f"/{phase}/extra")
+    # Steps of varying size are not looked up: their extras are only counted, and compared with one another.
+    total = recording.count(steps) if extras else 0
+    for block in extras.blocks(stop=None if complete else total):
+        on_block(topic, block)
+        numbers, where = block["step"], f"{topic.name}, step {block['step'][0]} and later"
+        if numbers[0] <= last or (np.diff(numbers) <= 0).any() or numbers[-1] >= total:
+            raise Inconsistent(f"{where}: found steps out of order, or after the last of {total:,}")
+        last = int(numbers[-1])
+        for name in block["values"].dtype.names or ():
+            given, values = block["given"][name], block["values"][name].reshape(len(block), -1)
+            if (given.view(np.uint8) > 1).any() or values[~given].any():
+                raise Inconsistent(f"{where}: {name}: found values where none were given")
+        if steps in recording.dtypes:
+            rows = np.concatenate(
+                [part[["step", "log_time"]] for part in recording.blocks(steps, int(numbers[0]), last + 1)]
+            )
+            found = rows["log_time"][np.isin(rows["step"], numbers)]
+            if len(found) != len(block) or (found != block["log_time"]).any():
+                raise Inconsistent(f"{where}: found other times than those of the steps")
+
+
 class _Phase:
     """The check of one phase."""
 

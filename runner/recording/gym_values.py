@@ -13,7 +13,7 @@ from runner.errors import RecordingError
 from runner.recording.gym_spaces import Part, Space, parts_of
 from runner.recording.spaces import MAX_VALUE_BYTES, encode_text
 
-_SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
+SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
 
 OnRounded = Callable[[str], None]
 """Called with a warning: values are recorded rounded."""
@@ -38,7 +38,7 @@ class Leaf:
             return
         self.base = np.dtype(part.dtype.base.str)
         self.shape = part.dtype.shape
-        scalars = {kind for kind in _SCALARS if np.can_cast(kind, self.base)}
+        scalars = {kind for kind in SCALARS if np.can_cast(kind, self.base)}
         scalars |= {bool} | ({int} if self.base.kind in "iu" else {float} if self.base.char == "d" else set())
         self.exact_scalars = frozenset(() if self.shape else scalars)
         """Classes whose values are all recorded exactly, or refused by NumPy."""

@@ -27,6 +27,7 @@ from runner.recording import schema
 from runner.recording.blocks import record_dtype
 from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.description import RunDescription
+from runner.recording.extras import ExtraLayout, Extras, read_layouts
 from runner.recording.index import read_index
 from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
@@ -204,6 +205,8 @@ class Recording(RunDescription):
 
         For a topic of variable size it reads them.
         """
+        if topic.message is schema.EXTRA:
+            return self.extras(topic.phase).count
         return self._chunks(topic).count()
 
     def blocks(self, topic: Topic, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
@@ -285,6 +288,51 @@ class Recording(RunDescription):
         if not blocks:
             raise RecordingError(f"{self.path}: the steps of {phase_name} episode {episode} were lost.")
         return np.concatenate(blocks)[:: span.step]
+
+    def extras(self, phase: str) -> Extras:
+        """Return the values that a loop recorded with the steps of a phase: names with dtypes, and values.
+
+        It is empty without any, as for a job.
+
+        Raises:
+            RecordingError: they are damaged.
+        """
+        places, start_times = np.empty(0, np.intp), np.empty(0, np.uint64)
+        topic = schema.TRAIN_EXTRA if phase == "train" else schema.EVAL_EXTRA
+        layouts: list[ExtraLayout] = []
+        if not self.is_job and len(places := self._chunk_numbers[topic]):
+            layouts = self.extra_layouts
+            start_times = self._index.chunks.columns["start_time"][places]
+        # As Python's numbers: a forged chunk may begin at any time
+        starts = [layout.start_time for layout in layouts]
+        chosen = np.array([bisect_right(starts, time) - 1 for time in start_times.tolist()], np.intp)
+        if (chosen < 0).any():
+            raise RecordingError(f"{self.path}: {topic.name} has values before their names.")
+        parts = [
+            (
+                layout,
+                TopicChunks(
+                    topic,
+                    places[chosen == k],
+                    self._index.chunks,
+                    self._store,
+                    layout.record,
+                    [],
+                    str(self.path),
+                ),
+            )
+            for k, layout in enumerate(layouts)
+            if (chosen == k).any()
+        ]
+        return Extras(parts, partial(self.episode_span, phase), str(self.path))
+
+    @cached_property
+    def extra_layouts(self) -> list[ExtraLayout]:
+        """The names of extras, from when on; each entry has those of the one before it."""
+        columns = (
+            (fields["log_time"], fields["json"]) for fields in self.decoded(schema.EXTRA_COLUMNS_TOPIC)
+        )
+        return read_layouts(columns, str(self.path))
 
     # --- messages, parsed -----------------------------------------------------------------------------
 

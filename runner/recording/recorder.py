@@ -124,11 +124,18 @@ class Recorder:
         return self._file.size if self._file is not None else 0
 
     def resize(self, sizes: Mapping[Topic, Sizes]) -> None:
-        """Change the sizes of fixed-width topics that have no messages yet, given those of all topics."""
+        """Change the sizes of fixed-width topics, or add such topics; later messages have these sizes.
+
+        Only the messages of a topic in `UNIFORM_TOPICS` may have different sizes in one recording.
+        """
         for topic, own in sizes.items():
-            lane = self._lanes[topic]
-            if lane.sizes != own:
-                assert not self.counts[topic.name], f"{topic.name} has messages already"
+            lane = self._lanes.get(topic)
+            if lane is None:
+                self._lanes[topic] = self._lane(topic, own, write=True)
+            elif lane.sizes != own:
+                assert not self.counts[topic.name] or topic not in schema.ALL_BLOCK_TOPICS
+                if lane.open is not None and lane.open.filled:
+                    self._send_block(lane)
                 self._lanes[topic] = self._lane(topic, own, lane.write)
 
     def release(self) -> None:

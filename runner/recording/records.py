@@ -177,7 +177,7 @@ def _checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint6
     if channel not in schema.TOPIC_OF:
         raise RecordingError(f"{where}: found messages of channel {channel}, which no recording has")
     size = RECORD_HEAD.size + length
-    if schema.TOPIC_OF[channel] in schema.ALL_BLOCK_TOPICS:
+    if schema.TOPIC_OF[channel] in schema.UNIFORM_TOPICS:
         if size < HEADER_BYTES or len(records) % size:
             raise RecordingError(f"{where}: its messages differ in size")
         block = np.frombuffer(records, np.dtype([*HEADER, ("data", "u1", (size - HEADER_BYTES,))]))

@@ -20,11 +20,14 @@ from mcap.opcode import Opcode
 
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
-from runner.recording.blocks import record_dtype
+from runner.recording.blocks import HEADER_BYTES, record_dtype
+from runner.recording.extras import read_layouts
 from runner.recording.integrity import check_integrity
+from runner.recording.messages import decode
 from runner.recording.metadata import REQUIRED_RECORDS, check_run, json_object, kind_of, sizes_of
 from runner.recording.reader import open_recording
 from runner.recording.records import (
+    ReadChunk,
     Report,
     asks_for_indexes,
     attachment_of,
@@ -157,6 +160,8 @@ class _Salvage:
         self._dtypes: dict[Topic, np.dtype[np.void]] = {}
         self._next = dict.fromkeys(topics, 0)
         """The number of the next message expected of each topic."""
+        self._extra_columns: list[tuple[int, str]] = []
+        self._extra_widths: set[int] = set()
         self._result: dict[str, str] | None = None
         self._counts: dict[str, int] = {}
         """Messages of each topic, according to the result."""
@@ -210,6 +215,11 @@ class _Salvage:
         if topic not in self._topics:
             raise RecordingError(f"{where}: found messages of another kind of run.")
         first = expected = self._next[topic]
+        if topic is schema.EXTRA_COLUMNS_TOPIC:
+            self._take_extra_columns(chunk)
+        if topic.message is schema.EXTRA and len(chunk.records) // count not in self._extra_widths:
+            self._damaged.lost_bytes += len(body)  # their names are lost
+            return
         if topic in self._dtypes:
             if len(chunk.records) % self._dtypes[topic].itemsize:
                 raise RecordingError(f"{where}: found messages of another size.")
@@ -224,6 +234,15 @@ class _Salvage:
         self._next[topic] = first + count
         file.add_chunk(topic, copied_chunk(chunk, body, self._indexed))
         self._done.kept[topic.name] = self._done.kept.get(topic.name, 0) + count
+
+    def _take_extra_columns(self, chunk: ReadChunk) -> None:
+        """Note how wide the records of extras are from here on."""
+        ends = [*chunk.offsets.tolist()[1:], len(chunk.records)]
+        for time, start, end in zip(chunk.times.tolist(), chunk.offsets.tolist(), ends, strict=True):
+            fields = decode(schema.EXTRA_COLUMNS, chunk.records[start + HEADER_BYTES : end])
+            self._extra_columns.append((time, fields["json"]))
+        layouts = read_layouts(self._extra_columns, str(self._path))
+        self._extra_widths = {layout.record.itemsize for layout in layouts}
 
     def _finish(self, file: RecordingFile) -> None:
         """Record what was lost, or else the result again, and finish the file."""

@@ -251,6 +251,31 @@ IMAGE = MessageType(
 )
 """Foxglove's own image message, so that viewers show it as a picture."""
 
+EXTRA_COLUMNS = MessageType("ExtraColumns", (Field(1, "json", _STRING),))
+"""The names of extras, with dtypes and shapes: a description of a `Dict` space."""
+EXTRA = MessageType(
+    "Extra",
+    (
+        Field(1, "values", _BYTES),
+        Field(2, "given", _BYTES),
+        Field(3, "step", _SFIXED64),
+    ),
+)
+"""The values that a loop recorded with a step, laid out as the latest `ExtraColumns` describes."""
+CHECKPOINT = MessageType(
+    "Checkpoint",
+    (
+        Field(1, "name", _STRING),
+        Field(2, "phase", _STRING),
+        Field(3, "step", _SFIXED64),
+        Field(4, "episode", _SFIXED64),
+        Field(5, "digest", _STRING),
+        Field(6, "size", _SFIXED64),
+        Field(7, "format", _STRING),
+    ),
+)
+"""A reference to content in the store next to the recordings, by its BLAKE3."""
+
 LOG_LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
 
 TRAIN_STEP = Topic("/train/step", 1, STEP, "train")
@@ -293,6 +318,10 @@ FIRST_VERSION_CHANNELS: Final = 23
 """The highest channel of the format's first version; topics with higher ones may be missing in a file."""
 TRAIN_RESET_STATE = Topic("/train/reset_state", 24, RESET_STATE, "train", digested=False)
 EVAL_RESET_STATE = Topic("/eval/reset_state", 25, RESET_STATE, "eval", digested=False)
+EXTRA_COLUMNS_TOPIC = Topic("/extra", 26, EXTRA_COLUMNS)
+TRAIN_EXTRA = Topic("/train/extra", 27, EXTRA, "train")
+EVAL_EXTRA = Topic("/eval/extra", 28, EXTRA, "eval")
+CHECKPOINT_TOPIC = Topic("/checkpoint", 29, CHECKPOINT)
 
 LOOP_TOPICS: Final = {
     "step": (TRAIN_STEP, EVAL_STEP, TRAIN_RESET, EVAL_RESET),
@@ -309,6 +338,7 @@ _EVERY_LOOP: Final = (
     *(TRAIN_EPISODE, EVAL_EPISODE, TRAIN_INFO, EVAL_INFO),
     *(SCALAR_TOPIC, ARRAY_TOPIC, TRAIN_FRAME, EVAL_FRAME, LOG_TOPIC),
     *(TRAIN_RESET_STATE, EVAL_RESET_STATE),
+    *(EXTRA_COLUMNS_TOPIC, TRAIN_EXTRA, EVAL_EXTRA, CHECKPOINT_TOPIC),
 )
 KINDS: Final = {
     "job": TOPICS,
@@ -331,6 +361,8 @@ ALL_BLOCK_TOPICS: Final = (
     *BLOCK_TOPICS,
     *(TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET),
 )
+UNIFORM_TOPICS: Final = (*ALL_BLOCK_TOPICS, TRAIN_EXTRA, EVAL_EXTRA)
+"""The topics whose messages have one size within a chunk."""
 
 PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_EPISODE)}
 """The step and the episode topic of each phase of a job."""

@@ -19,7 +19,7 @@ from runner.util.humanize import UNKNOWN, age, duration, number, size
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from runner.analysis.summary import RunDetails
+    from runner.analysis.summary import RecordedExtras, RunDetails
     from runner.recording.reader import Recording
     from runner.recording.run_file import Summary
 
@@ -38,7 +38,7 @@ def show_command(run_name: str, recordings: Path | None, as_json: bool) -> None:
     before it, success_percent, mean_length, mean_penalties and the count of every event; under `optimality`
     its exact measures, if the run takes them; under `train` one for each report of training; under `loop` the
     last results of a loop: its last evaluation, the means of its last 100 training episodes and the last
-    values it logged.
+    values it logged; under `extras` the names of the values that it recorded with its steps.
 
     Examples:
       dualtaxi show @latest
@@ -69,6 +69,8 @@ def _parts(details: RunDetails) -> list[RenderableType]:
         parts += [sentence] if sentence else []
     if details.loop is not None:
         parts += [title("Last results"), facts(_loop_results(details.loop))]
+    if details.extras:
+        parts += [title("Values recorded with steps"), facts(_extras(details.extras))]
     if details.optimality:
         with open_recording(run.recording) as recording:
             measures = _optimality(recording, details.optimality[-1])
@@ -119,6 +121,16 @@ def _loop_results(loop: Summary) -> dict[str, str]:
     for name, value in loop.logged.items():
         results[f"logged {name}"] = "not finite" if value is None else f"{value:,.6g}"
     return results
+
+
+def _extras(extras: Mapping[str, RecordedExtras]) -> dict[str, str]:
+    """Return the number of steps with extras, and dtype and shape of each name: `float32 [2]`."""
+    from runner.recording.schema import PHASE_NAMES
+
+    rows = {f"{PHASE_NAMES[phase]} steps": f"{own.steps:,}" for phase, own in extras.items()}
+    for own in extras.values():
+        rows |= {name: f"{dtype} {list(shape) or ''}".strip() for name, (dtype, shape) in own.names.items()}
+    return rows
 
 
 def _optimality(recording: Recording, measures: Mapping[str, Any]) -> dict[str, str]:

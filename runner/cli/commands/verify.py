@@ -138,6 +138,10 @@ _MESSAGES: Final = {
     "/array": "arrays",
     "/train/frame": "frames",
     "/eval/frame": "evaluation frames",
+    "/extra": "names of extras",
+    "/train/extra": "steps with extras",
+    "/eval/extra": "evaluation steps with extras",
+    "/checkpoint": "checkpoints",
 }
 
 
