@@ -82,7 +82,7 @@ def test_what_changed_fails_with_the_first_difference_its_cause_and_a_page(folde
     assert "They diverge at training step 2, of episode 0 at time 2: action is 0 in A, 1 in B" in output
     assert "epsilon" in output
     assert "They diverge in training episode" in output
-    assert "IQM 17.7" in output
+    assert "IQM 17.65" in output
     assert "error rate 0.05" in output
     for name in ("test_loop", "test_job"):
         page = folder / "pages" / f"test_mine--{name}.html"
