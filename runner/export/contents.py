@@ -61,14 +61,12 @@ def why_no_steps(recording: Recording) -> str:
     return "it ended before one was recorded"
 
 
-def ending_of(recording: Recording, phase: str, number: int, last: Any) -> str:
-    """Return how an episode ended, a key of `ENDINGS`, from its last step."""
-    if not (last["terminated"] or last["truncated"]):
-        return "reset" if number < recording.count(recording.topic(f"/{phase}/episode")) else "cut off"
-    record = recording.episodes(phase, number, number + 1)
-    if len(record) and record[0]["success"]:
-        return "success"
-    return "terminated" if last["terminated"] else "truncated"
+def ending_of(recording: Recording, phase: str, number: int) -> str:
+    """Return how an episode ended, a key of `ENDINGS`."""
+    records = recording.episodes(phase, number, number + 1)
+    if not len(records):
+        return "cut off"
+    return next((end for end in ("success", "terminated", "truncated") if records[0][end]), "reset")
 
 
 def whole_ranges(

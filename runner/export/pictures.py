@@ -117,7 +117,7 @@ class Pictures:
             action, events = describe(row)
             rewards = np.asarray(row["rewards"], np.float64)
             returns += rewards
-            ended = ENDINGS[ending_of(recording, phase, episode, row)] if t == self.steps else ""
+            ended = ENDINGS[ending_of(recording, phase, episode)] if t == self.steps else ""
             yield Picture(t, pixels, action, tuple(rewards.tolist()), tuple(returns.tolist()), events, ended)
 
 

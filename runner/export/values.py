@@ -37,7 +37,7 @@ class Values:
         self._leaves = [leaf for leaf in leaves if 0 < _count(leaf) <= MAX_NUMBERS]
         self._texts = [leaf for leaf in leaves if leaf.dtype is None]
         self.names = [each for leaf in self._leaves for each in _names(leaf, name)]
-        self.image = next((leaf for leaf in leaves if _is_image(leaf)), None)
+        self.image = next((leaf for leaf in leaves if is_image(leaf)), None)
 
     def numbers_in(self, value: Any) -> NDArray[np.float64]:
         """Return the numbers of a value, float64 [names]."""
@@ -100,7 +100,7 @@ def _names(leaf: Leaf, name: str) -> Iterator[str]:
         yield f"{own}[{', '.join(map(str, place))}]" if place else own
 
 
-def _is_image(leaf: Leaf) -> bool:
+def is_image(leaf: Leaf) -> bool:
     """Return whether a leaf holds bytes of a picture: [height, width], perhaps with channels or stacked."""
     if leaf.dtype is None or leaf.dtype.base != np.uint8:
         return False

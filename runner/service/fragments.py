@@ -9,7 +9,7 @@ import os
 import sys
 import threading
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -24,16 +24,9 @@ from runner.drawing import svg
 from runner.errors import RecordingError, RunnerError
 from runner.export.plots.curves import footnote, panel_plots
 from runner.export.reports.diff import ShownDivergence, difference_view
-from runner.export.reports.episode import (
-    Episode,
-    last_episode,
-    last_whole_evaluation,
-    payload,
-    training_episode,
-    trial,
-    typical_trial,
-)
+from runner.export.reports.episode import last_episode, last_whole_evaluation, trial, typical_trial
 from runner.export.reports.maps import maps_of, stages_of
+from runner.export.reports.playback import playback_of
 from runner.export.reports.rendering import Link, partials
 from runner.export.rerun.selection import Request, locate
 from runner.recording.reader import Recording, open_recording
@@ -62,22 +55,10 @@ def episode_part(path: Path, which: tuple[int, ...], start: int, steps: int) -> 
         RecordingError: there is no such episode or step, or no steps were recorded.
     """
     with open_recording(path) as recording:
-        recording.require_job("a replay in the page", "The Rerun viewer shows what it recorded.")
-        first = max(0, start - _STEPS_BEFORE)
-        episode: Episode
-        if len(which) == 1:
-            episode = training_episode(recording, which[0], steps, first)
-        else:
-            episode = trial(recording, which[0], which[1], steps, first)
-        data = payload(recording, [episode], svg.drawing_of(recording.mdp))
-        facts = {
-            "description": episode.outcome,
-            "length": episode.length,
-            "first": episode.first,
-            "before": list(episode.before),
-        }
-        data |= {"episode": data.pop("episodes")[0] | facts, "scene": recording.mdp.scene}
-        return json.dumps(data, separators=(",", ":"), ensure_ascii=False).encode()
+        episode = playback_of(recording, which, steps, max(0, start - _STEPS_BEFORE))
+        scene = recording.environment["scene"] if episode.grid else None
+        data = {"episode": asdict(episode), "scene": scene}
+        return json.dumps(data, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
 
 
 def random_policy(path: Path) -> bytes:

@@ -33,6 +33,7 @@ PRELOADED: Final = (
     "runner.execution.initial_tables",
     "runner.runs.importing",
     "runner.service.computed",
+    "runner.service.fragments",
     "runner.service.uploads",
 )
 """Modules that every process has from its start, where processes can be forked."""

@@ -7,22 +7,14 @@ episode of T steps has T + 1 frames.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_after, evaluations_of
-from runner.drawing import svg
-from runner.environments.mdp import Mdp, events_of
+from runner.environments.mdp import events_of
 from runner.environments.naming import (
-    actions_in_words,
-    agent_actions,
-    deeds_in_words,
-    event_in_words,
-    numbered_actions,
-    spoken,
-    states_in_words,
     trial_in_words,
 )
 from runner.errors import RecordingError
@@ -34,8 +26,6 @@ from runner.replay.tables import TableReplay, tables_at
 
 MAX_STEPS: Final = 1000
 """Steps of an episode that a page shows; the page says so where an episode has more."""
-MAX_VALUES: Final = 6
-"""Q-values of a state that a page shows: the highest, and that of the action taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +47,8 @@ class Episode:
     """[T, learners]."""
     events: NDArray[np.int64]
     explored: NDArray[np.int64]
+    times: NDArray[np.int64]
+    """The number of all steps of the run that were executed after each step, [T]."""
     values: tuple[NDArray[np.float64], ...]
     """For each learner the Q-values in the first T states, [T, actions]; empty if they are unknown."""
     names: tuple[str, ...] = ()
@@ -91,7 +83,44 @@ class Episode:
     @property
     def outcome(self) -> str:
         """Length, end and return as text."""
-        return f"{self.length:,} steps, {ENDINGS[self.ended]}. Rewards sum to {self.total:g}."
+        return outcome_in_words(self.length, self.ended, self.total)
+
+
+@dataclass(frozen=True)
+class EpisodePlace:
+    """Where an episode stands in its recording."""
+
+    phase: str
+    number: int
+    """Counted over the phase."""
+    title: str
+    table_step: int = -1
+    """Training steps before the evaluation of a trial."""
+
+
+def place_of(recording: Recording, which: tuple[int, ...]) -> EpisodePlace:
+    """Return where an episode stands.
+
+    Args:
+        recording: the run.
+        which: (episode,) of training, or (training episodes before, trial) of an evaluation.
+
+    Raises:
+        RecordingError: there is no such evaluation or trial.
+    """
+    if len(which) == 1:
+        return EpisodePlace("train", which[0], f"training episode {which[0]:,}")
+    after, number = which
+    where = str(recording.path)
+    evaluation = evaluation_after(evaluations_of(recording), after, where)
+    title = trial_in_words(after, number)
+    return EpisodePlace("eval", evaluation.trial(number, where), title, evaluation.train_step)
+
+
+def outcome_in_words(length: int, ended: str, total: float | None) -> str:
+    """Return length, end and return of an episode as text; a return of None is unknown."""
+    rewards = "" if total is None else f" Rewards sum to {total:g}."
+    return f"{length:,} steps, {ENDINGS[ended]}.{rewards}"
 
 
 def training_episode(recording: Recording, number: int, limit: int = MAX_STEPS, first: int = 0) -> Episode:
@@ -100,9 +129,7 @@ def training_episode(recording: Recording, number: int, limit: int = MAX_STEPS, 
     Raises:
         RecordingError: there is no such episode, or no steps.
     """
-    require_steps(recording, "show")
-    title = f"training episode {number:,}"
-    return _episode(recording, "train", number, title, range(first, first + limit))
+    return episode_at(recording, place_of(recording, (number,)), limit, first)
 
 
 def trial(recording: Recording, after: int, number: int, limit: int = MAX_STEPS, first: int = 0) -> Episode:
@@ -118,22 +145,24 @@ def trial(recording: Recording, after: int, number: int, limit: int = MAX_STEPS,
     Raises:
         RecordingError: there is no such evaluation or trial, or no steps.
     """
-    require_steps(recording, "show")
-    where = str(recording.path)
-    evaluation = evaluation_after(evaluations_of(recording), after, where)
-    index = evaluation.trial(number, where)
-    shown = range(first, first + limit)
-    return _episode(recording, "eval", index, trial_in_words(after, number), shown, evaluation.train_step)
+    return episode_at(recording, place_of(recording, (after, number)), limit, first)
 
 
 def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
     """Return the worst, the median and the best trial of an evaluation: by success, return and length."""
     evaluation = evaluation_after(evaluations_of(recording), after, str(recording.path))
-    records = recording.episodes("eval", evaluation.start, evaluation.stop)
+    worst, median, best = ranked(recording, "eval", evaluation.start, evaluation.stop)
+    return worst - evaluation.start, median - evaluation.start, best - evaluation.start
+
+
+def ranked(recording: Recording, phase: str, start: int, stop: int) -> tuple[int, int, int]:
+    """Return the worst, the median and the best of some episodes: by success, return and length."""
+    records = recording.episodes(phase, start, stop)
     order = np.lexsort(
         (-records["length"].astype(np.int64), records["returns"].sum(axis=1), records["success"])
     )
-    return int(order[0]), int(order[len(order) // 2]), int(order[-1])
+    worst, median, best = (int(records["episode"][order[i]]) for i in (0, len(order) // 2, -1))
+    return worst, median, best
 
 
 def typical_trial(recording: Recording) -> tuple[int, int]:
@@ -169,11 +198,9 @@ def last_episode(recording: Recording) -> int:
 def last_whole_evaluation(recording: Recording) -> int | None:
     """Return the training episodes before the last evaluation whose trials were all recorded.
 
-    A recording that was cut off may have an evaluation's metrics without its trials. None for a loop, where
-    the end of an evaluation is unknown.
+    A recording that was cut off may have an evaluation's metrics without its trials. The evaluations of a
+    loop are the trials that were recorded.
     """
-    if not recording.is_job:
-        return None
     episodes, steps = recording.count(schema.EVAL_EPISODE), recording.count(schema.EVAL_STEP)
     for one in reversed(evaluations_of(recording)):
         if (
@@ -184,35 +211,19 @@ def last_whole_evaluation(recording: Recording) -> int | None:
     return None
 
 
-def payload(recording: Recording, episodes: list[Episode], drawing: svg.Drawing | None) -> dict[str, Any]:
-    """Return the data of a replay as JSON values: lists of numbers, with each text once.
+def episode_at(recording: Recording, place: EpisodePlace, limit: int = MAX_STEPS, first: int = 0) -> Episode:
+    """Return at most `limit` steps of an episode from step `first` on, even if it never ended.
 
-    Args:
-        recording: the run.
-        episodes: episodes of the run.
-        drawing: the drawing of its scene; None without a scene.
+    Raises:
+        RecordingError: there is no such episode or step, or no steps.
     """
-    mdp, agents = recording.mdp, recording.agents
-    own = numbered_actions(mdp)
-    joint = actions_in_words(mdp).tolist()
-    return {
-        "actions": deeds_in_words(mdp),
-        "choices": [joint] if len(agents) == 1 else own,
-        "learners": [spoken(agent) for agent in agents],
-        "events": [event_in_words(name) for name in mdp.event_names],
-        "episodes": [_packed(mdp, episode, drawing) for episode in episodes],
-        "trail": svg.TRAIL,
-    }
-
-
-def _episode(
-    recording: Recording, phase: str, number: int, title: str, part: range, table_step: int = -1
-) -> Episode:
+    require_steps(recording, "show")
+    phase, number, title = place.phase, place.number, place.title
     steps = recording.episode_steps(phase, number)
-    shown, last = steps[part.start : part.stop], steps[-1]
+    shown = steps[first : first + limit]
     if not len(shown):
         raise RecordingError(
-            f"{recording.path}: {title} has {len(steps):,} steps, from 0; found no step {part.start:,}."
+            f"{recording.path}: {title} has {len(steps):,} steps, from 0; found no step {first:,}."
         )
     mdp = recording.mdp
     check_steps(shown, mdp, str(recording.path))
@@ -222,15 +233,16 @@ def _episode(
         number=number,
         length=len(steps),
         total=float(steps["rewards"].sum()),
-        ended=ending_of(recording, phase, number, last),
+        ended=ending_of(recording, phase, number),
         states=np.append(shown["state"], shown["next_state"][-1]).astype(np.int64),
         actions=shown["action"].astype(np.int64),
         rewards=shown["rewards"].astype(np.float64),
         events=events_of(mdp, shown).astype(np.int64),
         explored=shown["explored"].astype(np.int64),
-        values=_values(recording, shown, table_step),
-        first=part.start,
-        before=tuple(steps["rewards"][: part.start].sum(axis=0).tolist()) if part.start else (),
+        times=(shown["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64),
+        values=_values(recording, shown, place.table_step),
+        first=first,
+        before=tuple(steps["rewards"][:first].sum(axis=0).tolist()) if first else (),
     )
 
 
@@ -251,58 +263,3 @@ def _values(
     except RecordingError:
         return ()
     return tuple(rows[:, i, :width] for i, width in enumerate(widths))
-
-
-def _packed(mdp: Mdp, episode: Episode, drawing: svg.Drawing | None) -> dict[str, Any]:
-    """Return the arrays of an episode; words and places of a state are stored once."""
-    distinct, which = np.unique(episode.states, return_inverse=True)
-    places = []
-    if drawing is not None:
-        places = drawing.places(mdp, distinct).reshape(len(distinct), -1).tolist()
-    chosen = [agent_actions(mdp, action) for action in episode.actions.tolist()]
-    return {
-        "title": episode.heading,
-        "description": episode.description,
-        "states": [str(word) for word in states_in_words(mdp)[distinct]],
-        "places": places,
-        "state": which.tolist(),
-        "action": episode.actions.tolist(),
-        "reward": [[_short(reward) for reward in row] for row in episode.rewards.tolist()],
-        "event": episode.events.tolist(),
-        "explored": episode.explored.tolist(),
-        "values": [
-            _rows(
-                values,
-                [
-                    own[i] if len(episode.values) > 1 else joint
-                    for own, joint in zip(chosen, episode.actions.tolist(), strict=True)
-                ],
-            )
-            for i, values in enumerate(episode.values)
-        ],
-    }
-
-
-def _rows(values: NDArray[np.float64], taken: list[int]) -> dict[str, Any]:
-    """Return the highest Q-values of each step, [action, value] pairs, and the action taken."""
-    rows: dict[str, int] = {}
-    which: list[int] = []
-    packed: list[list[list[Any]]] = []
-    for row, action in zip(values, taken, strict=True):
-        best = np.argsort(-row, kind="stable")[:MAX_VALUES].tolist()
-        shown = best if action in best else [*best[:-1], action]
-        if len(row) <= MAX_VALUES:
-            shown = sorted(shown)
-        pairs = [[int(choice), _short(float(row[choice]))] for choice in shown]
-        key = str(pairs)
-        if key not in rows:
-            rows[key] = len(packed)
-            packed.append(pairs)
-        which.append(rows[key])
-    return {"rows": packed, "row": which, "taken": [int(action) for action in taken], "of": values.shape[1]}
-
-
-def _short(value: float) -> float | int:
-    """Round a value to five significant digits."""
-    rounded = float(f"{value:.5g}")
-    return int(rounded) if rounded == int(rounded) else rounded

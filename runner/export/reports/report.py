@@ -5,11 +5,12 @@ The page needs no network: style, script, plots and data are in it. All of it is
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import ClassVar
+
+import numpy as np
 
 from runner.analysis.evaluations import EvaluationRecord, evaluation_records
 from runner.analysis.groups import groups_of
@@ -21,16 +22,15 @@ from runner.errors import RecordingError
 from runner.export.contents import flat_text, shortcomings, why_no_steps
 from runner.export.plots.curves import Plot, footnote, plots_of
 from runner.export.reports.episode import (
-    MAX_VALUES,
-    Episode,
+    episode_at,
     last_whole_evaluation,
-    payload,
+    place_of,
+    ranked,
     ranked_trials,
-    training_episode,
-    trial,
 )
 from runner.export.reports.evaluations import EvaluationTable, evaluation_table
 from runner.export.reports.maps import MapRow, maps_of, stages_of
+from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import LegendEntry, View, embedded, render, templates
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
@@ -79,6 +79,7 @@ class ReportedRun:
     notes: list[str]
     maps: list[MapRow]
     replay: Replay | None
+    is_job: bool
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,7 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> Reporte
     evaluations = evaluation_records(recording)
     environment = recording.environment
     episodes = _episodes(recording, chosen)
+    replay = _replay(recording, episodes)
     drawing = None if environment["scene"] is None else svg.Drawing(environment["scene"])
     events, is_job = environment["event_names"], recording.is_job
     table = evaluation_table(evaluations, recording.agents, events, is_job) if evaluations else None
@@ -173,20 +175,16 @@ def _run(recording: Recording, number: int, chosen: Sequence[Choice]) -> Reporte
         config=flat_text(recording.config),
         provenance=recording.provenance,
         notes=_notes(recording),
-        maps=_maps(recording, episodes),
-        replay=_replay(recording, episodes, drawing) if episodes else None,
+        maps=_maps(recording, next(iter(episodes), None)),
+        replay=replay,
+        is_job=is_job,
     )
 
 
 def _notes(recording: Recording) -> list[str]:
     """Return what is missing from the recording, a sentence each."""
     notes = shortcomings(recording)
-    if not recording.is_job:
-        notes.append(
-            f"Run {recording.run_id} was recorded from a loop: what it learned is unknown, so the page shows "
-            "no episode of it; `dualtaxi view` shows what was recorded."
-        )
-    elif not recording.has_steps:
+    if not recording.has_steps:
         notes.append(
             f"No episode of run {recording.run_id} can be replayed, as there are no steps: "
             f"{why_no_steps(recording)}."
@@ -224,55 +222,66 @@ def _facts(recording: Recording) -> dict[str, str]:
     return {key: str(value) for key, value in facts.items()}
 
 
-def _episodes(recording: Recording, chosen: Sequence[Choice]) -> list[Episode]:
-    """Return the episodes to show: the chosen ones, of the last evaluation, first and last of training."""
-    if not recording.has_steps or not recording.is_job:
-        return []
-    found: dict[str, Episode] = {}
+def _episodes(recording: Recording, chosen: Sequence[Choice]) -> dict[tuple[int, ...], list[str]]:
+    """Return the episodes to show, each with the reasons for it.
 
-    def add(name: str, episode: Episode) -> None:
-        found[episode.title] = found.get(episode.title, episode).called(name)
-
-    for phase, number, of in chosen:
-        add(
-            "chosen",
-            training_episode(recording, number) if phase == "train" else trial(recording, number, of),
-        )
+    They are the chosen ones; the typical, the best and the worst one of the last evaluation, or else of the
+    last tenth of training; and of a tabular environment the first and the last one of training.
+    """
+    if not recording.has_steps:
+        return {}
+    episodes: dict[tuple[int, ...], list[str]] = {}
+    for phase, number, trial in chosen:
+        episodes.setdefault((number,) if phase == "train" else (number, trial), []).append("chosen")
     after = last_whole_evaluation(recording)
+    ended = recording.count(schema.TRAIN_EPISODE)
     if after is not None:
         worst, typical, best = ranked_trials(recording, after)
-        add("typical trial", trial(recording, after, typical))
-        add("best trial", trial(recording, after, best))
-        add("worst trial", trial(recording, after, worst))
-    last = recording.count(schema.TRAIN_EPISODE) - 1
-    for name, number in (("first of training", 0), ("last of training", last)):
-        with contextlib.suppress(RecordingError):  # its steps may have been cut off, or never recorded
-            add(name, training_episode(recording, number))
-    return list(found.values())
+        for name, number in (("typical", typical), ("best", best), ("worst", worst)):
+            episodes.setdefault((after, number), []).append(f"{name} trial")
+    elif ended:
+        worst, typical, best = ranked(recording, "train", ended - max(1, ended // 10), ended)
+        for name, number in (("typical", typical), ("best", best), ("worst", worst)):
+            episodes.setdefault((number,), []).append(f"{name} of the last tenth")
+    if recording.tabular:
+        for name, number in (("first", 0), ("last", max(0, ended - 1))):
+            episodes.setdefault((number,), []).append(f"{name} of training")
+    return episodes
 
 
-def _maps(recording: Recording, episodes: Sequence[Episode]) -> list[MapRow]:
-    """Return the maps, for the situation in which the first episode shown begins."""
+def _maps(recording: Recording, episode: tuple[int, ...] | None) -> list[MapRow]:
+    """Return the maps, for the situation in which an episode begins."""
     if not recording.is_job:
         return []
     mdp = recording.mdp
-    start = int(episodes[0].states[0]) if episodes else int(mdp.start.argmax())
+    start = int(mdp.start.argmax())
     try:
+        if episode is not None:
+            start = int(episode_at(recording, place_of(recording, episode), 1).states[0])
         return maps_of(mdp, recording.agents, stages_of(recording), start)
     except RecordingError:
         return []
 
 
-def _replay(recording: Recording, episodes: list[Episode], drawing: svg.Drawing | None) -> Replay:
-    mdp = recording.mdp
-    data = payload(recording, episodes, drawing)
-    picture, key = "", ""
-    if drawing is not None:
-        first = drawing.places(mdp, episodes[0].states[:1])
-        picture = drawing.frame(first[0], "The grid at the step shown below it", first, style="")
+def _replay(recording: Recording, episodes: Mapping[tuple[int, ...], list[str]]) -> Replay | None:
+    """Return what the page replays; None if no episode can be."""
+    shown = []
+    for which, names in episodes.items():
+        try:
+            shown.append((which, titled(playback_of(recording, which), names)))
+        except RecordingError:  # its steps may have been cut off, or never recorded
+            if "chosen" in names:
+                raise
+    if not shown:
+        return None
+    picture, key, first = "", "", shown[0][1]
+    if first.grid is not None:
+        drawing = svg.Drawing(recording.environment["scene"])
+        places = np.array(first.grid.places, np.int16)[first.grid.at[:1]].reshape(1, -1, 3)
+        picture = drawing.frame(places[0], "The grid at the step shown below it", places, style="")
         key = drawing.key()
-    titles = [episode.heading for episode in episodes]
-    return Replay(titles, picture, key, embedded(data))
+    data = [asdict(episode) | {"pictures": [], "picture": [], "picture_note": ""} for _, episode in shown]
+    return Replay([episode.title for _, episode in shown], picture, key, embedded(data))
 
 
 def _title(runs: Sequence[ReportedRun]) -> str:

@@ -1,4 +1,4 @@
-"""Episodes as the pages replay them: states, positions, rewards and Q-values at each step."""
+"""Episodes as the pages replay them: actions, rewards, and what was observed at each step."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel
 
+from runner.export.reports.player_data import Playback
 from runner.service import fragments
 from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
 from runner.service.problems import error_docs
@@ -41,42 +42,11 @@ Start = Annotated[int, Query(ge=0, lt=2**62, description="The first step, from 0
 Steps = Annotated[int, Query(ge=1, le=MAX_STEPS, description="Maximum number of steps.")]
 
 
-class ReplayedEpisode(BaseModel, extra="allow"):
-    """A part of an episode; frame k is the state after k steps."""
-
-    title: str
-    description: str
-    length: int
-    """Steps of the whole episode."""
-    first: int
-    """The step with which this part begins."""
-    before: list[float]
-    """The sum of each learner's earlier rewards; empty at the beginning."""
-    states: list[str]
-    """The descriptions of states, each once."""
-    places: list[list[int]]
-    """For each state: x, y (hundredths of a cell) and size (percent) of each thing of the scene."""
-    state: list[int]
-    """The index of each frame in `states`."""
-    action: list[int]
-    reward: list[list[float]]
-    event: list[int]
-    """Bit i: the i-th of the events."""
-    explored: list[int]
-    values: list[dict[str, Any]]
-    """For each learner the highest Q-values at each frame, and that of the action taken."""
-
-
 class Part(BaseModel):
-    """A part of an episode, and the names of actions, learners and events."""
+    """A part of an episode, and the scene of its environment if it has one."""
 
-    actions: list[str]
-    choices: list[list[str]]
-    learners: list[str]
-    events: list[str]
-    trail: int
+    episode: Playback
     scene: dict[str, Any] | None
-    episode: ReplayedEpisode
 
 
 @router.get("/train/{episode}", response_model=Part, summary="A part of a training episode, to be replayed.")
@@ -88,7 +58,7 @@ async def training(
     start: Start = 0,
     steps: Steps = STEPS,
 ) -> Response:
-    """Return steps of a training episode: states, positions, rewards, events and Q-values."""
+    """Return steps of a training episode: actions, rewards, and states or observations at each frame."""
     return _json(await part_of(run, cache, processes, (episode,), start, steps))
 
 

@@ -1,13 +1,15 @@
-"""The episodes of a run, a page at a time: the outcome of each, and a link to its replay if it has one."""
+"""The episodes of a run, a page at a time: the outcome of each, and a link to its replay."""
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 
+from runner.analysis.evaluations import evaluations_of
 from runner.analysis.frames import episode_columns
 from runner.analysis.sections import Grid
 from runner.environments.naming import event_in_words
@@ -32,7 +34,7 @@ class _EpisodesView(RunView):
     paging: Paging
     grid: Grid
     links: list[str]
-    """Address of the replay of each row; empty for a loop."""
+    """Address of the replay of each row."""
 
 
 @router.get("/episodes")
@@ -43,7 +45,7 @@ def episodes(
     phase: Literal["train", "eval"] = "train",
     number: Annotated[int, Query(alias="page", ge=1, lt=10**9)] = 1,
 ) -> Response:
-    """Show the episodes of a phase; those of a job link to their replays."""
+    """Show the episodes of a phase; each links to its replay."""
     total = recording.count(recording.topic(f"/{phase}/episode"))
     first = (number - 1) * ROWS
     columns = episode_columns(recording, phase, min(first, total), min(first + ROWS, total))
@@ -61,7 +63,7 @@ def episodes(
         for i, path in enumerate(paths)
     ]
     headings = ("episode" if phase == "train" else "trial", "end", *map(_heading, names))
-    links = [f"/runs/{run.run_id}/replay/{path}" for path in paths] if recording.is_job else []
+    links = [f"/runs/{run.run_id}/replay/{path}" for path in paths]
     paging = Paging(number, total, ROWS, link(f"/runs/{run.run_id}/episodes", {"phase": phase}))
     view = _EpisodesView(head_of(run), "episodes", phase, total, paging, Grid(headings, rows), links)
     return page(request, view)
@@ -75,18 +77,17 @@ def _heading(column: str) -> str:
 
 def _paths(recording: Recording, phase: str, numbers: list[int]) -> list[str]:
     """Return the path of the replay of each episode; trials are counted within their evaluation."""
-    if phase == "train" or not recording.is_job:
-        return [f"{phase}/{number}" for number in numbers]
-    ends: list[tuple[int, int, int]] = []
-    before = 0
-    for metrics in recording.iter_metrics("eval"):
-        ends.append((before + int(metrics["trials"]), before, int(metrics["episode"])))
-        before += int(metrics["trials"])
-    paths, at = [], 0
+    if phase == "train":
+        return [f"train/{number}" for number in numbers]
+    evaluations = evaluations_of(recording)
+    stops = [one.stop for one in evaluations]
+    paths = []
     for number in numbers:
-        while at < len(ends) - 1 and number >= ends[at][0]:
-            at += 1
-        paths.append(f"eval/{ends[at][2]}/{number - ends[at][1]}" if ends else f"eval/{number}/0")
+        at = bisect_right(stops, number)
+        if at == len(stops):  # its evaluation was cut off
+            paths.append(f"eval/{number}/0")
+        else:
+            paths.append(f"eval/{evaluations[at].after}/{number - evaluations[at].start}")
     return paths
 
 

@@ -34,7 +34,7 @@ class RunHead:
     created: str
     tags: tuple[str, ...]
     note: str
-    tabs: tuple[tuple[str, str], ...] = TABS
+    tabs: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,7 @@ def head_of(run: Run) -> RunHead:
         created=run.created.isoformat(),
         tags=run.tags,
         note=run.note,
+        tabs=tuple(tab for tab in TABS if str(tab[0]) != "learned" or not is_loop(run)),
     )
 
 

@@ -13,6 +13,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
+from runner.analysis.evaluations import evaluations_of
 from runner.analysis.step_reference import episode_reference
 from runner.drawing import svg
 from runner.errors import RunnerError
@@ -44,10 +45,15 @@ class ShownStep:
     """Steps of the episode."""
     t: int
     picture: str
+    """The grid, as SVG; empty without a scene."""
     key: str
     broad: bool
-    state: str
-    action: str
+    facts: list[tuple[str, str]]
+    """What is known of the step, by name."""
+    note: str = ""
+    """Why there is no picture."""
+    has_pictures: bool = False
+    """Whether pictures are fetched."""
 
 
 class Evaluation(NamedTuple):
@@ -142,10 +148,7 @@ async def _replay(
 def _view(run: Run, which: tuple[int, ...], step: ShownStep | None, problem: str = "") -> _ReplayView:
     with open_recording(run.recording) as recording:
         episodes = recording.count(recording.topic("/train/episode"))
-        evaluations = [
-            Evaluation(metrics["episode"], metrics["trials"])
-            for metrics in (recording.iter_metrics("eval") if recording.is_job else ())
-        ]
+        evaluations = [Evaluation(one.after, one.stop - one.start) for one in evaluations_of(recording)]
     if len(which) == 1:
         count = episodes
     else:
@@ -176,12 +179,12 @@ def _step(part: Mapping[str, Any], t: int) -> ShownStep:
     episode = part["episode"]
     at = min(t, episode["length"])
     i = at - episode["first"]
-    state = episode["states"][episode["state"][i]]
     picture, key, broad = "", "", False
-    if episode["places"]:
+    if episode["grid"]:
         drawing = svg.Drawing(part["scene"])
-        places = np.array(episode["places"], np.int16)[episode["state"]].reshape(len(episode["state"]), -1, 3)
-        picture = drawing.frame(places[i], f"The grid: {state}", places[: i + 1], style="")
+        frames = episode["grid"]["at"]
+        places = np.array(episode["grid"]["places"], np.int16)[frames].reshape(len(frames), -1, 3)
+        picture = drawing.frame(places[i], f"The grid after {at} steps", places[: i + 1], style="")
         key, broad = drawing.key(), drawing.width > svg.BROAD
     return ShownStep(
         title=episode["title"],
@@ -191,9 +194,24 @@ def _step(part: Mapping[str, Any], t: int) -> ShownStep:
         picture=picture,
         key=key,
         broad=broad,
-        state=state,
-        action=part["actions"][episode["action"][i - 1]] if i else "none yet: the episode begins",
+        facts=_facts(episode, i),
     )
+
+
+def _facts(episode: Mapping[str, Any], i: int) -> list[tuple[str, str]]:
+    """Return what is known of frame i of a part of an episode, by name, for readers without scripts."""
+
+    def named(one: Mapping[str, Any]) -> str:
+        name = f"{one['agent']} {one['name']}".strip().replace("_", " ")
+        return name[0].upper() + name[1:]
+
+    facts = [(named(text), text["values"][text["at"][i]]) for text in episode["texts"]]
+    if i == 0:
+        facts.append(("Last action", "none yet: the episode begins"))
+    else:
+        facts += [(named(action), action["values"][action["at"][i - 1]]) for action in episode["actions"]]
+        facts.append(("Reward", ", ".join(map(str, episode["reward"][i - 1]))))
+    return facts + [(named(series), str(series["values"][i])) for series in episode["series"]]
 
 
 def _whole(text: str) -> int:

@@ -184,10 +184,10 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
         last = deque(recording.iter_metrics("eval"), MAX_EVALUATIONS)
         records = [evaluation_record(metrics, agents, events) for metrics in last]
         total = recording.count(recording.topic("/eval/metrics"))
-        links = [f"/runs/{run.run_id}/replay/eval/{record.episode}/0" for record in records]
     else:
         every = evaluation_records(recording)
-        records, total, links = every[-MAX_EVALUATIONS:], len(every), []
+        records, total = every[-MAX_EVALUATIONS:], len(every)
+    links = [f"/runs/{run.run_id}/replay/eval/{record.episode}/0" for record in records]
     table = evaluation_table(records, agents, events, recording.is_job) if records else None
     return page(request, _EvaluationsView(head_of(run), "evaluations", table, links, total))
 

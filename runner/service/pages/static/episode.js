@@ -1,5 +1,6 @@
 // The replay of an episode: its parts are requested as they are needed, and the address names the step.
 import { onKeys, partAt } from "./parts.js";
+import { picturesOf } from "./pictures.js";
 
 const root = document.querySelector("[data-part]"), source = root.dataset.part;
 const onward = root.querySelector("[data-to-rerun]");
@@ -12,10 +13,10 @@ function moved(k) {
   writing = setTimeout(() => history.replaceState(null, "", `?t=${k}`), 150);
 }
 
-const at = Number(root.dataset.at);
-const data = await partAt(source, at);
-const replay = new Replay(root, data, { load: async (k) => (await partAt(source, k)).episode, moved });
-replay.begin(data.episode, at);
+const at = Number(root.dataset.at), pictures = picturesOf(root, at);
+const { episode } = await partAt(source, at);
+const replay = new Replay(root, { load: async (k) => (await partAt(source, k)).episode, moved, pictures });
+replay.begin(episode, at);
 
 onKeys("input, textarea, select, button, a, summary", () => replay.play(), (by) => {
   replay.pause();

@@ -1,5 +1,6 @@
 // Two replays in step: one slider moves both; a replay that has ended stays at its last step.
 import { onKeys, partAt } from "./parts.js";
+import { picturesOf } from "./pictures.js";
 
 const bar = document.querySelector("[data-together]");
 const [slider, button, count] = [".both", ".both-play", ".both-count"].map((name) => bar.querySelector(name));
@@ -7,9 +8,9 @@ let timer = null, writing = null;
 
 async function start(root) {
   const { source } = root.dataset;
-  const data = await partAt(source, 0);
-  const replay = new Replay(root, data, { load: async (k) => (await partAt(source, k)).episode });
-  replay.begin(data.episode);
+  const { episode } = await partAt(source, 0);
+  const replay = new Replay(root, { load: async (k) => (await partAt(source, k)).episode, pictures: picturesOf(root) });
+  replay.begin(episode);
   return replay;
 }
 

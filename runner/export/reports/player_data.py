@@ -1,0 +1,175 @@
+"""What a page plays of an episode, in one form for every recording; as JSON can hold it.
+
+Frame k is the state after k steps, so a part of T steps has T + 1 frames. Texts that repeat are stored once,
+with the index of each frame's text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.drawing import svg
+from runner.recording import schema
+from runner.recording.reader import Recording
+
+MAX_LOGGED: Final = 5000
+"""Logged values near a part that a page shows."""
+_NEAR: Final = 1000
+"""Steps of the run before and after a part in which logged values are near it."""
+Value = float | int | str | None
+"""A number; NaN and infinities as text; None where it is unknown."""
+
+
+@dataclass(frozen=True)
+class Words:
+    """The texts of frames, or of steps."""
+
+    agent: str
+    """Whose they are; empty for all agents together."""
+    name: str
+    values: list[str]
+    """The different texts."""
+    at: list[int]
+    """The index of each text."""
+
+
+@dataclass(frozen=True)
+class Series:
+    """A number at each frame."""
+
+    agent: str
+    """Whose it is; empty for all agents together."""
+    kind: str
+    """What it is a part of, such as `observation`."""
+    name: str
+    values: list[Value]
+
+
+@dataclass(frozen=True)
+class Logged:
+    """The values logged under a name near a part."""
+
+    name: str
+    at: list[int]
+    """The number of steps of the run before each, as in `Playback.time`."""
+    values: list[Value]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The places of the things of a scene."""
+
+    places: list[list[int]]
+    """For each state: x, y (hundredths of a cell) and size (percent) of each thing."""
+    at: list[int]
+    """The index of each frame's state."""
+
+
+@dataclass(frozen=True)
+class Playback:
+    """A part of an episode: T steps and T + 1 frames."""
+
+    title: str
+    description: str
+    length: int
+    """Steps of the whole episode."""
+    first: int
+    """The step with which this part begins."""
+    end: str
+    """How the episode ended, as text; empty if it did not."""
+    agents: list[str]
+    """Who is rewarded."""
+    before: list[float]
+    """The sum of each agent's earlier rewards; empty at the beginning."""
+    reward: list[list[Value]]
+    """For each step the reward of each agent."""
+    actions: list[Words]
+    """The actions of all agents together, or of each; a text for each step."""
+    texts: list[Words]
+    """Parts of states or observations that are texts, for each frame."""
+    time: list[int]
+    """The number of steps of the run before each frame, in training and evaluation together."""
+    series: list[Series] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    """What is left out, a sentence each."""
+    logged: list[Logged] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
+    """The names of the environment's events."""
+    event: list[int] = field(default_factory=list)
+    """For each step, bit i: the i-th of the events occurred."""
+    explored: list[int] = field(default_factory=list)
+    """For each step, bit i: the i-th agent's part of the action was chosen at random."""
+    choices: list[list[str]] = field(default_factory=list)
+    """The names of the actions of each Q-table."""
+    values: list[dict[str, Any]] = field(default_factory=list)
+    """For each Q-table the highest values before each step, and that of the action taken."""
+    grid: Grid | None = None
+    trail: int = svg.TRAIL
+    """The number of places that a trail joins."""
+
+
+def words(agent: str, name: str, texts: Iterable[str]) -> Words:
+    """Return texts with each different one stored once."""
+    numbers: dict[str, int] = {}
+    at = [numbers.setdefault(text, len(numbers)) for text in texts]
+    return Words(agent, name, list(numbers), at)
+
+
+def frame_times(after: NDArray[np.int64]) -> list[int]:
+    """Return the number of steps of the run before each of T + 1 frames, from those after T steps."""
+    return [int(after[0]) - 1, *after.tolist()]
+
+
+def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[Logged]:
+    """Return what was logged near frames: a loop's numbers and texts, or a job's reports of training.
+
+    Args:
+        recording: the run.
+        phase: of the frames; values logged in the other one are marked.
+        time: of the frames, as `Playback.time`.
+    """
+    tick = schema.STEP_NANOSECONDS
+    times = range(max(0, time[0] - _NEAR) * tick, (time[-1] + _NEAR) * tick + 1)
+    found: dict[str, Logged] = {}
+    count = 0
+
+    def add(name: str, log_time: int, value: Value) -> None:
+        one = found.setdefault(name, Logged(name, [], []))
+        one.at.append(log_time // tick)
+        one.values.append(value)
+
+    if recording.is_job:
+        for report in recording.decoded(schema.TRAIN_METRICS_TOPIC, times=times):
+            for name in ("epsilon", "step_size", "mean_length"):
+                add(name.replace("_", " "), report["log_time"], short(report[name]))
+        return list(found.values())
+    for scalar in recording.decoded(schema.SCALAR_TOPIC, times=times):
+        own = scalar["name"] if scalar["phase"] == phase else f"{scalar['name']} ({scalar['phase']})"
+        add(own, scalar["log_time"], short(scalar["value"]))
+        count += 1
+        if count == MAX_LOGGED:
+            break
+    for text in recording.decoded(schema.LOG_TOPIC, times=times):
+        add(text["name"], text["log_time"], text["message"][:300])
+        count += 1
+        if count >= MAX_LOGGED:
+            break
+    return list(found.values())
+
+
+def short(value: float) -> Value:
+    """Round a number to five significant digits; NaN and infinities are texts."""
+    if not np.isfinite(value):
+        return "NaN" if np.isnan(value) else "inf" if value > 0 else "-inf"
+    rounded = float(f"{value:.5g}")
+    return int(rounded) if rounded == int(rounded) else rounded
+
+
+def short_rows(rows: NDArray[Any]) -> list[list[Value]]:
+    """Round the numbers of rows."""
+    return [[short(value) for value in row] for row in rows.tolist()]
