@@ -158,9 +158,9 @@ def ranked_trials(recording: Recording, after: int) -> tuple[int, int, int]:
 def ranked(recording: Recording, phase: str, start: int, stop: int) -> tuple[int, int, int]:
     """Return the worst, the median and the best of some episodes: by success, return and length."""
     records = recording.episodes(phase, start, stop)
-    order = np.lexsort(
-        (-records["length"].astype(np.int64), records["returns"].sum(axis=1), records["success"])
-    )
+    with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
+        returns = records["returns"].sum(axis=1)
+    order = np.lexsort((-records["length"].astype(np.int64), returns, records["success"]))
     worst, median, best = (int(records["episode"][order[i]]) for i in (0, len(order) // 2, -1))
     return worst, median, best
 

@@ -110,7 +110,7 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
         first=first,
         end=ENDINGS[ended],
         agents=[spoken(agent) for agent in recording.agents],
-        before=before.tolist() if first else [],
+        before=[short(value) for value in before.tolist()] if first else [],
         reward=short_rows(steps.rewards),
         actions=[words(agent, "action", texts) for agent, texts in steps.actions.items()],
         texts=texts,

@@ -54,9 +54,10 @@ def playback_of(
     """
     require_steps(recording, "show")
     place = place_of(recording, which)
-    if recording.tabular:
-        return tabular_playback(recording, episode_at(recording, place, limit, first))
-    return loop_playback(recording, place, limit, first)
+    with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
+        if recording.tabular:
+            return tabular_playback(recording, episode_at(recording, place, limit, first))
+        return loop_playback(recording, place, limit, first)
 
 
 def titled(playback: Playback, names: Sequence[str]) -> Playback:
@@ -92,7 +93,7 @@ def tabular_playback(recording: Recording, episode: Episode) -> Playback:
         first=episode.first,
         end=ENDINGS[episode.ended],
         agents=[spoken(agent) for agent in agents],
-        before=list(episode.before),
+        before=[short(value) for value in episode.before],
         reward=short_rows(episode.rewards),
         actions=[words("", "action", [deeds[action] for action in episode.actions.tolist()])],
         texts=[Words("", "state", states, at.tolist())],

@@ -84,7 +84,7 @@ class Playback:
     """How the episode ended, as text; empty if it did not."""
     agents: list[str]
     """Who is rewarded."""
-    before: list[float]
+    before: list[Value]
     """The sum of each agent's earlier rewards; empty at the beginning."""
     reward: list[list[Value]]
     """For each step the reward of each agent."""

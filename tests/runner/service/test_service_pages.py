@@ -10,7 +10,7 @@ import re
 import pytest
 from submitted import ICY
 
-from runner.environments.naming import states_in_words
+from runner.environments.naming import deeds_in_words, states_in_words
 from runner.recording import reader
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
@@ -188,18 +188,25 @@ def test_only_the_frame_of_the_viewer_may_compile(client):
 def test_the_parts_of_an_episode_are_the_recorded_steps(client, recordings):
     with open_recording(find_run("first", recordings).recording) as recording:
         steps = recording.episode_steps("train", 2)
-        words = states_in_words(recording.mdp)
+        mdp, words = recording.mdp, states_in_words(recording.mdp)
     whole = client.get("/api/v1/runs/first/replay/train/2?steps=2000").json()["episode"]
     assert whole["length"] == len(steps)
-    assert whole["action"] == steps["action"].tolist()
+    deeds = deeds_in_words(mdp)
+
+    def actions(part):
+        (action,) = part["actions"]
+        return [action["values"][i] for i in action["at"]]
+
+    assert actions(whole) == [deeds[number] for number in steps["action"]]
     for start in (0, 1, len(steps) // 2, len(steps) - 3):
         part = client.get(f"/api/v1/runs/first/replay/train/2?start={start}&steps=101").json()["episode"]
         first = max(0, start - 1)
         assert part["first"] == first
         assert part["before"] == (steps["rewards"][:first].sum(axis=0).tolist() if first else [])
-        assert part["action"] == whole["action"][first : first + 101]
+        assert actions(part) == actions(whole)[first : first + 101]
         assert part["values"][0]["taken"] == whole["values"][0]["taken"][first : first + 101]
-        shown = [part["states"][i] for i in part["state"]][:-1]
+        (state,) = part["texts"]
+        shown = [state["values"][i] for i in state["at"]][:-1]
         assert shown == words[steps["state"][first : first + 101]].tolist()
 
 
