@@ -33,7 +33,7 @@ from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES
 from runner.recording.records import IN_DATA, MAX_NAME_BYTES, MAX_NAMED, check_unpacked_size, record_heads
-from runner.recording.schema import ALL_TOPICS, PROFILE, TOPIC_OF
+from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPIC_OF
 
 K = TypeVar("K")
 T = TypeVar("T")
@@ -128,7 +128,8 @@ class Index:
     """The places of a recording's records."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
-    schemas: set[int] = field(default_factory=set)
+    schemas: dict[int, bytes] = field(default_factory=dict)
+    """Id to the schema as it is in the file."""
     chunks: ChunkTable = field(default_factory=ChunkTable)
     attachments: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Name to (offset, length) of the record."""
@@ -272,9 +273,7 @@ def _add_schema_or_channel(index: Index, opcode: int, offset: int, body: bytes) 
         _add_once(index.channels, channel.id, channel, "channel")
         return
     schema = _parse(Schema, body, offset)
-    if schema.id in index.schemas:
-        raise RecordingError(f"has schema {schema.id} twice, at {offset} again.")
-    index.schemas.add(schema.id)
+    _add_once(index.schemas, schema.id, schema.data, "schema")
 
 
 def _records(stream: BinaryIO, start: int, end: int) -> Iterator[tuple[int, int, bytes]]:
@@ -341,7 +340,7 @@ def _add_once(known: dict[K, T], key: K, value: T, what: str) -> None:
     """Add an entry; a file may have one of each key, and not too many."""
     if key in known:
         raise RecordingError(f"has {what} {key!r} twice.")
-    if len(known) == (len(ALL_TOPICS) if what == "channel" else MAX_NAMED):
+    if len(known) == {"channel": len(ALL_TOPICS), "schema": len(MESSAGES)}.get(what, MAX_NAMED):
         raise RecordingError(
             f"has more than {len(known):,} {what} records, the most that a recording may have."
         )

@@ -128,6 +128,28 @@ def decode(message: MessageType, payload: bytes) -> dict[str, Any]:
     }
 
 
+def unknown_measures(message: MessageType, schema_data: bytes) -> list[str]:
+    """Return the single doubles of a message that a recorded schema does not have: they were added later.
+
+    Protobuf reads such a field as 0, as if that had been measured.
+
+    Args:
+        message: the message as this version defines it.
+        schema_data: the schema in the recording, a serialized FileDescriptorSet.
+    """
+    try:
+        files = descriptor_pb2.FileDescriptorSet.FromString(schema_data).file
+    except DecodeError:
+        return []
+    described = [each for file in files for each in file.message_type if each.name == message.name]
+    numbers = {field.number for each in described for field in each.field}
+    return [
+        field.name
+        for field in message.fields
+        if described and field.kind == Pb.TYPE_DOUBLE and not field.repeated and field.number not in numbers
+    ]
+
+
 def encode_q_table(table: QTable) -> bytes:
     """Return a `dualtaxi.QTable`; values as little-endian float64, row-major."""
     return encode(

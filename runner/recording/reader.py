@@ -10,6 +10,7 @@ other parts of the project read recordings through this module.
 
 from __future__ import annotations
 
+import math
 import os
 import stat
 from bisect import bisect_right
@@ -31,7 +32,7 @@ from runner.recording.extras import ExtraLayout, Extras, read_layouts
 from runner.recording.index import read_index
 from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
-from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table
+from runner.recording.messages import QTable, Snapshot, decode, decode_array, decode_q_table, unknown_measures
 from runner.recording.metadata import check_file, sizes_of
 from runner.recording.record_store import RecordStore
 from runner.recording.reset_states import ResetState, decode_reset_state
@@ -421,11 +422,19 @@ class Recording(RunDescription):
         if phase not in schema.PHASES:
             raise ValueError(f"found phase {phase!r}, expected one of: {', '.join(schema.PHASES)}.")
         topic = schema.TRAIN_METRICS_TOPIC if phase == "train" else schema.EVAL_METRICS_TOPIC
-        yield from self.decoded(topic, _METRICS_BYTES)
+        yield from self._measures(topic)
 
     def optimality(self) -> Iterator[dict[str, Any]]:
         """Yield the exact measures of the evaluations, in order; none unless `evaluation.exact` was set."""
-        yield from self.decoded(schema.OPTIMALITY_TOPIC, _METRICS_BYTES)
+        yield from self._measures(schema.OPTIMALITY_TOPIC)
+
+    def _measures(self, topic: Topic) -> Iterator[dict[str, Any]]:
+        """Yield metrics; one that the recording's version did not have is NaN, as unknown ones are."""
+        channel = self._index.channels.get(topic.channel)
+        recorded = self._index.schemas.get(channel.schema_id, b"") if channel else b""
+        unknown = dict.fromkeys(unknown_measures(topic.message, recorded), math.nan)
+        for fields in self.decoded(topic, _METRICS_BYTES):
+            yield fields | unknown
 
     def snapshots(self, step: int = 0, tables: int = 0) -> Iterator[QTable]:
         """Yield the snapshots in order, without those that are older than needed for `step`.

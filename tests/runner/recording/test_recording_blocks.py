@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from runner.analysis.evaluations import evaluation_records
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import open_recording
@@ -102,3 +103,17 @@ def test_metrics_of_no_phase_are_refused(tmp_path):
         pytest.raises(ValueError, match="found phase 'bogus', expected one of: train, eval"),
     ):
         opened.metrics("bogus")
+
+
+def test_a_metric_that_the_recording_was_made_without_is_unknown(taxis, tmp_path):
+    name_and_number = b"mean_penalties\x18\x10"
+    old = tmp_path / "old.mcap"
+    data = taxis.recording.read_bytes()[:-20]  # without its end it is read from its beginning
+    assert name_and_number in data
+    old.write_bytes(data.replace(name_and_number, b"mean_penalties\x18\x63"))
+    with open_recording(taxis.recording) as now, open_recording(old) as then:
+        for expected, found in zip(now.metrics("eval"), then.metrics("eval"), strict=True):
+            assert np.isnan(found.pop("mean_penalties"))
+            assert expected.pop("mean_penalties") >= 0
+            assert repr(found) == repr(expected)  # as NaN is not equal to itself
+        assert evaluation_records(then)[0].value("mean_penalties") is None
