@@ -6,6 +6,7 @@ without a traceback and exits with `exit_code`.
     RunnerError
     ├── ConfigError          a configuration is not valid (the message has file, line and key)
     ├── EnvironmentNotUsable an environment is unknown, or has no transition table
+    ├── CannotRedo           a loop's environment cannot be made again here, or not drawn
     ├── RecordingError       a recording is damaged, of another program, or of an unknown version
     ├── Diverged             a recording differs from what its job produces
     ├── RunNotFound          no run, or more than one, matches a name
@@ -66,6 +67,10 @@ class ConfigError(RunnerError):
 
 class EnvironmentNotUsable(RunnerError):
     """An environment is not registered, cannot be made, or has no transition table."""
+
+
+class CannotRedo(RunnerError):
+    """A loop's environment cannot be made again here, or its episodes cannot be repeated or drawn."""
 
 
 class RecordingError(RunnerError):

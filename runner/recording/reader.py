@@ -199,7 +199,11 @@ class Recording(RunDescription):
     @property
     def has_steps(self) -> bool:
         """Whether any step was recorded."""
-        return any(len(self._chunks(self.topic(f"/{phase}/step"))) for phase in schema.PHASES)
+        return any(self.has_messages(f"/{phase}/step") for phase in schema.PHASES)
+
+    def has_messages(self, name: str) -> bool:
+        """Return whether the topic of that name has any message."""
+        return len(self._chunks(self.topic(name))) > 0
 
     def count(self, topic: Topic) -> int:
         """Return the number after that of a topic's last message: how many there are, if none was lost.
@@ -351,16 +355,17 @@ class Recording(RunDescription):
         """Yield the resets of a phase one by one, as `transitions` yields steps."""
         yield from self._values(self.topic(f"/{phase}/reset"), None, observation="observation")
 
-    def reset_states(self, phase: str) -> Iterator[ResetState]:
+    def reset_states(self, phase: str, times: range | None = None) -> Iterator[ResetState]:
         """Yield what resets of a loop's phase without a seed depend on, in the order of the resets.
 
-        Not every reset has one; recordings of earlier versions and jobs have none.
+        Not every reset has one; recordings of earlier versions and jobs have none. `times` as for `decoded`.
 
         Raises:
             RecordingError: one is damaged.
         """
         if not self.is_job:
-            for _, state in self._parsed(self.topic(f"/{phase}/reset_state"), decode_reset_state):
+            topic = self.topic(f"/{phase}/reset_state")
+            for _, state in self._parsed(topic, decode_reset_state, times=times):
                 yield state
 
     def _values(self, topic: Topic, times: range | None, **spaces: str) -> Iterator[Any]:

@@ -1,1 +1,1 @@
-"""Q-tables of a recorded run at any step, replayed from its snapshots and steps."""
+"""A recorded run replayed: Q-tables at any step of a job, and episodes of a loop in its environment."""

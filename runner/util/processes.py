@@ -17,7 +17,7 @@ import threading
 import time
 import traceback
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
@@ -128,15 +128,39 @@ class ChildProcess:
             RunnerError, OSError: the function raised it.
             RuntimeError: the function raised anything else, whose traceback is in the message.
         """
+        events = self._events(function, seconds, args, keywords)
+        while True:
+            try:
+                self._on_progress(next(events))
+            except StopIteration as end:
+                return end.value  # type: ignore[no-any-return]
+
+    def stream(
+        self, function: Callable[Args, object], seconds: float, *args: Args.args, **keywords: Args.kwargs
+    ) -> Iterator[Any]:
+        """Yield what a function in the process passes to `report_progress`, as it comes.
+
+        The function waits where its caller is slower. Arguments and errors are those of `call`, but `seconds`
+        is the limit for each value.
+        """
+        yield from self._events(function, seconds, args, keywords, for_each=True)
+
+    def _events(
+        self, function: Callable[..., Any], seconds: float, args: Any, keywords: Any, for_each: bool = False
+    ) -> Generator[Any, None, Any]:
+        """Yield what the function reports, and return its result; the limit is for all, or for each."""
         try:
             self._pipe.send((function, args, keywords))
-            deadline, kind = time.monotonic() + seconds, "progress"
-            while kind == "progress":
+            deadline = time.monotonic() + seconds
+            while True:
                 if not self._pipe.poll(max(deadline - time.monotonic(), 0)):
                     raise TimedOut(f"this took longer than {seconds:g} s and was given up; ask for less.")
                 kind, result = self._pipe.recv()
-                if kind == "progress":
-                    self._on_progress(result)
+                if kind != "progress":
+                    break
+                yield result
+                if for_each:
+                    deadline = time.monotonic() + seconds
         except (EOFError, OSError):
             raise ProcessDied(
                 "the process that worked on this died; it may have run out of memory."
@@ -148,7 +172,7 @@ class ChildProcess:
             raise _rebuilt(*result)
         if kind == "unexpected":
             raise RuntimeError(result)
-        return result  # type: ignore[no-any-return]
+        return result
 
     def is_alive(self) -> bool:
         """Return whether the process is running."""

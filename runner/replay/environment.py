@@ -1,0 +1,137 @@
+"""A loop's episodes, done again: its environment is made again and takes the recorded resets and actions.
+
+    for steps in redo_in_child(path, "train", episodes=[5], render=True):
+        for row in range(len(steps)):
+            show(steps.frames[row], steps.recorded.rewards[row])
+        if steps.difference:
+            ...                           # the environment is not the recorded one; nothing follows
+
+`redo` runs the environment, which is foreign code, in this process; `redo_in_child` in a child process with
+limits on memory and time. Whether a recording can be done again is for `runner.replay.capabilities` to say.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from runner.errors import CannotRedo
+from runner.recording.reader import Recording, open_recording
+from runner.replay.capabilities import why_not_redone
+from runner.replay.engine import Replay, Report
+from runner.replay.episodes import redo_episode
+from runner.replay.redone import RedoneSteps
+from runner.util.processes import CallFailed, ChildProcess, TimedOut, report_progress
+
+MEMORY_BYTES: Final = 2 << 30
+"""How much a child process may allocate."""
+SECONDS: Final = 60.0
+"""How long a child process may take for a block of steps, which is meant to take 0.2 s, or to begin."""
+
+
+def redo(
+    recording: Recording,
+    phase: str | None = None,
+    episodes: Sequence[int] | None = None,
+    *,
+    render: bool = False,
+    trust: bool = False,
+    tolerance: float = 0.0,
+    report: Report = lambda _: None,
+) -> Iterator[RedoneSteps]:
+    """Do recorded episodes again; yield their steps in blocks of about 0.2 s, compared with the recording.
+
+    An episode alone is begun at its reset, if that has a seed or the state of the random generators was
+    recorded there, else at the nearest such reset before it. Where its first steps differ then, as in
+    environments that keep more than that from episode to episode, it is done again with all episodes since an
+    earlier seed, and at last since the beginning of the recording.
+
+    Args:
+        recording: of a loop.
+        phase: `train` or `eval`; None for both, in the order of time, without `episodes`.
+        episodes: numbers of ended episodes of the phase, in any order; of a single environment also that of
+            the last, unfinished one. None for all that happened, in the order of time.
+        render: whether to draw a picture after each reset and step.
+        trust: whether what the recording names may be imported, see `runner.replay.makers`.
+        tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
+        report: called with the number of steps taken so far, also of those before an episode.
+
+    Raises:
+        CannotRedo: the environment cannot be made again, or draws no pictures; the message is why.
+        RecordingError: the recording is damaged, or has no such episode.
+    """
+    if reason := why_not_redone(recording, trust):
+        raise CannotRedo(reason)
+    make = partial(Replay, recording, trust, tolerance, report, render)
+    if episodes is None:
+        with closing(make()) as replay:
+            for steps in replay.all():
+                if phase in (None, steps.phase) or steps.difference is not None:
+                    yield steps
+        return
+    for episode in episodes:
+        for steps in redo_episode(recording, phase or "train", episode, make):
+            yield steps
+            if steps.difference is not None:
+                return
+
+
+def redo_in_child(
+    path: Path,
+    phase: str | None = None,
+    episodes: Sequence[int] | None = None,
+    *,
+    render: bool = False,
+    trust: bool = False,
+    tolerance: float = 0.0,
+    seconds: float = SECONDS,
+    memory_bytes: int = MEMORY_BYTES,
+    report: Report = lambda _: None,
+) -> Iterator[RedoneSteps]:
+    """Do recorded episodes again in a child process, which ends with the iterator; see `redo`.
+
+    The child works ahead of the caller by a block at most.
+
+    Args:
+        path: of the recording.
+        phase: see `redo`.
+        episodes: see `redo`.
+        render: see `redo`.
+        trust: see `redo`.
+        tolerance: see `redo`.
+        seconds: how long a block of steps may take, and making the environment.
+        memory_bytes: how much the process may allocate.
+        report: see `redo`.
+
+    Raises:
+        CannotRedo: see `redo`; or the environment hangs, crashes, or needs more memory.
+        RecordingError: see `redo`.
+    """
+    arguments = {"render": render, "trust": trust, "tolerance": tolerance}
+    with ChildProcess(memory_bytes) as child:
+        try:
+            for found in child.stream(_redo_path, seconds, path, phase, episodes, **arguments):
+                if isinstance(found, int):
+                    report(found)
+                else:
+                    yield found
+        except TimedOut:
+            raise CannotRedo(
+                f"The environment took longer than {seconds:g} s to be made or stepped, and was stopped."
+            ) from None
+        except CallFailed as error:
+            raise CannotRedo(f"The environment ended its process: {error}") from error
+
+
+def _redo_path(
+    path: Path, phase: str | None, episodes: Sequence[int] | None, **arguments: bool | float
+) -> None:
+    """Pass the redone steps of a recording to the process that called this one."""
+    warnings.simplefilter("ignore")
+    with open_recording(path) as recording:
+        for steps in redo(recording, phase, episodes, report=report_progress, **arguments):  # type: ignore[arg-type]
+            report_progress(steps)

@@ -1,0 +1,192 @@
+"""One recorded episode, done again alone: begun as late as its environment allows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from runner.errors import CannotRedo, RecordingError
+from runner.recording import schema
+from runner.recording.reader import Recording
+from runner.replay.engine import Replay
+from runner.replay.recorded import Piece, RecordedReset, pieces, resets_of
+from runner.replay.redone import RedoneSteps
+
+_HELD_STEPS: Final = 64
+_HELD_SECONDS: Final = 0.3
+"""An episode counts as begun in the right state if this many steps agree, or those of this time."""
+
+
+class _Astray(Exception):
+    """An environment differs where it was not begun at the beginning of the recording."""
+
+
+@dataclass(frozen=True)
+class _Target:
+    """An episode that is done again alone."""
+
+    phase: str
+    number: int
+    environment: int
+    reset: RecordedReset
+    stop_time: int
+    """The `log_time` of its last step, and of the other environments' steps with it."""
+
+
+def redo_episode(
+    recording: Recording, phase: str, number: int, make: Callable[[], Replay]
+) -> Iterator[RedoneSteps]:
+    """Yield the steps of one episode, begun as late as possible.
+
+    Args:
+        recording: of a loop.
+        phase: `train` or `eval`.
+        number: of an episode, as `Recording.episode_span` takes it.
+        make: returns a new replay.
+
+    Raises:
+        CannotRedo, RecordingError: see `runner.replay.environment.redo`.
+    """
+    target = _target(recording, phase, number)
+    for start in _starts(recording, target):
+        try:
+            with closing(make()) as replay:
+                yield from _held(_episode(recording, replay, target, start), is_last=start is None)
+            return
+        except _Astray:
+            continue
+
+
+def _target(recording: Recording, phase: str, number: int) -> _Target:
+    """Return where an episode is, and its reset.
+
+    Raises:
+        RecordingError: there is no such episode, or it has no reset.
+    """
+    span = recording.episode_span(phase, number)
+    topic, n = recording.topic(f"/{phase}/step"), recording.environments
+    last = span[-1] // n * n + n - 1
+    start_time, stop_time = (_time_of(recording, topic, step) for step in (span[0], last))
+    for reset in _resets_back(recording, phase, start_time):
+        if reset.environment == span[0] % n and reset.step <= span[0]:
+            return _Target(phase, number, reset.environment, reset, stop_time)
+    raise RecordingError(f"{recording.path}: {phase} episode {number} has no reset before it.")
+
+
+def _time_of(recording: Recording, topic: schema.Topic, step: int) -> int:
+    """Return the `log_time` of a step."""
+    if topic in recording.dtypes:
+        for block in recording.blocks(topic, step, step + 1):
+            return int(block["log_time"][0])
+    else:
+        for message in recording.decoded(topic):
+            if message["step"] == step:
+                return int(message["log_time"])
+    raise RecordingError(f"{recording.path}: {topic.name}: step {step} was lost.")
+
+
+def _resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:
+    """Yield the resets up to a time, from the last to the first, reading no more than needed."""
+    width, stop = 1_000 * schema.STEP_NANOSECONDS, time
+    while stop >= 0:
+        start = max(stop - width, 0)
+        yield from reversed(list(resets_of(recording, phase, start, stop)))
+        stop, width = start - 1, 4 * width
+
+
+def _starts(recording: Recording, target: _Target) -> Iterator[RecordedReset | None]:
+    """Yield the resets from which to begin, the best first; None for the beginning of the recording."""
+    has_state = False
+    for reset in _resets_back(recording, target.phase, target.reset.time):
+        if reset.environment != target.environment or reset.number > target.reset.number:
+            continue
+        if reset.seed is not None or (reset.is_known and not has_state):
+            yield reset
+            if reset.seed is not None:
+                break
+            has_state = True
+    yield None
+
+
+def _episode(
+    recording: Recording, replay: Replay, target: _Target, start: RecordedReset | None
+) -> Iterator[RedoneSteps]:
+    """Yield the steps of one episode, after taking those between `start` and its reset.
+
+    Raises:
+        _Astray: steps before the episode differ, and it was not begun at the beginning of the recording.
+        CannotRedo: the state of the random generators at its beginning is not known.
+    """
+    for piece, is_target in _approach(recording, target, start):
+        for steps in replay.steps(piece, target.environment, draws=is_target and replay.render):
+            if is_target:
+                yield replace(steps, episode=np.full(len(steps), target.number))
+            elif steps.difference is not None and start is not None:
+                raise _Astray
+            elif steps.difference is not None:
+                yield steps.without_rows()
+                return
+        if is_target and target.environment not in replay.known:
+            raise CannotRedo(
+                f"{target.phase} episode {target.number} began with a reset without a seed, and the state of "
+                "the random generators before it was not recorded."
+            )
+
+
+def _approach(
+    recording: Recording, target: _Target, start: RecordedReset | None
+) -> Iterator[tuple[Piece, bool]]:
+    """Yield pieces from a reset up to the end of an episode, each with whether it belongs to the episode."""
+    is_reached, is_waiting = False, start is not None
+    start_time = 0 if start is None else start.time
+    for piece in pieces(recording, schema.PHASES, start_time, target.stop_time):
+        own = piece
+        if is_waiting and start is not None:
+            if not _has(piece, target.phase, start):
+                continue
+            own, is_waiting = _split(piece, start)[1], False
+        if not is_reached and _has(own, target.phase, target.reset):
+            before, own = _split(own, target.reset)
+            yield before, False
+            is_reached = True
+        if not is_reached or own.phase == target.phase:  # what the other phase does meanwhile is not its own
+            yield own, is_reached
+
+
+def _has(piece: Piece, phase: str, reset: RecordedReset) -> bool:
+    """Return whether a reset of a phase is in a piece."""
+    return piece.phase == phase and any(each.number == reset.number for each in piece.resets)
+
+
+def _held(found: Iterator[RedoneSteps], is_last: bool) -> Iterator[RedoneSteps]:
+    """Yield the same blocks, the first ones only once enough steps agree.
+
+    Raises:
+        _Astray: they do not, and there is another place to begin.
+    """
+    held: list[RedoneSteps] = []
+    count, begun = 0, time.monotonic()
+    for steps in found:
+        if not is_last and count < _HELD_STEPS and (not held or time.monotonic() < begun + _HELD_SECONDS):
+            if steps.difference is not None:
+                raise _Astray
+            held.append(steps)
+            count += len(steps)
+            continue
+        yield from held
+        held = []
+        yield steps
+    yield from held
+
+
+def _split(piece: Piece, reset: RecordedReset) -> tuple[Piece, Piece]:
+    """Return what comes before a reset, and the rest, which begins with it."""
+    at = next(k for k, each in enumerate(piece.resets) if each.number == reset.number)
+    rows = reset.step - piece.first
+    before = replace(piece, rows=piece.rows[:rows], resets=piece.resets[:at])
+    return before, replace(piece, first=reset.step, rows=piece.rows[rows:], resets=piece.resets[at:])

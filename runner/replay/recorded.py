@@ -1,0 +1,271 @@
+"""What a loop did to its environments, in the order of time: resets and steps, in pieces of bounded size."""
+
+from __future__ import annotations
+
+import heapq
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, pairwise
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.reader import Recording
+from runner.recording.reset_states import ResetState
+from runner.recording.schema import STEP_NANOSECONDS
+
+_ROWS: Final = 1024
+"""Steps of varying size in a piece."""
+_FOREVER: Final = 2**63 - 1
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedReset:
+    """A reset of one environment."""
+
+    number: int
+    """Its number in the phase."""
+    environment: int
+    episode: int
+    """The number of the episode that it begins, counted in its environment."""
+    step: int
+    """Steps of the phase before it."""
+    time: int
+    """Its `log_time` in nanoseconds."""
+    observation: Any
+    """As recorded: a NumPy value, or bytes where values vary in size."""
+    seed: int | None
+    options: dict[str, Any] | None
+    state: ResetState | None
+    """What it depends on, if it has no seed and this was recorded."""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether its episode can be repeated without those before it, but for what outlives a reset."""
+        state = self.state
+        return self.seed is not None or (state is not None and not is_empty(state))
+
+
+def is_empty(state: ResetState) -> bool:
+    """Return whether a state holds nothing that a reset could depend on."""
+    return state.np_random_seed is None and state.bit_generator is None and not state.ale_state
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Consecutive steps of a phase, as many of each environment, and the resets before and between them."""
+
+    phase: str
+    first: int
+    """The number of its first step."""
+    rows: NDArray[np.void]
+    """The records, [steps of each environment * environments]; values of varying size are objects."""
+    resets: Sequence[RecordedReset]
+    """In order; those of a piece with steps come before one of them."""
+    time: int
+    """Nanoseconds before its first step, or at its resets."""
+
+
+def pieces(
+    recording: Recording, phases: Iterable[str], start_time: int = 0, stop_time: int | None = None
+) -> Iterator[Piece]:
+    """Yield what happened in some phases, in the order of time.
+
+    Args:
+        recording: of a loop.
+        phases: `train`, `eval` or both.
+        start_time: the earliest `log_time` of resets; steps come after it.
+        stop_time: the last `log_time` of steps and resets; by default all that is recorded.
+
+    Raises:
+        RecordingError: the recording is damaged.
+    """
+    streams = [_pieces_of(recording, phase, start_time, stop_time) for phase in phases]
+    yield from heapq.merge(*streams, key=lambda piece: (piece.time, len(piece.rows) > 0))
+
+
+def resets_of(
+    recording: Recording, phase: str, start_time: int = 0, stop_time: int | None = None
+) -> Iterator[RecordedReset]:
+    """Yield the resets of a phase in order; arguments as for `pieces`."""
+    topic = recording.topic(f"/{phase}/reset")
+    stop = _FOREVER if stop_time is None else stop_time + 1
+    extras = _Extras(recording, phase, range(start_time, stop))
+    states = recording.reset_states(phase, range(start_time, stop))
+    state = next(states, None)
+    if topic in recording.dtypes:
+        blocks = recording.blocks_between(topic, start_time, stop)
+        records: Iterator[Any] = (record for block in blocks for record in block)
+    else:
+        records = recording.decoded(topic, times=range(start_time, stop))
+    for record in records:
+        number, environment, step = int(record["reset"]), int(record["environment"]), int(record["step"])
+        time = int(record["log_time"])
+        own, state = None, _skipped(state, states, number)
+        while state is not None and state.reset == number:
+            own, state = state, next(states, None)
+        options, seed = extras.of(step, time)
+        if record["seeded"]:
+            seed = int(record["seed"])
+        yield RecordedReset(
+            number, environment, int(record["episode"]), step, time, record["observation"], seed, options, own
+        )
+
+
+def _skipped(state: ResetState | None, states: Iterator[ResetState], number: int) -> ResetState | None:
+    while state is not None and state.reset < number:
+        state = next(states, None)
+    return state
+
+
+class _Extras:
+    """Options of resets, and seeds too large for the record of a reset, which stand among the infos."""
+
+    def __init__(self, recording: Recording, phase: str, times: range) -> None:
+        topic = recording.topic(f"/{phase}/info")
+        self._messages: Iterator[tuple[int, int, dict[str, Any]]] = iter(())
+        if recording.has_messages(topic.name):
+            self._messages = (
+                (info["step"], info["log_time"], _reset_part(info["json"]))
+                for info in recording.decoded(topic, times=times)
+                if info["reset"] and '"reset": {' in info["json"]
+            )
+        self._next = next(self._messages, None)
+        self._last: tuple[int, int, dict[str, Any]] | None = None
+
+    def of(self, step: int, time: int) -> tuple[dict[str, Any] | None, int | None]:
+        """Return options and seed of the reset at this place; those of one call hold for all its resets."""
+        while self._next is not None and (self._next[1], self._next[0]) <= (time, step):
+            self._last, self._next = self._next, next(self._messages, None)
+        if self._last is None or self._last[:2] != (step, time):
+            return None, None
+        found = self._last[2]
+        options, seed = found.get("options"), found.get("seed")
+        large = str(seed.get("value")) if isinstance(seed, dict) else ""
+        is_number = large.isdecimal() and len(large) < 100
+        return options if isinstance(options, dict) else None, int(large) if is_number else None
+
+
+def _reset_part(text: str) -> dict[str, Any]:
+    try:
+        part = json.loads(text).get("reset")
+    except (ValueError, RecursionError, AttributeError):
+        part = None
+    return part if isinstance(part, dict) else {}
+
+
+# --- pieces -------------------------------------------------------------------------------------------
+
+
+def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int | None) -> Iterator[Piece]:
+    """Yield the pieces of one phase; one ends where steps of the other phase come between its own."""
+    n = recording.environments
+    resets = resets_of(recording, phase, start_time, stop_time)
+    waiting = next(resets, None)
+    rows = _cut_off(recording, phase, _aligned(_blocks(recording, phase, start_time, stop_time), n), n)
+    nothing = np.empty(0, _row_dtype(recording, recording.topic(f"/{phase}/step")))
+    for block in rows:
+        first, time = int(block["step"][0]), int(block["log_time"][0]) - STEP_NANOSECONDS
+        while waiting is not None and waiting.time < time and waiting.step <= first:
+            yield Piece(phase, waiting.step, nothing, [waiting], waiting.time)
+            waiting = next(resets, None)
+        here = []
+        while waiting is not None and waiting.step < first + len(block):
+            if waiting.step < first or (waiting.step - first) % n or waiting.environment >= n:
+                raise RecordingError(
+                    f"{recording.path}: /{phase}/reset {waiting.number}: out of order, or of no environment."
+                )
+            here.append(waiting)
+            waiting = next(resets, None)
+        yield Piece(phase, first, block, here, time)
+    for reset in chain([] if waiting is None else [waiting], resets):
+        yield Piece(phase, reset.step, nothing, [reset], reset.time)
+
+
+def _blocks(
+    recording: Recording, phase: str, start_time: int, stop_time: int | None
+) -> Iterator[NDArray[np.void]]:
+    """Yield the steps of a phase in blocks, each without steps of the other phase in between."""
+    topic = recording.topic(f"/{phase}/step")
+    stop = _FOREVER if stop_time is None else stop_time + 1
+    if topic in recording.dtypes:
+        found = recording.blocks_between(topic, start_time + 1, stop)
+    else:
+        found = _variable_blocks(recording, topic, range(start_time + 1, stop))
+    for block in found:
+        if not len(block):
+            continue
+        others = block["log_time"].astype(np.int64) // STEP_NANOSECONDS - block["step"]
+        edges = [0, *(np.flatnonzero(np.diff(others)) + 1).tolist(), len(block)]
+        for begin, end in pairwise(edges):
+            yield block[begin:end]
+
+
+def _variable_blocks(recording: Recording, topic: schema.Topic, times: range) -> Iterator[NDArray[np.void]]:
+    """Yield messages of varying size as records, their values of spaces as bytes."""
+    dtype, learners = _row_dtype(recording, topic), len(recording.agents)
+    rows: list[tuple[Any, ...]] = []
+    for message in recording.decoded(topic, times=times):
+        if len(message["rewards"]) != learners:
+            raise RecordingError(
+                f"{recording.path}: {topic.name}: found {len(message['rewards'])} rewards of a step, "
+                f"expected {learners}."
+            )
+        rows.append(
+            tuple(tuple(v) if isinstance(v := message[name], list) else v for name in dtype.names or ())
+        )
+        if len(rows) == _ROWS:
+            yield np.array(rows, dtype)
+            rows = []
+    if rows:
+        yield np.array(rows, dtype)
+
+
+def _row_dtype(recording: Recording, topic: schema.Topic) -> np.dtype[np.void]:
+    """Return the dtype of the records of steps."""
+    if topic in recording.dtypes:
+        return recording.dtypes[topic]
+    learners = len(recording.agents)
+    kinds: dict[str, Any] = {"rewards": ("f8", (learners,)), "terminated": "?", "truncated": "?"}
+    kinds |= {"action": "O", "next_observation": "O"}
+    names = [field.name for field in topic.message.fields]
+    return np.dtype([*((name, kinds.get(name, "i8")) for name in names), ("log_time", "u8")])
+
+
+def _aligned(blocks: Iterator[NDArray[np.void]], n: int) -> Iterator[NDArray[np.void]]:
+    """Yield the same steps in blocks that hold as many of each of the n environments."""
+    left: NDArray[np.void] | None = None
+    for block in blocks:
+        rows = block if left is None or not len(left) else np.concatenate([left, block])
+        whole = len(rows) - len(rows) % n
+        left = rows[whole:]
+        if whole:
+            yield rows[:whole]
+
+
+def _cut_off(
+    recording: Recording, phase: str, blocks: Iterator[NDArray[np.void]], n: int
+) -> Iterator[NDArray[np.void]]:
+    """Yield the steps up to the first end of an episode after the last reset, if the recording was cut off.
+
+    What comes after it may lack its reset: topics are written one after the other.
+    """
+    if "content_digest" in recording.result:
+        yield from blocks
+        return
+    topic, last = recording.topic(f"/{phase}/reset"), 0
+    for record in recording.blocks(topic) if topic in recording.dtypes else ():
+        last = int(record["step"][-1])
+    if topic not in recording.dtypes:
+        last = max((int(each["step"]) for each in recording.decoded(topic)), default=0)
+    for block in blocks:
+        over = (block["terminated"] | block["truncated"]) & (block["step"] >= last)
+        if over.any():
+            end = int(np.argmax(over)) // n * n + n
+            yield block[:end]
+            return
+        yield block

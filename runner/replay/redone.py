@@ -1,0 +1,86 @@
+"""Steps that were done again, as `runner.replay.environment.redo` yields them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.replay.comparing import Difference
+
+Frame = NDArray[np.uint8]
+"""A picture, [height, width, 3]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """Values of steps: arrays [rows]."""
+
+    observations: NDArray[Any]
+    """After each step, as recorded: [rows, ...] in the dtype of the space, structured for `Dict` and `Tuple`.
+
+    States from 0 if both spaces are `Discrete`; bytes, for `runner.recording.spaces.decode`, where values
+    vary in size."""
+    rewards: NDArray[np.float64]
+    """[rows, agents]."""
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+
+    def first(self, rows: int) -> Values:
+        """Return the values of the first rows."""
+        return Values(
+            self.observations[:rows], self.rewards[:rows], self.terminated[:rows], self.truncated[:rows]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RedoneStart:
+    """The beginning of an episode that was done again."""
+
+    row: int
+    """The row of the block that comes after the reset."""
+    episode: int
+    seed: int | None
+    recorded: Any
+    """The first observation, as in `Values`, but a state as the environment returned it."""
+    got: Any
+    frame: Frame | None = None
+    """The picture after the reset, if pictures are drawn."""
+
+
+@dataclass(frozen=True, eq=False)
+class RedoneSteps:
+    """Consecutive steps of one environment, done again; of one or more episodes."""
+
+    phase: str
+    environment: int
+    """Which environment of a vector; 0 for a single one."""
+    step: NDArray[np.int64]
+    """The number of each step in its phase."""
+    episode: NDArray[np.int64]
+    """The number of its episode; counted in each environment by itself where several take turns and all
+    episodes are done again."""
+    t: NDArray[np.int64]
+    """The number of each step in its episode."""
+    actions: NDArray[Any]
+    """As recorded."""
+    recorded: Values
+    got: Values
+    starts: tuple[RedoneStart, ...] = ()
+    """The episodes that begin in the block, in order."""
+    frames: Sequence[Frame] = ()
+    """The picture after each step, uint8 [height, width, 3], if pictures are drawn."""
+    difference: Difference | None = None
+    """The first difference, in the last row, or at the reset after it; the last block has it, if any has."""
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+    def without_rows(self) -> RedoneSteps:
+        """Return the difference alone: it is in another episode than the one that was asked for."""
+        empty = {name: getattr(self, name)[:0] for name in ("step", "episode", "t", "actions")}
+        recorded, got = self.recorded.first(0), self.got.first(0)
+        return replace(self, **empty, recorded=recorded, got=got, starts=(), frames=())

@@ -1,0 +1,351 @@
+"""One environment, stepped through recorded actions, with what it returns in the layout of the recording."""
+
+from __future__ import annotations
+
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import CannotRedo
+from runner.recording.gym_spaces import Space, describe_space
+from runner.recording.gym_values import filler, filler_by_agent, leaves_by_agent, leaves_of, value_bytes
+from runner.recording.reader import Recording
+from runner.recording.reset_states import ResetState
+from runner.recording.spaces import decode
+from runner.recording.spaces import leaves_of as recorded_leaves
+from runner.replay.recorded import RecordedReset
+from runner.replay.redone import Frame, Values
+
+Put = Callable[[int, Any], None]
+
+_ENDING: Final = struct.Struct("<d??")
+_ENDING_DTYPE: Final = np.dtype([("reward", "<f8"), ("terminated", "?"), ("truncated", "?")])
+
+
+@dataclass(frozen=True)
+class Dtypes:
+    """The dtypes of recorded observations; `object` where values vary in size."""
+
+    step: np.dtype[Any]
+    """Of the observation after a step."""
+    reset: np.dtype[Any]
+    """Of the first observation of an episode."""
+
+
+class Results:
+    """What an environment returned for some steps and resets, as it is recorded: arrays [rows], [resets]."""
+
+    def __init__(self, rows: int, resets: int, dtypes: Dtypes, learners: int) -> None:
+        self.observations: NDArray[Any] = np.zeros(rows, dtypes.step)
+        self.rewards: NDArray[np.float64] = np.zeros((rows, learners))
+        self.terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
+        self.truncated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
+        masks = rows if learners > 1 else 0
+        self.agents_terminated = np.zeros(masks, np.uint32)
+        """Bit i: agent i of a game; empty for one agent."""
+        self.agents_truncated = np.zeros(masks, np.uint32)
+        self.first_observations: NDArray[Any] = np.zeros(resets, dtypes.reset)
+        self.frames: list[Frame] = []
+        self.first_frames: list[Frame] = []
+        self.done = self.resets_done = 0
+        """Rows and resets that are filled in; fewer than all if the environment raised `error`."""
+        self.error: Exception | None = None
+
+    @property
+    def values(self) -> Values:
+        """The values of all rows."""
+        return Values(self.observations, self.rewards, self.terminated, self.truncated)
+
+
+class Stepper(ABC):
+    """An environment that is stepped through a recording of one like it.
+
+    Args:
+        env: the environment.
+        recording: of a loop over such an environment.
+    """
+
+    env: Any
+
+    def __init__(self, env: Any, recording: Recording) -> None:
+        self.env = env
+        self.draws = False
+        """Whether to draw a picture after each step and reset."""
+        self._recording = recording
+        self.observation_space, self.action_space = self._spaces()
+        self._learners = len(recording.agents)
+        topics = [recording.topic(f"/train/{name}") for name in ("step", "reset")]
+        fields = "next_state" if recording.kind == "step" else "next_observation", "observation"
+        found = zip(topics, fields, strict=True)
+        varying = np.dtype(object)
+        self.dtypes = Dtypes(
+            *(
+                recording.dtypes[topic][name] if topic in recording.dtypes else varying
+                for topic, name in found
+            )
+        )
+
+    @abstractmethod
+    def _spaces(self) -> tuple[Space, Space]:
+        """Return the spaces of observation and action."""
+
+    @abstractmethod
+    def _filler(self, column: NDArray[Any], is_first: bool = False) -> Put:
+        """Return a function that puts an observation into a row of a column; `is_first`: that of a reset."""
+
+    @abstractmethod
+    def actions(self, rows: NDArray[np.void]) -> Sequence[Any]:
+        """Return the actions of recorded steps as the environment takes them."""
+
+    @abstractmethod
+    def take(self, actions: Sequence[Any], first: int, stop: int, results: Results, put: Put) -> None:
+        """Take the steps of these rows, and fill them in; `results.error` is what the environment raised."""
+
+    def other_space(self) -> tuple[str, Any, Any] | None:
+        """Return name, recorded and found description of a space that holds other values than recorded."""
+        found = {"observation": self.observation_space, "action": self.action_space}
+        for name, space in found.items():
+            recorded, described = self._recording.spaces[name], describe_space(space)
+            shapes = [
+                [(leaf.path, leaf.dtype and leaf.dtype.shape) for leaf in recorded_leaves(each, name)]
+                for each in (recorded, described)
+            ]
+            if shapes[0] != shapes[1] or any(
+                recorded.get(key) != described.get(key) for key in ("type", "n")
+            ):
+                return f"{name} space", recorded, described
+        return None
+
+    def _restore(self, state: ResetState) -> int | None:
+        """Bring random generators to a recorded state; return the seed that `reset` needs instead, if any."""
+        base = self.env.unwrapped
+        if state.bit_generator is None and not state.ale_state:
+            return state.np_random_seed
+        if state.bit_generator is not None:
+            base.np_random.bit_generator.state = state.bit_generator
+        if state.ale_state:
+            import ale_py
+
+            emulator = ale_py.ALEState.__new__(ale_py.ALEState)
+            emulator.__setstate__(state.ale_state)  # type: ignore[arg-type]
+            base.ale.restoreState(emulator)
+        return None
+
+    def draw(self) -> Frame:
+        """Return a picture of the environment, [height, width, 3].
+
+        Raises:
+            CannotRedo: it draws none.
+        """
+        try:
+            picture = np.asarray(self.env.render())
+        except MemoryError:
+            raise
+        except Exception as error:  # foreign code raises anything
+            raise CannotRedo(
+                f"The environment cannot draw itself here: {type(error).__name__}: {error}. "
+                "Where there is no display, drawing may need a library such as EGL or OSMesa."
+            ) from error
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+            raise CannotRedo(
+                f"The environment draws {picture.dtype} of shape {list(picture.shape)}, expected uint8 of "
+                "[height, width, 3]."
+            )
+        return picture.copy()
+
+    def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
+        """Do recorded steps again, until the environment raises an error.
+
+        Args:
+            rows: the recorded steps.
+            resets: row and reset, in order; each comes before its row.
+        """
+        n = len(rows)
+        results = Results(n, len(resets), self.dtypes, self._learners)
+        put, actions, first = self._filler(results.observations), self.actions(rows), 0
+        put_first = self._filler(results.first_observations, is_first=True)
+        for number, (row, reset) in enumerate(resets):
+            self.take(actions, first, row, results, put)
+            if results.error is not None:
+                return results
+            first = row
+            try:
+                put_first(number, self._reset(reset))
+                if self.draws:
+                    results.first_frames.append(self.draw())
+            except (MemoryError, CannotRedo):
+                raise
+            except Exception as error:  # foreign code raises anything
+                results.error = error
+                return results
+            results.resets_done += 1
+        self.take(actions, first, n, results, put)
+        return results
+
+    def _reset(self, reset: RecordedReset) -> Any:
+        """Reset the environment as it was; return its observation."""
+        seed = reset.seed
+        if seed is None and reset.state is not None:
+            seed = self._restore(reset.state)
+        arguments = {"seed": seed, "options": reset.options}
+        return self.env.reset(**{name: value for name, value in arguments.items() if value is not None})[0]
+
+
+class EnvironmentStepper(Stepper):
+    """A Gymnasium environment."""
+
+    def _spaces(self) -> tuple[Space, Space]:
+        return self.env.observation_space, self.env.action_space
+
+    def _filler(self, column: NDArray[Any], is_first: bool = False) -> Put:
+        if self._recording.kind == "step":
+            # States are counted from 0, the first observations are as they came.
+            start = 0 if is_first else int(self.observation_space.start)  # type: ignore[attr-defined]
+
+            def put_state(row: int, observation: Any) -> None:
+                if observation.__class__ is not int:
+                    observation = int(np.asarray(observation).reshape(()))
+                column[row] = observation - start
+
+            return put_state
+        leaves = leaves_of(self.observation_space, "observation")
+        if self._recording.kind == "transition":
+            return filler(leaves, column)
+
+        def put_bytes(row: int, observation: Any) -> None:
+            column[row] = value_bytes(leaves, observation)
+
+        return put_bytes
+
+    def actions(self, rows: NDArray[np.void]) -> Sequence[Any]:
+        """Return the actions of recorded steps as the environment takes them."""
+        if self._recording.kind == "step":
+            start = int(self.action_space.start)  # type: ignore[attr-defined]
+            return (rows["action"].astype(np.int64) + start).tolist()  # type: ignore[no-any-return]
+        if self._recording.kind == "transition":
+            return values_in(self.action_space, np.array(rows["action"]))
+        description = self._recording.spaces["action"]
+        where = f"{self._recording.path}: an action"
+        return [keyed(self.action_space, decode(description, data, where)) for data in rows["action"]]
+
+    def take(self, actions: Sequence[Any], first: int, stop: int, results: Results, put: Put) -> None:
+        """Take the steps of these rows, and fill them in."""
+        step, pack, frames = self.env.step, _ENDING.pack_into, results.frames
+        endings = np.zeros(stop - first, _ENDING_DTYPE)
+        data, at, draws = endings.view(np.uint8).data, 0, self.draws
+        row = first
+        try:
+            for row in range(first, stop):
+                observation, reward, terminated, truncated, _ = step(actions[row])
+                put(row, observation)
+                try:
+                    pack(data, at, reward, terminated, truncated)
+                except (struct.error, TypeError):  # an array of one
+                    pack(data, at, float(np.asarray(reward).reshape(())), bool(terminated), bool(truncated))
+                at += 10
+                if draws:
+                    frames.append(self.draw())
+            row = stop
+        except (MemoryError, CannotRedo):
+            raise
+        except Exception as error:  # foreign code raises anything
+            results.error = error
+        results.done = row
+        filled = endings[: row - first]
+        results.rewards[first:row, 0] = filled["reward"]
+        results.terminated[first:row] = filled["terminated"]
+        results.truncated[first:row] = filled["truncated"]
+
+
+class GameStepper(Stepper):
+    """A PettingZoo parallel environment."""
+
+    def _spaces(self) -> tuple[Space, Space]:
+        from gymnasium import spaces
+
+        agents = self.env.possible_agents
+        if tuple(map(str, agents)) != self._recording.agents:
+            raise CannotRedo(
+                f"The environment has the agents {', '.join(map(str, agents))}, and the recording "
+                f"{', '.join(self._recording.agents)}."
+            )
+        observations = spaces.Dict({agent: self.env.observation_space(agent) for agent in agents})
+        return observations, spaces.Dict({agent: self.env.action_space(agent) for agent in agents})
+
+    def _filler(self, column: NDArray[Any], is_first: bool = False) -> Put:  # noqa: ARG002
+        return filler_by_agent(leaves_by_agent(self.observation_space, "observation"), column)
+
+    def actions(self, rows: NDArray[np.void]) -> Sequence[Any]:
+        """Return the actions of recorded steps as the environment takes them."""
+        agents = self.env.possible_agents
+        spaces: Any = self.action_space
+        columns = {agent: values_in(spaces[agent], np.array(rows["action"][str(agent)])) for agent in agents}
+        return [
+            {agent: columns[agent][row] for i, agent in enumerate(agents) if acted >> i & 1}
+            for row, acted in enumerate(rows["acted"].tolist())
+        ]
+
+    def take(self, actions: Sequence[Any], first: int, stop: int, results: Results, put: Put) -> None:
+        """Take the steps of these rows, and fill them in."""
+        agents = self.env.possible_agents
+
+        def mask(flags: Mapping[Any, bool]) -> int:
+            return sum(bool(flags.get(agent)) << i for i, agent in enumerate(agents))
+
+        row = first
+        try:
+            for row in range(first, stop):
+                observations, rewards, terminated, truncated, _ = self.env.step(actions[row])
+                put(row, observations)
+                over = not self.env.agents
+                results.rewards[row] = [float(rewards.get(agent, 0.0)) for agent in agents]
+                results.terminated[row] = over and any(terminated.values())
+                results.truncated[row] = over and any(truncated.values())
+                if len(results.agents_terminated):
+                    results.agents_terminated[row] = mask(terminated)
+                    results.agents_truncated[row] = mask(truncated)
+                if self.draws:
+                    results.frames.append(self.draw())
+            row = stop
+        except (MemoryError, CannotRedo):
+            raise
+        except Exception as error:  # foreign code raises anything
+            results.error = error
+        results.done = row
+
+
+def values_in(space: Space, column: NDArray[Any]) -> Sequence[Any]:
+    """Return the values of a column, one by one, as an environment with this action space takes them."""
+    from gymnasium import spaces
+
+    if isinstance(space, spaces.Dict):
+        parts = {key: values_in(part, np.array(column[str(key)])) for key, part in space.spaces.items()}
+        return [{key: part[row] for key, part in parts.items()} for row in range(len(column))]
+    if isinstance(space, spaces.Tuple):
+        columns = [values_in(part, np.array(column[str(i)])) for i, part in enumerate(space.spaces)]
+        return list(zip(*columns, strict=True))
+    if column.ndim == 1 and column.dtype.kind in "iu":
+        return list(column.tolist())
+    return list(column)
+
+
+def keyed(space: Space, value: Any) -> Any:
+    """Return a decoded value with the keys and types that its space has.
+
+    Raises:
+        CannotRedo: values of the space are recorded as text that does not give them back.
+    """
+    from gymnasium import spaces
+
+    if isinstance(space, spaces.Dict):
+        return {key: keyed(part, value[str(key)]) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(keyed(part, own) for part, own in zip(space.spaces, value, strict=True))
+    if isinstance(value, str) and not isinstance(space, spaces.Text):
+        raise CannotRedo(f"Its actions are of the space {type(space).__name__}, which is recorded as text.")
+    return value.item() if isinstance(value, np.integer) else value
