@@ -286,7 +286,7 @@ def _own(
         return rows, [(0, reset) for reset in own]
     at = [(reset.step - piece.first) // environments for reset in own]
     if environments > 1:
-        taken = rows["t"] != schema.NEVER
+        taken = rows["t"] != schema.RESET_ONLY
         if not taken.all():
             before = np.concatenate([[0], np.cumsum(taken)])
             at, rows = before[at].tolist(), rows[taken]
