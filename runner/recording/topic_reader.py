@@ -1,0 +1,222 @@
+"""The topics of a recording: its blocks and messages, read lazily, and its metadata and attachments."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property, partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.errors import RecordingError
+from runner.recording.blocks import record_dtype
+from runner.recording.chunks import MAX_CHUNK_BYTES
+from runner.recording.description import RunDescription
+from runner.recording.index import read_index
+from runner.recording.messages import decode
+from runner.recording.metadata import check_file, sizes_of
+from runner.recording.record_store import RecordStore
+from runner.recording.schema import Topic
+from runner.recording.topic_chunks import TopicChunks, chunks_by_topic
+
+M = TypeVar("M")
+
+
+class TopicReader(RunDescription):
+    """The file of a recording, opened; a context manager.
+
+    A block is the file's own bytes seen through the dtype of `record_dtype`: no message is parsed by itself.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        try:
+            if not stat.S_ISREG(path.stat().st_mode):  # to open a pipe would wait for its writer
+                raise RecordingError(f"{path}: cannot be read: it is no file.")
+            self._stream = path.open("rb")
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise RecordingError(f"{path}: cannot be read ({reason}).") from error
+        self._store = RecordStore(self._stream, str(path))
+        try:
+            self._index = read_index(self._stream, str(path))
+            check_file(self.run, self._index, str(path))
+        except OSError as error:
+            self.close()
+            raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+        except BaseException:
+            self.close()
+            raise
+        self._topic_chunks: dict[Topic, TopicChunks] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._store.close()
+
+    @property
+    def finished(self) -> bool:
+        """Whether the file was closed properly: it has its index and summary."""
+        return self._index.finished
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return os.fstat(self._stream.fileno()).st_size
+
+    def metadata(self, name: str) -> dict[str, str]:
+        """Return a metadata record's entries.
+
+        Raises:
+            RecordingError: there is none of that name, or it cannot be read.
+        """
+        return self._store.metadata(name, *self._place("metadata", self._index.metadata, name))
+
+    @property
+    def metadata_names(self) -> list[str]:
+        """The names of the metadata records, in the order of the file."""
+        return sorted(self._index.metadata, key=lambda name: self._index.metadata[name][0])
+
+    def attachments(self) -> Iterator[tuple[str, str, bytes]]:
+        """Yield name, media type and data of each attachment, in the order of the file."""
+        for name, place in sorted(self._index.attachments.items(), key=lambda item: item[1]):
+            yield name, *self._store.attachment(name, *place)
+
+    def attachment(self, name: str) -> bytes:
+        """Return an attachment's data, after comparing its checksum.
+
+        Raises:
+            RecordingError: there is none of that name, or it is damaged.
+        """
+        return self._store.attachment(name, *self._place("attachment", self._index.attachments, name))[1]
+
+    def _place(self, kind: str, places: Mapping[str, tuple[int, int]], name: str) -> tuple[int, int]:
+        """Return where a named record is in the file."""
+        if name not in places:
+            raise RecordingError(
+                f"{self.path}: has no {kind} {name!r}; it was cut off, or not written by dualtaxi."
+            )
+        return places[name]
+
+    @cached_property
+    def dtypes(self) -> dict[Topic, np.dtype[np.void]]:
+        """The dtype of each fixed-width topic's message records in this recording."""
+        return {
+            topic: record_dtype(topic.message, sizes)
+            for topic, sizes in sizes_of(self.run, str(self.path)).items()
+        }
+
+    def topic(self, name: str) -> Topic:
+        """Return the topic of that name, such as `/train/step`.
+
+        Raises:
+            RecordingError: a recording of its kind has none.
+        """
+        if name not in self._topics_by_name:
+            raise RecordingError(f"{self.path}: has no topic {name!r}: it is of the kind {self.kind!r}.")
+        return self._topics_by_name[name]
+
+    def blocks(self, topic: Topic, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
+        """Yield the messages number `start` up to `stop` of a fixed-width topic, a chunk at a time.
+
+        Each block is a read-only structured array with the fields of the message, and those of the MCAP
+        record (`log_time` in nanoseconds, ...).
+        """
+        return self._chunks(topic).blocks(start, stop)
+
+    def blocks_between(self, topic: Topic, start_time: int, stop_time: int) -> Iterator[NDArray[np.void]]:
+        """Yield the messages of a fixed-width topic logged from `start_time` up to `stop_time`, in ns."""
+        return self._chunks(topic).blocks_between(start_time, stop_time)
+
+    def first_from(self, topic: Topic, field: str, value: int) -> int:
+        """Return the number of a fixed-width topic's first message of that value or more.
+
+        The values of the field must never decrease.
+        """
+        return self._chunks(topic).first_from(field, value)
+
+    def messages(self, topic: Topic, first_chunk: int = 0) -> Iterator[tuple[int, bytes]]:
+        """Yield (log time in nanoseconds, payload) of a topic's messages, in order."""
+        return self._chunks(topic).messages(first_chunk)
+
+    def decoded(
+        self, topic: Topic, max_bytes: int = MAX_CHUNK_BYTES, times: range | None = None
+    ) -> Iterator[dict[str, Any]]:
+        """Yield the messages of a topic of variable size: `log_time` and the fields, by name.
+
+        Args:
+            topic: the topic.
+            max_bytes: the largest message that is accepted.
+            times: in ns, from the first to before the last; None for all.
+
+        Raises:
+            RecordingError: one cannot be read, or has more than `max_bytes` bytes.
+        """
+        parse = partial(decode, topic.message)
+        for time, fields in self._parsed(topic, parse, max_bytes=max_bytes, times=times):
+            yield {"log_time": time} | fields
+
+    def _parsed(
+        self,
+        topic: Topic,
+        parse: Callable[[bytes], M],
+        first_chunk: int = 0,
+        max_bytes: int = MAX_CHUNK_BYTES,
+        times: range | None = None,
+    ) -> Iterator[tuple[int, M]]:
+        """Yield (log time in nanoseconds, parsed message) of a topic's messages, in order.
+
+        Raises:
+            RecordingError: one cannot be parsed, or has more than `max_bytes` bytes; it is named.
+        """
+        chunks = self._chunks(topic)
+        found = (
+            chunks.messages(first_chunk)
+            if times is None
+            else chunks.messages_between(times.start, times.stop)
+        )
+        for time, payload in found:
+            try:
+                if len(payload) > max_bytes:
+                    raise RecordingError(f"found {len(payload):,} bytes, expected at most {max_bytes:,}.")
+                message = parse(payload)
+            except RecordingError as error:
+                raise RecordingError(f"{self.path}: {topic.name} at {time} ns: {error}") from error
+            yield time, message
+
+    def _chunks(self, topic: Topic) -> TopicChunks:
+        """Return the chunks of a topic, or of this recording's own topic of that name: the kinds differ."""
+        own = self._topics_by_name.get(topic.name, topic)
+        if own not in self._topic_chunks:
+            self._topic_chunks[own] = TopicChunks(
+                own,
+                self._chunk_numbers[own],
+                self._index.chunks,
+                self._store,
+                self.dtypes.get(own),
+                self.lost.get(own.name, []),
+                str(self.path),
+            )
+        return self._topic_chunks[own]
+
+    @cached_property
+    def _chunk_numbers(self) -> Mapping[Topic, NDArray[np.intp]]:
+        """The numbers of the chunks of the file that hold each topic."""
+        return chunks_by_topic(self._index, self._store, self.dtypes, str(self.path))
+
+    @cached_property
+    def _topics_by_name(self) -> Mapping[str, Topic]:
+        """The topics that a recording of its kind has, by name."""
+        return {topic.name: topic for topic in self.topics}
