@@ -67,6 +67,7 @@ def measure(quick: bool) -> list[Figure]:
         for name, kind, count in (("Blackjack-v1", "short", steps // 20), ("Taxi-v4", "long", steps // 2)):
             figures += _against_minari(name, kind, Path(folder), count, repetitions)
         figures += [_vector(count, Path(folder), steps // 5, repetitions) for count in (1, 4, 16)]
+        figures += _extras(Path(folder), steps, repetitions)
         figures += _short(Path(folder), 100 if quick else 1_000, repetitions)
         figures += _logging(Path(folder), steps, repetitions)
         figures += _memory(Path(folder), 10_000_000 if not quick else 1_000_000)
@@ -213,6 +214,78 @@ def _drive_vector(envs: Any, steps: int) -> None:
     envs.reset(seed=0)
     for _ in range(steps):
         envs.step(actions)
+
+
+class Observed(gymnasium.Env[Any, Any]):
+    """An environment that takes no time, with observations of 4 float32 under each of these names."""
+
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, numbers: Any, names: str) -> None:
+        self.observation_space = spaces.Dict({name: spaces.Box(-9, 9, (4,), np.float32) for name in names})
+        self._observations = [dict.fromkeys(names, row) for row in numbers]
+        for k, name in enumerate(names):  # other numbers under each name
+            for row, observation in zip(
+                np.roll(numbers, k * len(numbers) // 2, axis=0), self._observations, strict=True
+            ):
+                observation[name] = row
+        self._t = 0
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:  # noqa: ARG002
+        """Return the first observation."""
+        return self._observations[0], {}
+
+    def step(self, action: Any) -> Any:  # noqa: ARG002
+        """Return the next observation; every 200th step ends an episode."""
+        self._t += 1
+        return self._observations[self._t], 1.0, self._t % 200 == 0, False, {}
+
+
+def _extras(folder: Path, steps: int, repetitions: int) -> list[Figure]:
+    """Return what extras of 4 float32 add to a step, next to an observation of the same size."""
+    numbers = np.random.default_rng(0).normal(size=(steps + 1, 4)).astype(np.float32)
+
+    def play(env: Any, with_extras: bool) -> None:
+        env.reset()
+        for k in range(steps):
+            result = env.step(0, {"logits": numbers[k]}) if with_extras else env.step(0)
+            if result[2]:
+                env.reset()
+
+    added: dict[str, list[float]] = {"none": [], "extras": [], "second": []}
+    sizes = dict.fromkeys(added, 0.0)
+    for _ in range(repetitions):
+        for kind, own in added.items():
+            names = "ab" if kind == "second" else "a"
+            alone = _times(partial(play, Observed(numbers, names), False))
+            with runner.record(Observed(numbers, names), folder / "recordings") as env:
+                recorded = _times(partial(play, env, kind == "extras"))
+            own.append((recorded[0] - alone[0]) / steps * 1e6)
+            sizes[kind] = env.run.summary["bytes"] / steps
+    by_extras, by_observation = (
+        [more - less for more, less in zip(added[kind], added["none"], strict=True)]
+        for kind in ("extras", "second")
+    )
+    step = statistics.median(added["none"])
+    return [
+        figure(
+            "extras of 4 float32, added per step",
+            by_extras,
+            "us",
+            (step, statistics.median(by_observation)),
+            higher_is_better=False,
+            detail=f"targets: a step with an observation of 4 float32, {step:.2f} us, and a second such part "
+            f"of a Dict observation, {statistics.median(by_observation):.2f} us, in the same run",
+        ),
+        figure(
+            "  on disk, extras of 4 float32",
+            [sizes["extras"] - sizes["none"]],
+            "bytes/step",
+            (sizes["none"], sizes["second"] - sizes["none"]),
+            higher_is_better=False,
+            detail="targets: the same steps; 16 of these bytes are their message index",
+        ),
+    ]
 
 
 def _short(folder: Path, loops: int, repetitions: int) -> list[Figure]:

@@ -29,7 +29,7 @@ MAX_LINES: Final = 16
 """Observations or actions of more numbers are not drawn as lines."""
 MAX_ARRAYS: Final = 2
 MAX_LOGGED: Final = 6
-"""Views of logged arrays and of logged scalars in the blueprint; all are sent."""
+"""Views of logged arrays and of logged scalars in the blueprint, and of extras; all are sent."""
 _FRAMES: Final = {"train": schema.TRAIN_FRAME, "eval": schema.EVAL_FRAME}
 Leaf = tuple[str, tuple[str, ...]]
 """A name, and the path of fields in the record of a step."""
@@ -48,6 +48,9 @@ class LoopExporter:
         self._drawn: dict[str, None] = {}
         """The parts of both phases that are drawn as lines; a dictionary keeps them in order."""
         self._logged: dict[str, None] = {}
+        self._extras: dict[tuple[str, str], str] = {}
+        """Phase and name to the entity, of extras that are drawn as lines; `_bars` is entity to name."""
+        self._bars: dict[str, str] = {}
         self._frames: list[str] = []
         self._arrays: dict[str, None] = {}
         self._has_log = False
@@ -74,6 +77,15 @@ class LoopExporter:
         if self._has_log:
             left.append((rrb.TextLogView(origin=f"{root}/log", name="Log"), 1))
         plots = [self._plot(name, [f"{phase}/{name}" for phase in schema.PHASES]) for name in self._drawn]
+        extras = {name: entity for (_, name), entity in self._extras.items()}
+        plots += [
+            self._plot(name, [f"{phase}/{entity}" for phase in schema.PHASES])
+            for name, entity in islice(extras.items(), MAX_LOGGED)
+        ]
+        plots += [
+            rrb.BarChartView(origin=f"{root}/{entity}", name=name)
+            for entity, name in islice(self._bars.items(), MAX_ARRAYS)
+        ]
         plots += [self._plot(name, [f"logged/{name}"]) for name in islice(self._logged, MAX_LOGGED)]
         if not left:
             return rrb.Grid(*plots, grid_columns=2, name=title)
@@ -177,6 +189,7 @@ class LoopExporter:
             for part, paths in leaves.items():
                 numbers = np.concatenate([_numbers(steps, path) for _, path in paths], axis=1)
                 sender.send(part, times, scalars(numbers))
+            self._send_extras(phase, steps["step"], steps["log_time"], times)
             if grid is not None:
                 episode = steps["episode"].astype(np.int64)
                 if training_ends is not None:  # evaluation is shown by the training episodes before it
@@ -201,7 +214,31 @@ class LoopExporter:
             while batch := list(islice(steps, MAX_ROWS)):
                 times, episodes = (np.array([step[key] for step in batch]) for key in ("log_time", "episode"))
                 rewards = np.array([step["rewards"] for step in batch])
-                sender.send("reward", self._times(times, episodes), scalars(rewards))
+                columns = self._times(times, episodes)
+                sender.send("reward", columns, scalars(rewards))
+                self._send_extras(phase, np.array([step["step"] for step in batch]), times, columns)
+
+    def _send_extras(
+        self, phase: str, steps: NDArray[Any], log_times: NDArray[Any], times: list[rr.TimeColumn]
+    ) -> None:
+        """Send the values that the loop recorded with these steps: as lines, or as bars if they are many."""
+        sender = self._sender(phase)
+        for name, values in self._recording.extras(phase).at(steps).items():
+            given = ~np.ma.getmaskarray(values).reshape(len(steps), -1)[:, 0]
+            numbers = values.data.reshape(len(steps), -1).astype(np.float64)
+            entity = f"extra/{_entity(name)}"
+            if numbers.shape[1] > MAX_LINES:
+                self._bars.setdefault(f"{phase}/{entity}", name)
+                for time, row in zip(log_times[given].tolist(), numbers[given], strict=True):
+                    self._log(time, f"{phase}/{entity}", rr.BarChart(row))
+                continue
+            if (phase, name) not in self._extras:
+                count = numbers.shape[1]
+                lines = [f"{phase} {name}"] if count == 1 else [f"{phase} {name}[{i}]" for i in range(count)]
+                sender.send_static(entity, series_lines(lines, phase_colours(phase, count)))
+                self._extras[phase, name] = entity
+            # A gap in the line where the value was not recorded
+            sender.send(entity, times, scalars(np.where(given[:, np.newaxis], numbers, np.nan)))
 
     def _batches(self, topic: schema.Topic, spans: Sequence[Span]) -> Iterator[NDArray[np.void]]:
         """Yield the steps of the first environment, at most a batch at a time."""

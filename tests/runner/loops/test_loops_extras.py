@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,10 +11,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from rerun.chunk import RrdReader
 
 import runner
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.execution.verify import verify
+from runner.export.rerun.runs import Source
+from runner.export.rerun.selection import Request
+from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.chunks import encode_chunk
@@ -117,6 +119,24 @@ def test_a_recording_with_extras_is_verified_archived_and_exported_with_the_same
     exported = dualtaxi(tmp_path / "recordings", "export", "csv", "pole", "-o", str(tmp_path / "csv"))
     assert exported.exit_code == 0, exported.output
     assert len((tmp_path / "csv/extras.csv").read_text().splitlines()) == 1 + len(seen) + 4
+
+
+def test_rerun_has_extras_on_the_timeline_as_lines_or_as_bars(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path) as rec:
+        for k, entry in enumerate(play(rec, 30)):
+            if entry[0] == "step":
+                rec.note_step(logits=np.array([k, -k]), histogram=np.full(20, k))
+    path = tmp_path / "run.rrd"
+    with runner.open_recording(rec.run.recording) as recording:
+        export([Source(recording, "a run")], Request(everything=True), path)
+        steps = next(recording.extras("train").blocks())["step"]
+    chunks = RrdReader(str(path)).store().stream().to_chunks()
+    rows = {"logits": [], "histogram": []}
+    for chunk in chunks:
+        name = str(chunk.entity_path).rpartition("/")[2]
+        if not chunk.is_static and name in rows and "/extra/" in str(chunk.entity_path):
+            rows[name] += chunk.to_record_batch().column("step").to_pylist()
+    assert sorted(rows["logits"]) == sorted(rows["histogram"]) == (steps + 1).tolist()
 
 
 def test_the_same_loop_gives_the_same_digest_and_one_without_extras_keeps_its_own(tmp_path):
@@ -247,11 +267,11 @@ for k in range(10**9):
 
 
 def test_a_killed_loop_keeps_its_extras_and_a_repair_too(tmp_path):
-    process = subprocess.Popen([sys.executable, "-c", KILLED, str(tmp_path)], stdout=subprocess.PIPE)
-    assert process.stdout is not None
-    assert process.stdout.readline() == b"ready\n"
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    command = [sys.executable, "-c", KILLED, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n"
+        process.kill()
     run = next(tmp_path.iterdir()).name
     for command in ("repair", "verify"):
         done = dualtaxi(tmp_path, command, run)
